@@ -1,0 +1,16 @@
+"""Differentiable direct volume rendering in JAX.
+
+A camera makes rays; a march steps along them, with transforms that each change one of its answers;
+a volume gives values, a transfer function their colour and extinction; the cells blend front to
+back into a `Rendering`.
+"""
+
+from .alignment import AlphaCorrection as AlphaCorrection
+from .camera import Camera as Camera
+from .engine import render as render, render_rays as render_rays
+from .march import March as March, Transform as Transform
+from .reference import render_ray_reference as render_ray_reference
+from .rendering import Rendering as Rendering
+from .termination import EarlyTermination as EarlyTermination
+from .transfer import TransferFunction as TransferFunction
+from .volume import Volume as Volume

@@ -1,0 +1,187 @@
+"""Which ray belongs to this pixel?
+
+Names and conventions are VTK's and PyVista's: `view_angle` and `parallel_scale` measure the height
+of the view. Pixel (0, 0) is the top left; a pixel's ray passes through its middle.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from .checks import finite_array, number, require
+from .triple import Triple, apart
+from .volume import Volume
+
+
+class Camera(eqx.Module):
+    """A pinhole camera, or an orthographic one where `parallel_scale` is given.
+
+    **Arguments:**
+
+    - `position`: world position. It may lie inside a volume (endoscopy); what is behind it is not seen.
+    - `focal_point`: the world point in the middle of the image.
+    - `view_up`: a direction that points up in the image, not along the view.
+    - `view_angle`: angle between the lower and the upper edge of the image, degrees, in (0, 180).
+    - `parallel_scale`: half the height of the view in world length; makes the camera orthographic,
+      with rays that start in the plane through `position`.
+    - `size`: (width, height) of the image in pixels.
+    - `window`: the part of the image plane that the image shows, (left, right, bottom, top) from its
+      middle, in units of half the height of the whole view. The default is the whole view,
+      (-width/height, width/height, -1, 1). `crop` and `zoom` set it.
+
+    **Raises:** `ValueError` for a camera at its focal point, `view_up` along the view, an angle, a
+    scale or a size out of range.
+    """
+
+    position: Float[Array, "3"]
+    focal_point: Float[Array, "3"]
+    view_up: Float[Array, "3"]
+    view_angle: Float[Array, ""]
+    parallel_scale: Float[Array, ""] | None
+    window: Float[Array, "4"]
+    size: tuple[int, int] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        position: ArrayLike | Any,
+        focal_point: ArrayLike | Any,
+        view_up: ArrayLike | Any = (0.0, 1.0, 0.0),
+        view_angle: ArrayLike | Any = 30.0,
+        *,
+        size: tuple[int, int] = (512, 512),
+        parallel_scale: ArrayLike | Any | None = None,
+        window: ArrayLike | Any | None = None,
+    ):
+        self.size = width, height = _image_size(size)
+        self.focal_point = finite_array("focal_point", focal_point, (3,))
+        position = finite_array("position", position, (3,))
+        view = self.focal_point - position
+        apart = jnp.sum(view**2) > 0
+        message = f"position must differ from focal_point; got {position} for both."
+        self.position = require(apart, message, position)
+        view_up = finite_array("view_up", view_up, (3,))
+        sine = jnp.linalg.norm(jnp.cross(view, view_up)) > 1e-6 * jnp.linalg.norm(view) * jnp.linalg.norm(view_up)
+        message = f"view_up must not be zero or point along the view; got {view_up} for a view along {view}."
+        self.view_up = require(sine, message, view_up)
+        self.view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
+        self.parallel_scale = (
+            None if parallel_scale is None else number("parallel_scale", parallel_scale, above=0)
+        )
+        aspect = width / height
+        window = (-aspect, aspect, -1.0, 1.0) if window is None else window
+        self.window = finite_array("window", window, (4,))
+
+    @classmethod
+    def looking_at(
+        cls,
+        volume: Volume,
+        direction: ArrayLike | Any = (0.5, -1.0, 0.4),
+        view_up: ArrayLike | Any = (0.0, 0.0, 1.0),
+        view_angle: ArrayLike | Any = 30.0,
+        *,
+        size: tuple[int, int] = (512, 512),
+    ) -> "Camera":
+        """A perspective camera that sees the whole volume from the side that `direction` points to.
+
+        As VTK's `ResetCamera`: the sphere around the volume's bounds just fits into the view.
+        """
+        direction = finite_array("direction", direction, (3,))
+        norm = jnp.linalg.norm(direction)
+        direction = require(norm > 0, "direction must not be zero.", direction)
+        view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
+        low, high = volume.corners
+        radius = jnp.linalg.norm(high - low) / 2
+        width, height = _image_size(size)
+        half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * min(1, width / height))
+        position = volume.center + direction / norm * radius / jnp.sin(half)
+        return cls(position, volume.center, view_up, view_angle, size=size)
+
+    def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
+        """The camera that renders just this rectangle of the image: the same pixels, in an image of
+        their own. `left` and `top` are the column and row of its first pixel.
+
+        **Raises:** `ValueError` for a rectangle that is empty or leaves the image.
+        """
+        full_width, full_height = self.size
+        inside = 0 <= left and 0 <= top and left + width <= full_width and top + height <= full_height
+        if not inside or width < 1 or height < 1:
+            raise ValueError(
+                f"crop must be a rectangle inside the {full_width} x {full_height} image; "
+                f"got left={left}, top={top}, width={width}, height={height}."
+            )
+        x = [self._column(edge) for edge in (left, left + width)]
+        y = [self._row(edge) for edge in (top + height, top)]
+        return self._showing(jnp.stack([*x, *y]), (width, height))
+
+    def zoom(self, factor: ArrayLike | Any, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
+        """The camera that shows 1/`factor` of the image in an image of the same size, around
+        `center`, given as fractions of width and height from the top left.
+
+        It magnifies the image plane, so perspective does not change.
+        """
+        factor = number("zoom factor", factor, above=0)
+        middle_x, middle_y = self._column(center[0] * self.size[0]), self._row(center[1] * self.size[1])
+        left, right, bottom, top = self.window
+        half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
+        window = [middle_x - half_x, middle_x + half_x, middle_y - half_y, middle_y + half_y]
+        return self._showing(jnp.stack(window), self.size)
+
+    def ray(self, column: Int[Array, ""], row: Int[Array, ""]) -> tuple[Triple, Triple]:
+        """Origin and unit direction of one pixel's ray."""
+        dtype = self.position.dtype
+        x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)
+        right, up, forward = self._axes()
+        if self.parallel_scale is not None:
+            offset = self.parallel_scale * (x * right + y * up)
+            return apart(self.position + offset), apart(forward)
+        scale = jnp.tan(jnp.deg2rad(self.view_angle) / 2)
+        direction = forward + scale * (x * right + y * up)
+        return apart(self.position), apart(direction / jnp.linalg.norm(direction))
+
+    def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+        """Origins and unit directions of all pixels' rays, `[row, column]`."""
+        width, height = self.size
+        over_row = jax.vmap(self.ray, in_axes=(0, None))
+        origin, direction = jax.vmap(over_row, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
+        return jnp.stack(origin, axis=-1), jnp.stack(direction, axis=-1)
+
+    def _showing(self, window: Float[Array, "4"], size: tuple[int, int]) -> "Camera":
+        return Camera(
+            self.position,
+            self.focal_point,
+            self.view_up,
+            self.view_angle,
+            size=size,
+            parallel_scale=self.parallel_scale,
+            window=window,
+        )
+
+    def _axes(self) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+        forward = self.focal_point - self.position
+        forward = forward / jnp.linalg.norm(forward)
+        right = jnp.cross(forward, self.view_up)
+        right = right / jnp.linalg.norm(right)
+        return right, jnp.cross(right, forward), forward
+
+    def _column(self, column):
+        """Image-plane x of a column; whole numbers are pixel edges."""
+        left, right = self.window[0], self.window[1]
+        return left + (right - left) * (column / self.size[0])
+
+    def _row(self, row):
+        bottom, top = self.window[2], self.window[3]
+        return top - (top - bottom) * (row / self.size[1])
+
+
+def _image_size(size: tuple[int, int]) -> tuple[int, int]:
+    try:
+        width, height = (int(n) for n in size)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"size must be (width, height) in pixels; got {size!r}.") from fault
+    if (width, height) != tuple(size) or width < 1 or height < 1:
+        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size}.")
+    return width, height
+

@@ -1,0 +1,114 @@
+"""Which grid coordinate is this world point, and where does a ray meet the grid?
+
+This is the seam `locate`. A `Space` answers both questions for one volume; the default is `Affine`
+(spacing and origin), under which a ray stays straight in the grid. A space whose rays are curved
+in the grid gives another `Path`, and the rest of the march does not notice.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .triple import Scalar, Triple, along, apart
+from .volume import Volume
+
+
+class Path(eqx.Module):
+    """A ray as seen in the grid: the coordinate at depth `s`, the world length past the entry."""
+
+    @abstractmethod
+    def __call__(self, s: Scalar) -> Triple: ...
+
+
+class Space(eqx.Module):
+    """Where a volume's grid lies in the world."""
+
+    @abstractmethod
+    def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
+        """Distances at which the line enters and leaves the grid; the first exceeds the second on a miss."""
+
+    @abstractmethod
+    def path(self, entry: Triple, direction: Triple) -> Path:
+        """The straight world ray from `entry`, as seen in the grid."""
+
+
+class Ray(eqx.Module):
+    """One ray, cut to the part inside the volume.
+
+    - `entry`, `direction`: world point where the part begins, and the unit direction.
+    - `t_in`: distance from the ray's origin to the entry. `length`: from entry to exit; 0 on a miss.
+      Both carry gradients. All depths `s` along a march count from the entry: near 0 float32 resolves
+      them as finely as the volume needs, however far away the camera stands.
+    - `path`: the ray as seen in the grid.
+    - `pixel`: (column, row), the key of everything random along this ray.
+    """
+
+    entry: Triple
+    direction: Triple
+    t_in: Scalar
+    length: Scalar
+    path: Path
+    pixel: tuple[Int[Array, ""], Int[Array, ""]]
+
+
+def enter(
+    space: Space, origin: Triple, direction: Triple, pixel: tuple[Int[Array, ""], Int[Array, ""]]
+) -> Ray:
+    """The part of a ray inside the volume and not behind its origin, which may lie inside."""
+    t_in, t_out = space.interval(origin, direction)
+    t_in = jnp.maximum(t_in, 0)
+    hit = t_out > t_in
+    t_in = jnp.where(hit, t_in, 0)  # a miss has infinite distances, whose products are NaN
+    entry = along(origin, direction, t_in)
+    length = jnp.where(hit, t_out - t_in, 0)
+    return Ray(entry, direction, t_in, length, space.path(entry, direction), pixel)
+
+
+class Straight(Path):
+    """A path straight in the grid: `start + s rate`."""
+
+    start: Triple
+    rate: Triple
+
+    def __call__(self, s: Scalar) -> Triple:
+        return along(self.start, self.rate, s)
+
+
+class Affine(Space):
+    """A grid whose axes are those of the world: spacing and origin."""
+
+    low: Triple
+    high: Triple
+    spacing: Triple
+
+    def __init__(self, volume: Volume):
+        low, high = volume.corners
+        self.low, self.high = apart(low), apart(high)
+        self.spacing = apart(volume.spacing)
+
+    def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
+        slabs = [_slab(*ends) for ends in zip(origin, direction, self.low, self.high, strict=True)]
+        (near_x, far_x), (near_y, far_y), (near_z, far_z) = slabs
+        near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
+        far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
+        return near, far
+
+    def path(self, entry: Triple, direction: Triple) -> Straight:
+        ex, ey, ez = ((e - low) / step for e, low, step in zip(entry, self.low, self.spacing, strict=True))
+        dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
+        return Straight((ex, ey, ez), (dx, dy, dz))
+
+
+def _slab(origin: Scalar, direction: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
+    """Distances to the nearer and the farther of two parallel planes."""
+    # Below this a direction runs along the planes. Not 0: the derivative of 1/d is 1/d², and must be finite.
+    parallel = jnp.abs(direction) < float(jnp.finfo(direction.dtype).tiny) ** 0.25
+    slope = jnp.where(parallel, 1, direction)
+    a, b = (low - origin) / slope, (high - origin) / slope
+    between = (low <= origin) & (origin <= high)
+    near = jnp.where(parallel, jnp.where(between, -jnp.inf, jnp.inf), jnp.minimum(a, b))
+    far = jnp.where(parallel, jnp.where(between, jnp.inf, -jnp.inf), jnp.maximum(a, b))
+    return near, far
+

@@ -1,0 +1,168 @@
+"""Where is the next sample, and how much of the ray does it stand for?
+
+A march is a step length and a tuple of transforms. With none it is Levoy's ray casting: samples at
+depth 0, d, 2d, … past the entry, each standing for a cell of width d behind it, until the exit.
+A transform is one idea of one paper. It changes one of five answers, the seams, and leaves the
+others as they are; every seam passes through all transforms in turn, so that any of them compose.
+
+| seam | question | answer of the plain march |
+|---|---|---|
+| `locate` | which grid coordinate is this world point? | spacing and origin |
+| `start` | how many steps past the entry is the first cell? | 0 |
+| `advance` | how many steps is it to the next cell? | 1 |
+| `cut` | which part of its cell does a sample stand for? | all of it |
+| `stop` | is this ray finished? | not before the exit |
+"""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .checks import number
+from .locate import Affine, Ray, Space
+from .triple import Scalar
+from .volume import Volume
+
+
+class Cell(eqx.Module):
+    """The piece of a ray that one sample stands for: from depth `front`, of this `width`.
+
+    `cut` tells that it was shortened at the volume's exit.
+    """
+
+    front: Scalar
+    width: Scalar
+    cut: Bool[Array, ""]
+
+
+class Transform(eqx.Module):
+    """One change to a march. Override the seam that the idea is about; each default changes nothing.
+
+    All methods see one ray; the engine batches them. `memory` is what a transform remembers from
+    sample to sample along a ray: `remember` makes it, `advance` sees and replaces it.
+    """
+
+    def locate(self, space: Space, volume: Volume) -> Space:
+        """The space in which rays meet the volume, in place of `space`."""
+        return space
+
+    def start(self, steps: Scalar, ray: Ray) -> Scalar:
+        """Steps from the entry to the front of the first cell; may be negative where `cut` trims that cell."""
+        return steps
+
+    def remember(self, ray: Ray) -> Any:
+        """The memory with which a ray begins."""
+        return None
+
+    def advance(
+        self, steps: Scalar, memory: Any, ray: Ray, transparent: Bool[Array, ""]
+    ) -> tuple[Scalar, Any]:
+        """Steps from this cell's front to the next one's, and the memory from there on.
+
+        `transparent` tells that the extinction at this sample was 0.
+        """
+        return steps, memory
+
+    def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+        """The pieces, front to back, that the cell falls into; each is sampled on its own. How many is
+        fixed; a piece may have width 0."""
+        return (cell,)
+
+    def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
+        """Whether the ray is finished, given what the transforms before this one say."""
+        return stopped
+
+
+class March(eqx.Module):
+    """How rays step through a volume.
+
+    **Arguments:**
+
+    - `step`: distance d between samples, world length, > 0.
+    - `transforms`: applied in this order at every seam; none may be given twice.
+    - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
+      error falls with d. `"midpoint"`: in the middle; the error falls with d².
+    - `max_samples`: the most steps that a ray may take, against marches that never end. Rays that
+      need more are marked in `Rendering.exhausted`.
+
+    **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
+    transform, and for a transform given twice.
+    """
+
+    step: Float[Array, ""]
+    transforms: tuple[Transform, ...]
+    quadrature: Literal["left", "midpoint"] = eqx.field(static=True)
+    max_samples: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        step: Any,
+        transforms: tuple[Any, ...] | list[Any] = (),
+        quadrature: str = "left",
+        *,
+        max_samples: int = 2**17,
+    ):
+        self.step = number("step", step, above=0)
+        self.transforms = tuple(transforms)
+        kinds = [type(t) for t in self.transforms]
+        for transform in self.transforms:
+            if not isinstance(transform, Transform):
+                raise ValueError(f"transforms must hold jaxvol transforms; got {transform!r}.")
+            if kinds.count(type(transform)) > 1:
+                name = type(transform).__name__
+                raise ValueError(f"transforms must each be given once; got {name} {kinds.count(type(transform))} times.")
+        if quadrature not in ("left", "midpoint"):
+            raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
+        self.quadrature = quadrature
+        if max_samples < 1:
+            raise ValueError(f"max_samples must be at least 1; got {max_samples}.")
+        self.max_samples = max_samples
+
+    def locate(self, volume: Volume) -> Space:
+        """The space in which rays meet the volume."""
+        space: Space = Affine(volume)
+        for transform in self.transforms:
+            space = transform.locate(space, volume)
+        return space
+
+    def start(self, ray: Ray) -> Scalar:
+        """Steps from the entry to the first cell."""
+        steps = jnp.zeros_like(ray.length)
+        for transform in self.transforms:
+            steps = transform.start(steps, ray)
+        return steps
+
+    def remember(self, ray: Ray) -> tuple[Any, ...]:
+        """What the transforms remember when a ray begins."""
+        return tuple(transform.remember(ray) for transform in self.transforms)
+
+    def advance(
+        self, memory: tuple[Any, ...], ray: Ray, transparent: Bool[Array, ""]
+    ) -> tuple[Scalar, tuple[Any, ...]]:
+        """Steps to the next cell, and what is remembered there."""
+        steps, after = jnp.ones_like(ray.length), []
+        for transform, remembered in zip(self.transforms, memory, strict=True):
+            steps, remembered = transform.advance(steps, remembered, ray, transparent)
+            after.append(remembered)
+        return steps, tuple(after)
+
+    def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+        """The pieces of a cell, front to back."""
+        pieces = (cell,)
+        for transform in self.transforms:
+            pieces = tuple(part for piece in pieces for part in transform.cut(piece, ray, volume))
+        return pieces
+
+    def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
+        """Whether a ray with this much transmittance left ends before its exit."""
+        stopped = jnp.zeros(jnp.shape(transmittance), bool)
+        for transform in self.transforms:
+            stopped = transform.stop(stopped, transmittance)
+        return stopped
+
+    def sample(self, cell: Cell) -> Scalar:
+        """Depth at which a cell is sampled."""
+        return cell.front if self.quadrature == "left" else cell.front + cell.width / 2

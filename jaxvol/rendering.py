@@ -1,0 +1,38 @@
+"""What does a render give back?"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Rendering(eqx.Module):
+    """What the rays saw. The leading shape is that of the rays: (height, width) from a camera.
+
+    - `rgba`: linear colour, premultiplied by opacity, and opacity; not yet over any background.
+    - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
+      adds to the opacity, world length; infinite where nothing is seen.
+    - `samples`: samples evaluated.
+    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
+      (Kye 2013, Fig. 13).
+    - `exhausted`: whether the ray spent `March.max_samples` before it was finished: it lacks what
+      lies behind.
+    """
+
+    rgba: Float[Array, "*rays 4"]
+    depth: Float[Array, "*rays"]
+    samples: Int[Array, "*rays"]
+    aligned: Bool[Array, "*rays"]
+    exhausted: Bool[Array, "*rays"]
+
+    def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
+        """Linear RGB over a background: one colour (3,), or an image of the same shape."""
+        background = jnp.asarray(background, self.rgba.dtype)
+        if background.shape not in ((3,), (*self.rgba.shape[:-1], 3)):
+            raise ValueError(
+                f"background must be one colour (3,) or an image {(*self.rgba.shape[:-1], 3)}; "
+                f"got shape {background.shape}."
+            )
+        background = jnp.broadcast_to(background, (*self.rgba.shape[:-1], 3))
+        return self.rgba[..., :3] + (1 - self.rgba[..., 3:]) * background

@@ -1,0 +1,36 @@
+"""When does a ray have nothing left to gain? Early ray termination (KISTI report 2005)."""
+
+from typing import Any
+
+from jaxtyping import Array, Bool, Float
+
+from .checks import number
+from .march import Transform
+from .triple import Scalar
+
+
+class EarlyTermination(Transform):
+    """End a ray once its transmittance is at most `opacity_left`.
+
+    What lies behind is left out: the error of a colour channel is at most `opacity_left` times the
+    brightest colour behind, that of the accumulated opacity at most `opacity_left`. The gradient with
+    respect to what was left out is taken as 0, the same order of error. Moving the sample at which
+    a ray ends makes a jump of that size in the image, which gradients do not see.
+
+    **Arguments:**
+
+    - `opacity_left`: in (0, 1); 1/255 is below one step of an 8-bit image.
+
+    **Raises:** `ValueError` outside that range.
+
+    Source: KISTI report 2005, which tests once in 16 slices since testing each one cost more than it
+    saved; here the test is part of the meaning, and how often an engine looks is its own business.
+    """
+
+    opacity_left: Float[Array, ""]
+
+    def __init__(self, opacity_left: Any = 1 / 255):
+        self.opacity_left = number("opacity_left", opacity_left, above=0, below=1)
+
+    def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
+        return stopped | (transmittance <= self.opacity_left)

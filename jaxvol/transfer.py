@@ -1,0 +1,122 @@
+"""Which colour and extinction has this value?"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .checks import finite_array, number, require
+from .triple import Scalar, Triple
+from .volume import Volume
+
+
+Classify: TypeAlias = Callable[[Triple], tuple[Triple, Scalar]]
+"""From a grid coordinate to colour (r, g, b) and extinction (1/length)."""
+
+
+class TransferFunction(eqx.Module):
+    """Colour and extinction, piecewise linear in the volume's value and constant beyond the ends.
+
+    **Arguments:**
+
+    - `values`: (n,) increasing control points, in value units; n ≥ 2. They carry no gradient.
+    - `colors`: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
+    - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
+      `1 - exp(-extinction w)`.
+
+    Extinction is what is interpolated. VTK interpolates opacity; the two agree at the points, and
+    differ between points where the opacity of a unit distance is high.
+
+    **Raises:** `ValueError` for fewer than two points, points that do not increase, negative
+    extinction, NaN or infinity, or lengths that differ.
+    """
+
+    values: Float[Array, " n"]
+    colors: Float[Array, "n 3"]
+    extinction: Float[Array, " n"]
+
+    def __init__(self, values: ArrayLike | Any, colors: ArrayLike | Any, extinction: ArrayLike | Any):
+        values = finite_array("values", values, (None,))
+        n = values.shape[0]
+        if n < 2:
+            raise ValueError(f"values must hold at least 2 control points; got {n}.")
+        increasing = values[1:] > values[:-1]
+        message = f"values must increase from point to point; got {values}. Sort the points, and move equal ones apart."
+        self.values = require(increasing, message, values)
+        self.colors = finite_array("colors", colors, (n, 3))
+        extinction = finite_array("extinction", extinction, (n,))
+        message = f"extinction must not be negative; got {extinction}."
+        self.extinction = require(extinction >= 0, message, extinction)
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Sequence[tuple[float, tuple[float, float, float], float]],
+        unit_distance: float = 1.0,
+    ) -> "TransferFunction":
+        """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
+
+        **Arguments:**
+
+        - `points`: in increasing order of value. `opacity` in [0, 1] is that of a layer of thickness
+          `unit_distance`, and becomes the extinction `-ln(1 - opacity) / unit_distance` exactly.
+          An opacity of 1, whose extinction would be infinite, is taken as 1 - 2⁻²⁴.
+        - `unit_distance`: world length. VTK's `ScalarOpacityUnitDistance`.
+
+        **Raises:** `ValueError` as the class does, and for an opacity outside [0, 1].
+        """
+        try:
+            values, colors, opacities = zip(*points, strict=True)
+        except (TypeError, ValueError) as fault:
+            raise ValueError(f"points must be triples (value, (r, g, b), opacity); got {points!r}.") from fault
+        return cls(values, colors, extinction_of(opacities, unit_distance))
+
+    def __call__(self, value: Scalar) -> tuple[Triple, Scalar]:
+        """Colour (r, g, b) and extinction of a value."""
+        return self._rows()(value)
+
+    def over(self, volume: Volume) -> Classify:
+        """Classification of grid coordinates of this volume. What does not depend on the coordinate
+        is computed here, once, outside the march's loop."""
+        look_up = self._rows()
+        return lambda coordinate: look_up(volume.value(coordinate))
+
+    def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
+        """Opacity at the control points of a layer of thickness `unit_distance`."""
+        return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
+
+    def _rows(self) -> Callable[[Scalar], tuple[Triple, Scalar]]:
+        """A table with one row per interval: all that a sample needs, so that it costs one gather."""
+        values = jax.lax.stop_gradient(self.values)
+        channels = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        inverse = 1 / (values[1:] - values[:-1])
+        columns = [values[:-1, None], inverse[:, None], channels[:-1], channels[1:] - channels[:-1]]
+        rows = jnp.concatenate(columns, axis=1)
+        last = rows.shape[0] - 1
+        # Comparing with every point is one fused kernel, the faster one while there are few points.
+        search = "compare_all" if last < 32 else "scan_unrolled"
+
+        def look_up(value: Scalar) -> tuple[Triple, Scalar]:
+            i = jnp.searchsorted(values, value, side="right", method=search).astype(jnp.int32) - 1
+            row = rows.at[jnp.clip(i, 0, last)].get(mode="promise_in_bounds")
+            f = jnp.clip((value - row[0]) * row[1], 0, 1)
+            return (row[2] + f * row[6], row[3] + f * row[7], row[4] + f * row[8]), row[5] + f * row[9]
+
+        return look_up
+
+
+def extinction_of(opacity: ArrayLike | Any, unit_distance: ArrayLike | Any = 1.0) -> Float[Array, " n"]:
+    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity.
+
+    Inverse of `1 - exp(-extinction unit_distance)`; an opacity above 1 - 2⁻²⁴ counts as that, the
+    largest float32 below 1. **Raises** `ValueError` for an opacity outside [0, 1].
+    """
+    unit_distance = number("unit_distance", unit_distance, above=0)
+    opacity = finite_array("opacity", opacity, (None,))
+    message = f"opacity must be in [0, 1]; got {opacity}."
+    opacity = require((opacity >= 0) & (opacity <= 1), message, opacity)
+    return -jnp.log1p(-jnp.minimum(opacity, 1 - np.float32(2) ** -24)) / unit_distance

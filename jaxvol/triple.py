@@ -1,0 +1,26 @@
+"""How are the three components of a point kept? Apart, as a tuple of three scalars.
+
+Batched over rays, three arrays of length n run 3 to 5 times faster in a loop than one of shape
+(n, 3), whose components XLA must pick out and put together again at every step. Functions of a
+single point or direction on the march's path therefore take and give triples; what a user holds
+(a camera's position, an image) is stacked.
+"""
+
+from typing import TypeAlias
+
+from jaxtyping import Array, Float
+
+
+Scalar: TypeAlias = Float[Array, ""]
+Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]
+
+
+def apart(vector: Float[Array, "3"]) -> Triple:
+    """The components of a stacked vector."""
+    return vector[0], vector[1], vector[2]
+
+
+def along(start: Triple, rate: Triple, s: Scalar) -> Triple:
+    """The point `start + s rate`."""
+    (x, y, z), (dx, dy, dz) = start, rate
+    return x + s * dx, y + s * dy, z + s * dz

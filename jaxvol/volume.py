@@ -1,0 +1,198 @@
+"""Which value stands at this grid coordinate?
+
+Grid coordinates count voxels: the node `data[i, j, k]` stands at coordinate (i, j, k), so a
+grid of n nodes spans n - 1 steps along an axis. Between nodes the value is trilinear; outside
+the grid it is that of the nearest point of the grid.
+"""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, Integer, Shaped
+
+from .checks import finite_array, is_traced, require
+from .triple import Scalar, Triple
+
+
+DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
+
+
+class Volume(eqx.Module):
+    """A scalar field sampled on a regular grid, `data[x, y, z]`.
+
+    **Arguments:**
+
+    - `data`: (nx, ny, nz) voxels, at least 2 along each axis, of type uint8, int8, uint16, int16,
+      float16, bfloat16 or float32. The type is kept on the device and converted after a voxel is
+      fetched. float64 follows JAX: kept where 64-bit types are enabled, else made float32.
+    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT).
+    - `origin`: world position of node (0, 0, 0).
+    - `labels`: optional integer label of every node (a segmentation), of the same shape.
+
+    **Raises:** `ValueError` naming the argument for data that are not 3-D, have an axis of one
+    voxel, another type, or NaN or infinite voxels; for spacing that is not positive; and for labels
+    of another shape or type.
+    """
+
+    data: Shaped[Array, "nx ny nz"]
+    spacing: Float[Array, "3"]
+    origin: Float[Array, "3"]
+    labels: Integer[Array, "nx ny nz"] | None
+
+    def __init__(
+        self,
+        data: ArrayLike | Any,
+        spacing: ArrayLike | Any = (1.0, 1.0, 1.0),
+        origin: ArrayLike | Any = (0.0, 0.0, 0.0),
+        labels: ArrayLike | Any | None = None,
+    ):
+        self.data = _voxels(data)
+        spacing = finite_array("spacing", spacing, (3,))
+        self.spacing = require(spacing > 0, f"spacing must be positive along every axis; got {spacing}.", spacing)
+        self.origin = finite_array("origin", origin, (3,))
+        self.labels = None if labels is None else _labels(labels, self.data.shape)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of nodes along x, y, z."""
+        nx, ny, nz = self.data.shape
+        return nx, ny, nz
+
+    @property
+    def bounds(self) -> Float[Array, "6"]:
+        """World extent (x_min, x_max, y_min, y_max, z_min, z_max), from the first node to the last."""
+        low, high = self.corners
+        return jnp.stack([low, high], axis=-1).reshape(-1)
+
+    @property
+    def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """World positions of the first and the last node."""
+        steps = jnp.asarray(self.shape, self.spacing.dtype) - 1
+        return self.origin, self.origin + steps * self.spacing
+
+    @property
+    def center(self) -> Float[Array, "3"]:
+        """World position of the middle of the bounds."""
+        low, high = self.corners
+        return (low + high) / 2
+
+    def value(self, coordinate: Triple) -> Scalar:
+        """Trilinear value at a grid coordinate, in the coordinate's float type."""
+        (((c000, c001), (c010, c011)), ((c100, c101), (c110, c111))), (fx, fy, fz) = self._cube(coordinate)
+        return _mix(
+            fx,
+            _mix(fy, _mix(fz, c000, c001), _mix(fz, c010, c011)),
+            _mix(fy, _mix(fz, c100, c101), _mix(fz, c110, c111)),
+        )
+
+    def gradient(self, coordinate: Triple, method: Literal["trilinear", "central"] = "central") -> Triple:
+        """Gradient of the value in the grid's own axes, in value units per world length.
+
+        - `"trilinear"`: derivative of the trilinear value inside the cell; exact for what is
+          rendered, and discontinuous where cells meet.
+        - `"central"`: difference over one node to either side, continuous, with an error of
+          O(spacing²) against the gradient of the field that was sampled; where the grid ends, the
+          difference is taken over the part inside.
+        """
+        if method == "trilinear":
+            slopes = self._trilinear_slopes(coordinate)
+        elif method == "central":
+            slopes = self._central_slopes(coordinate)
+        else:
+            raise ValueError(f'method must be "trilinear" or "central"; got {method!r}.')
+        sx, sy, sz = slopes
+        return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
+
+    def label(self, coordinate: Triple) -> Int[Array, ""]:
+        """Label of the node nearest to a grid coordinate (the upper one half-way between two)."""
+        if self.labels is None:
+            raise ValueError("labels are needed here and this volume has none; give Volume(..., labels=...).")
+        i, j, k = (
+            jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)
+            for c, n in zip(coordinate, self.shape, strict=True)
+        )
+        _, ny, nz = self.shape
+        return _fetch(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
+
+    def _cube(self, coordinate: Triple):
+        """The eight voxels around a coordinate, [x][y][z], and the fractions between them."""
+        dtype = coordinate[0].dtype
+        low, fraction = zip(*(_split(c, n) for c, n in zip(coordinate, self.shape, strict=True)), strict=True)
+        _, ny, nz = self.shape
+        base = (low[0] * ny + low[1]) * nz + low[2]
+        cube = [
+            [[_fetch(self.data, base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)]
+            for x in (0, 1)
+        ]
+        return cube, fraction
+
+    def _trilinear_slopes(self, coordinate: Triple) -> Triple:
+        (((c000, c001), (c010, c011)), ((c100, c101), (c110, c111))), (fx, fy, fz) = self._cube(coordinate)
+        return (
+            _mix(fy, _mix(fz, c100 - c000, c101 - c001), _mix(fz, c110 - c010, c111 - c011)),
+            _mix(fx, _mix(fz, c010 - c000, c011 - c001), _mix(fz, c110 - c100, c111 - c101)),
+            _mix(fx, _mix(fy, c001 - c000, c011 - c010), _mix(fy, c101 - c100, c111 - c110)),
+        )
+
+    def _central_slopes(self, coordinate: Triple) -> Triple:
+        def slope(axis: int) -> Scalar:
+            before, after = list(coordinate), list(coordinate)
+            before[axis] = jnp.clip(coordinate[axis] - 1, 0, self.shape[axis] - 1)
+            after[axis] = jnp.clip(coordinate[axis] + 1, 0, self.shape[axis] - 1)
+            rise = self.value(tuple(after)) - self.value(tuple(before))
+            # at least half a node apart for any coordinate less than half a node outside the grid
+            return rise / jnp.maximum(after[axis] - before[axis], 0.5)
+
+        return slope(0), slope(1), slope(2)
+
+
+def _voxels(data: ArrayLike | Any) -> Array:
+    if not is_traced(data) and not hasattr(data, "dtype"):
+        data = np.asarray(data)
+    dtype = str(data.dtype)
+    if data.ndim != 3 or min(data.shape) < 2:
+        raise ValueError(
+            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {data.shape}. "
+            "For a stack of images, stack them along the last axis."
+        )
+    if dtype not in (*DTYPES, "float64"):
+        raise ValueError(
+            f"data must be of type {', '.join(DTYPES)}; got {dtype}. Convert it, for example with "
+            "data.astype(np.float32), where that keeps the values apart."
+        )
+    if data.size >= 2**31:
+        raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
+    if data.dtype.kind not in "ui":
+        bad = ~jnp.isfinite(data) if is_traced(data) else ~np.isfinite(np.asarray(data, dtype=np.float32))
+        count = "some" if is_traced(data) else f"{int(bad.sum())} of {data.size}"
+        data = require(
+            ~bad, f"data must be finite; got {count} voxels that are NaN or infinite. Replace them first.", data
+        )
+    return jnp.asarray(data)
+
+
+def _labels(labels: ArrayLike | Any, shape: tuple[int, ...]) -> Array:
+    labels = labels if hasattr(labels, "dtype") else np.asarray(labels)
+    if labels.dtype.kind not in "ui":
+        raise ValueError(f"labels must be integers; got {labels.dtype}.")
+    if labels.shape != shape:
+        raise ValueError(f"labels must stand on the grid of data, shape {shape}; got shape {labels.shape}.")
+    return jnp.asarray(labels)
+
+
+def _split(c: Scalar, n: int) -> tuple[Int[Array, ""], Scalar]:
+    """The node below a coordinate and the fraction past it; the last node belongs to the cell below."""
+    c = jnp.clip(c, 0, n - 1)
+    low = jnp.clip(c.astype(jnp.int32), 0, n - 2)  # also keeps NaN inside the array
+    return low, c - low.astype(c.dtype)
+
+
+def _fetch(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
+    return array.reshape(-1).at[flat].get(mode="promise_in_bounds")
+
+
+def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
+    # a + f (b - a) would round differently at f = 1; this form gives a and b exactly at the ends
+    return a * (1 - fraction) + b * fraction
