@@ -7,8 +7,12 @@ back into a `Rendering`.
 
 from .alignment import AlphaCorrection as AlphaCorrection
 from .camera import Camera as Camera
+from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to_srgb
 from .engine import render as render, render_rays as render_rays
+from .formats import load as load
 from .march import March as March, Transform as Transform
+from .phantoms import phantom as phantom
+from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
 from .rendering import Rendering as Rendering
 from .termination import EarlyTermination as EarlyTermination

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from .checks import finite_array, number, require
-from .triple import Triple, apart
+from .triple import Triple, along, apart
 from .volume import Volume
 
 
@@ -51,21 +51,26 @@ class Camera(eqx.Module):
         view_up: ArrayLike | Any = (0.0, 1.0, 0.0),
         view_angle: ArrayLike | Any = 30.0,
         *,
-        size: tuple[int, int] = (512, 512),
+        size: tuple[int, int] | Any = (512, 512),
         parallel_scale: ArrayLike | Any | None = None,
         window: ArrayLike | Any | None = None,
     ):
         self.size = width, height = _image_size(size)
         self.focal_point = finite_array("focal_point", focal_point, (3,))
         position = finite_array("position", position, (3,))
-        view = self.focal_point - position
-        apart = jnp.sum(view**2) > 0
-        message = f"position must differ from focal_point; got {position} for both."
-        self.position = require(apart, message, position)
-        view_up = finite_array("view_up", view_up, (3,))
-        sine = jnp.linalg.norm(jnp.cross(view, view_up)) > 1e-6 * jnp.linalg.norm(view) * jnp.linalg.norm(view_up)
-        message = f"view_up must not be zero or point along the view; got {view_up} for a view along {view}."
-        self.view_up = require(sine, message, view_up)
+        self.position = require(
+            position,
+            lambda here, there: jnp.any(here != there),
+            "position must differ from focal_point; got {got} for both.",
+            self.focal_point,
+        )
+        self.view_up = require(
+            finite_array("view_up", view_up, (3,)),
+            lambda up, here, there: _sine(up, there - here) > 1e-6,
+            "view_up must not be zero or point along the view; got {got}.",
+            self.position,
+            self.focal_point,
+        )
         self.view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
         self.parallel_scale = (
             None if parallel_scale is None else number("parallel_scale", parallel_scale, above=0)
@@ -82,21 +87,20 @@ class Camera(eqx.Module):
         view_up: ArrayLike | Any = (0.0, 0.0, 1.0),
         view_angle: ArrayLike | Any = 30.0,
         *,
-        size: tuple[int, int] = (512, 512),
+        size: tuple[int, int] | Any = (512, 512),
     ) -> "Camera":
         """A perspective camera that sees the whole volume from the side that `direction` points to.
 
         As VTK's `ResetCamera`: the sphere around the volume's bounds just fits into the view.
         """
         direction = finite_array("direction", direction, (3,))
-        norm = jnp.linalg.norm(direction)
-        direction = require(norm > 0, "direction must not be zero.", direction)
+        direction = require(direction, lambda d: jnp.any(d != 0), "direction must not be zero.")
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
         low, high = volume.corners
         radius = jnp.linalg.norm(high - low) / 2
         width, height = _image_size(size)
         half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * min(1, width / height))
-        position = volume.center + direction / norm * radius / jnp.sin(half)
+        position = volume.center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
         return cls(position, volume.center, view_up, view_angle, size=size)
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
@@ -133,13 +137,15 @@ class Camera(eqx.Module):
         """Origin and unit direction of one pixel's ray."""
         dtype = self.position.dtype
         x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)
-        right, up, forward = self._axes()
+        right, up, forward = (apart(axis) for axis in self._axes())
+        position = apart(self.position)
         if self.parallel_scale is not None:
-            offset = self.parallel_scale * (x * right + y * up)
-            return apart(self.position + offset), apart(forward)
+            scale = self.parallel_scale
+            return along(along(position, right, scale * x), up, scale * y), forward
         scale = jnp.tan(jnp.deg2rad(self.view_angle) / 2)
-        direction = forward + scale * (x * right + y * up)
-        return apart(self.position), apart(direction / jnp.linalg.norm(direction))
+        dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
+        norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
+        return position, (dx / norm, dy / norm, dz / norm)
 
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
         """Origins and unit directions of all pixels' rays, `[row, column]`."""
@@ -176,7 +182,13 @@ class Camera(eqx.Module):
         return top - (top - bottom) * (row / self.size[1])
 
 
-def _image_size(size: tuple[int, int]) -> tuple[int, int]:
+def _sine(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
+    """Sine of the angle between two vectors; 0 where one is zero."""
+    lengths = jnp.linalg.norm(a) * jnp.linalg.norm(b)
+    return jnp.linalg.norm(jnp.cross(a, b)) / jnp.where(lengths > 0, lengths, 1)
+
+
+def _image_size(size: tuple[int, int] | Any) -> tuple[int, int]:
     try:
         width, height = (int(n) for n in size)
     except (TypeError, ValueError) as fault:

@@ -4,6 +4,7 @@ A fault that shapes or Python values show raises `ValueError` at once. A fault t
 traced values show is raised by `equinox.error_if` when the compiled program runs.
 """
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -21,51 +22,64 @@ def is_traced(*values: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def require(ok: Any, message: str, value: T) -> T:
-    """`value`, once `ok` holds for all of its elements. The result must be used: a check
-    on traced values vanishes with the value that carries it.
+def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
+    """`value`, once `holds(value, *others)` is true everywhere.
 
-    **Raises:** `ValueError(message)` for a concrete `ok`; an Equinox runtime error with
-    the same message where `ok` is traced.
+    **Arguments:**
+
+    - `message`: the error; `{got}` in it becomes the value.
+
+    **Returns:** the value. Use what is returned: a check on a traced value vanishes without it.
+
+    **Raises:** `ValueError` at once for a concrete value, an Equinox runtime error for a traced one.
     """
-    if is_traced(ok):
-        return eqx.error_if(value, ~jnp.all(ok), message)
-    if not np.all(ok):
-        raise ValueError(message)
+    if is_traced(value, *others):
+        message = message.format(got="a value known only when the program runs")
+        return eqx.error_if(value, ~jnp.all(holds(value, *others)), message)
+    with jax.ensure_compile_time_eval():  # what is concrete can be asked at once inside jit, too
+        if not np.all(holds(value, *others)):
+            raise ValueError(message.format(got=np.asarray(value)))
     return value
+
+
+def finite(values: Any) -> Any:
+    """For `require`: everything but NaN and infinity."""
+    return abs(values) < np.inf
 
 
 def finite_array(name: str, value: ArrayLike | Any, shape: tuple[int | None, ...]) -> Array:
     """`value` as an array of JAX's default float type, of this shape (None: any length)."""
+    spelled = str(shape).replace("None", "n")
     try:
-        array = jnp.asarray(value, dtype=float)
+        if is_traced(value):
+            array = jnp.asarray(value, dtype=float)
+        else:
+            with jax.ensure_compile_time_eval():
+                array = jnp.asarray(value, dtype=float)
     except (TypeError, ValueError) as fault:
-        raise ValueError(f"{name} must be numbers of shape {_spell(shape)}; got {value!r}.") from fault
+        raise ValueError(f"{name} must be numbers of shape {spelled}; got {value!r}.") from fault
     fits = array.ndim == len(shape) and all(
         want in (None, got) for want, got in zip(shape, array.shape, strict=True)
     )
     if not fits:
-        raise ValueError(f"{name} must have shape {_spell(shape)}; got shape {array.shape}.")
-    return require(jnp.isfinite(array), f"{name} must be finite; got {_show(array)}.", array)
+        raise ValueError(f"{name} must have shape {spelled}; got shape {array.shape}.")
+    return require(array, finite, f"{name} must be finite; got {{got}}.")
 
 
 def number(
     name: str, value: ArrayLike | Any, *, above: float = -np.inf, below: float = np.inf, unit: str = ""
 ) -> Array:
     """`value` as a finite scalar strictly between `above` and `below`."""
-    scalar = finite_array(name, value, ())
-    between = " and ".join(
-        f"{word} {bound:g}"
-        for word, bound in (("greater than", above), ("less than", below))
-        if np.isfinite(bound)
+    bounds = (("greater than", above), ("less than", below))
+    between = " and ".join(f"{word} {bound:g}" for word, bound in bounds if np.isfinite(bound))
+    return require(
+        finite_array(name, value, ()),
+        lambda scalar: (scalar > above) & (scalar < below),
+        f"{name} must be {between}{' ' + unit if unit else ''}; got {{got}}.",
     )
-    message = f"{name} must be {between}{' ' + unit if unit else ''}; got {_show(scalar)}."
-    return require((scalar > above) & (scalar < below), message, scalar)
 
 
-def _show(array: Array) -> str:
-    return "a value known only at run time" if is_traced(array) else str(np.asarray(array))
-
-
-def _spell(shape: tuple[int | None, ...]) -> str:
-    return "() (one number)" if not shape else str(tuple("n" if n is None else n for n in shape)).replace("'", "")
+def unit_interval(name: str, value: ArrayLike | Any, shape: tuple[int | None, ...]) -> Array:
+    """`value` as an array of numbers in [0, 1]."""
+    array = finite_array(name, value, shape)
+    return require(array, lambda a: (a >= 0) & (a <= 1), f"{name} must be in [0, 1]; got {{got}}.")

@@ -16,18 +16,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .camera import Camera
-from .checks import require
+from .checks import finite, require
 from .locate import enter
 from .march import March
 from .reference import Progress, begin, end, samples_across, step
 from .rendering import Rendering
 from .transfer import TransferFunction
-from .triple import Triple, apart
 from .volume import Volume
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
-Pixel: TypeAlias = tuple[Int[Array, ""], Int[Array, ""]]
+Lanes: TypeAlias = Float[Array, " rays"]
+Points: TypeAlias = tuple[Lanes, Lanes, Lanes]
+Pixels: TypeAlias = tuple[Int[Array, " rays"], Int[Array, " rays"]]
 
 TILE = 64
 """Pixels along the side of a tile: 4096 rays. Smaller batches drown in kernel launches, larger ones
@@ -63,7 +64,7 @@ def render(
     **Returns:** a `Rendering` with leading shape (height, width), in float32.
 
     **Raises:** `ValueError` for an unknown adjoint, and for `"direct"` where the step or the spacing
-    is traced and `march.max_samples` was left at its default.
+    is traced and `march.max_samples` is not given.
 
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
@@ -94,8 +95,9 @@ def render_rays(
     origins, directions = _rays("origins", origins), _rays("directions", directions)
     if origins.shape != directions.shape:
         raise ValueError(f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}.")
-    norms = jnp.linalg.norm(directions, axis=-1, keepdims=True)
-    directions = require(norms > 0, "directions must not have length 0.", directions) / norms
+    message = "directions must not have length 0."
+    directions = require(directions, lambda d: jnp.any(d != 0, axis=-1), message)
+    directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     return _render_rays(volume, transfer, origins, directions, march, _Loop.of(adjoint, volume, march))
 
 
@@ -110,10 +112,10 @@ class _Loop(eqx.Module):
         if adjoint not in get_args(Adjoint):
             raise ValueError(f"adjoint must be one of {', '.join(get_args(Adjoint))}; got {adjoint!r}.")
         if adjoint != "direct":
-            return cls(adjoint, march.max_samples)
+            return cls(adjoint, march.most_samples)
         length = samples_across(volume, march)
         # to the next of few lengths, so that a change of step rarely compiles the program again
-        return cls(adjoint, min(-(-length // 64) * 64, march.max_samples))
+        return cls(adjoint, min(-(-length // 64) * 64, march.most_samples))
 
     def tiles(self, tile: Callable[[Any], Rendering], numbered: Any) -> Rendering:
         """Every tile's rendering, one after the other."""
@@ -170,14 +172,14 @@ def _render_rays(
     batch = min(TILE * TILE, max(count, 1))
     batches = -(-count // batch)
 
-    def in_batches(rays: Float[Array, "*rays 3"]) -> Float[Array, "batches 3 batch"]:
+    def in_batches(rays: Float[Array, "*_ 3"]) -> Float[Array, "_ 3 _"]:
         padded = jnp.pad(rays.reshape(count, 3), ((0, batches * batch - count), (0, 0)), mode="edge")
         return padded.reshape(batches, batch, 3).swapaxes(1, 2)
 
     def tile(given: tuple[Array, Array, Array]) -> Rendering:
         number, origin, direction = given
         place = number * batch + jnp.arange(batch)
-        rays = apart(origin), apart(direction)
+        rays = tuple(origin), tuple(direction)
         return _march(volume, transfer, rays, (place, jnp.zeros_like(place)), place < count, march, loop)
 
     def assemble(leaf: Array) -> Array:
@@ -190,8 +192,8 @@ def _render_rays(
 def _march(
     volume: Volume,
     transfer: TransferFunction,
-    rays: tuple[Triple, Triple],
-    pixel: Pixel,
+    rays: tuple[Points, Points],
+    pixel: Pixels,
     wanted: Bool[Array, " rays"],
     march: March,
     loop: _Loop,
@@ -209,4 +211,4 @@ def _rays(name: str, rays: ArrayLike | Any) -> Float[Array, "*rays 3"]:
     rays = jnp.asarray(rays, dtype=float)
     if rays.ndim < 1 or rays.shape[-1] != 3:
         raise ValueError(f"{name} must have shape (*rays, 3); got {rays.shape}.")
-    return require(jnp.isfinite(rays), f"{name} must be finite.", rays)
+    return require(rays, finite, f"{name} must be finite.")

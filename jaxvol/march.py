@@ -85,8 +85,8 @@ class March(eqx.Module):
     - `transforms`: applied in this order at every seam; none may be given twice.
     - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
       error falls with d. `"midpoint"`: in the middle; the error falls with d².
-    - `max_samples`: the most steps that a ray may take, against marches that never end. Rays that
-      need more are marked in `Rendering.exhausted`.
+    - `max_samples`: the most steps that a ray may take. Rays that need more are marked in
+      `Rendering.exhausted`. By default 131 072, against marches that never end.
 
     **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
     transform, and for a transform given twice.
@@ -95,17 +95,19 @@ class March(eqx.Module):
     step: Float[Array, ""]
     transforms: tuple[Transform, ...]
     quadrature: Literal["left", "midpoint"] = eqx.field(static=True)
-    max_samples: int = eqx.field(static=True)
+    max_samples: int | None = eqx.field(static=True)
 
     def __init__(
         self,
         step: Any,
-        transforms: tuple[Any, ...] | list[Any] = (),
-        quadrature: str = "left",
+        transforms: tuple[Transform, ...] | Any = (),
+        quadrature: Literal["left", "midpoint"] | Any = "left",
         *,
-        max_samples: int = 2**17,
+        max_samples: int | None = None,
     ):
         self.step = number("step", step, above=0)
+        if not isinstance(transforms, tuple | list):
+            raise ValueError(f"transforms must be a tuple, such as (AlphaCorrection(),); got {transforms!r}.")
         self.transforms = tuple(transforms)
         kinds = [type(t) for t in self.transforms]
         for transform in self.transforms:
@@ -117,9 +119,14 @@ class March(eqx.Module):
         if quadrature not in ("left", "midpoint"):
             raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
         self.quadrature = quadrature
-        if max_samples < 1:
+        if max_samples is not None and max_samples < 1:
             raise ValueError(f"max_samples must be at least 1; got {max_samples}.")
         self.max_samples = max_samples
+
+    @property
+    def most_samples(self) -> int:
+        """`max_samples`, or its default."""
+        return 2**17 if self.max_samples is None else self.max_samples
 
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""

@@ -1,11 +1,12 @@
 """What does one ray see? The definition: one ray, one cell after the other.
 
 Every combination of transforms means what this file says. There is no acceleration here. Front to
-back, a cell of extinction σ, colour c and width w, behind transmittance T, adds its weight:
+back, a cell of extinction σ, colour c and width w, behind opacity A, adds its weight:
 
-    α = 1 - exp(-σ w)        C ← C + T α c        T ← T - T α
+    α = 1 - exp(-σ w)        C ← C + (1 - A) α c        A ← A + (1 - A) α
 
-so that the weights of a ray and the transmittance that is left sum to 1.
+so that the weights of a ray and the transmittance T = 1 - A that is left sum to 1. It is A that is kept:
+in float32, taking thousands of small equal weights from a T near 1 would round the same way each time.
 """
 
 from typing import Any
@@ -35,7 +36,7 @@ class Progress(eqx.Module):
     index: Int[Array, ""]
     offset: Scalar
     color: Triple
-    transmittance: Scalar
+    opacity: Scalar
     moment: Scalar
     """Σ weight × depth past the entry."""
     samples: Int[Array, ""]
@@ -52,7 +53,7 @@ def begin(march: March, ray: Ray) -> Progress:
         index=count,
         offset=march.start(ray) * march.step,
         color=(zero, zero, zero),
-        transmittance=jnp.ones_like(zero),
+        opacity=zero,
         moment=zero,
         samples=count,
         aligned=no,
@@ -65,7 +66,7 @@ def step(march: March, ray: Ray, volume: Volume, classify: Classify, at: Progres
     """Sample one cell, blend it, and move on. Changes nothing once the ray is finished."""
     front = at.offset + at.index.astype(ray.length.dtype) * march.step
     cell = Cell(front, march.step, jnp.zeros_like(at.finished))
-    (r, g, b), transmittance, moment = at.color, at.transmittance, at.moment
+    (r, g, b), opacity, moment = at.color, at.opacity, at.moment
     samples, aligned = at.samples, at.aligned
     inside, transparent = jnp.zeros_like(at.finished), jnp.ones_like(at.finished)
 
@@ -74,10 +75,10 @@ def step(march: March, ray: Ray, volume: Volume, classify: Classify, at: Progres
         live = ~at.finished & (depth < ray.length)
         (red, green, blue), extinction = classify(ray.path(depth))
         extinction = jnp.where(live, extinction, 0)
-        weight = transmittance * -jnp.expm1(-extinction * piece.width)  # expm1: thin cells keep their digits
+        weight = (1 - opacity) * -jnp.expm1(-extinction * piece.width)  # expm1: thin cells keep their digits
         r, g, b = r + weight * red, g + weight * green, b + weight * blue
-        transmittance, moment = transmittance - weight, moment + weight * depth
-        samples, inside = samples + live, inside | live
+        opacity, moment = opacity + weight, moment + weight * depth
+        samples, inside = samples + live.astype(samples.dtype), inside | live
         transparent &= extinction == 0
         aligned |= piece.cut & (extinction > 0)
 
@@ -86,22 +87,21 @@ def step(march: March, ray: Ray, volume: Volume, classify: Classify, at: Progres
         index=at.index + 1,
         offset=at.offset + (steps - 1) * march.step,
         color=(r, g, b),
-        transmittance=transmittance,
+        opacity=opacity,
         moment=moment,
         samples=samples,
         aligned=aligned,
-        finished=at.finished | ~inside | march.stop(transmittance),
+        finished=at.finished | ~inside | march.stop(1 - opacity),
         memory=memory,
     )
 
 
 def end(ray: Ray, at: Progress) -> Rendering:
     """What the ray has seen."""
-    opacity = 1 - at.transmittance
-    seen = opacity > 0
-    depth = ray.t_in + at.moment / jnp.where(seen, opacity, 1)
+    seen = at.opacity > 0
+    depth = ray.t_in + at.moment / jnp.where(seen, at.opacity, 1)
     return Rendering(
-        rgba=jnp.stack([*at.color, opacity]),
+        rgba=jnp.stack([*at.color, at.opacity]),
         depth=jnp.where(seen, depth, jnp.inf),
         samples=at.samples,
         aligned=at.aligned,
@@ -117,7 +117,6 @@ def render_ray_reference(
     march: March,
     *,
     pixel: tuple[Any, Any] = (0, 0),
-    max_samples: int | None = None,
 ) -> Rendering:
     """What one ray sees, by a plain scan over its cells.
 
@@ -128,32 +127,33 @@ def render_ray_reference(
 
     - `origin`, `direction`: world point and unit direction of the ray.
     - `pixel`: (column, row), on which everything random depends.
-    - `max_samples`: length of the scan. The default suffices for every ray through the volume;
-      it cannot be derived where the step or the spacing is traced, and must be given there.
 
     **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
+
+    **Raises:** `ValueError` where the step or the spacing is traced and `march.max_samples` is not given:
+    the length of the scan cannot be known.
     """
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     ray = enter(march.locate(volume), apart(origin), apart(direction), pixel)
-    length = samples_across(volume, march) if max_samples is None else max_samples
     classify = transfer.over(volume)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(march, ray, volume, classify, at), None
 
-    at, _ = jax.lax.scan(one, begin(march, ray), None, length=length)
+    at, _ = jax.lax.scan(one, begin(march, ray), None, length=samples_across(volume, march))
     return end(ray, at)
 
 
 def samples_across(volume: Volume, march: March) -> int:
     """Steps that suffice for any ray through the volume: its diagonal, and a few that transforms may add."""
     if is_traced(volume.spacing, march.step):
+        if march.max_samples is not None:
+            return march.max_samples
         raise ValueError(
-            "max_samples must be given where march.step or volume.spacing is traced: "
+            "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
             "the length of a scan must be known before the program is compiled."
         )
-    low, high = volume.corners
-    diagonal = float(np.linalg.norm(np.asarray(high - low)))
+    diagonal = np.linalg.norm((np.array(volume.shape) - 1) * np.asarray(volume.spacing))
     # the first cell may begin a step early, one step finds the exit, one more is shortened by a jitter
-    return min(int(np.ceil(diagonal / float(march.step))) + 4, march.max_samples)
+    return min(int(np.ceil(diagonal / float(march.step))) + 4, march.most_samples)

@@ -6,10 +6,9 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import finite_array, number, require
+from .checks import finite_array, number, require, unit_interval
 from .triple import Scalar, Triple
 from .volume import Volume
 
@@ -44,13 +43,14 @@ class TransferFunction(eqx.Module):
         n = values.shape[0]
         if n < 2:
             raise ValueError(f"values must hold at least 2 control points; got {n}.")
-        increasing = values[1:] > values[:-1]
-        message = f"values must increase from point to point; got {values}. Sort the points, and move equal ones apart."
-        self.values = require(increasing, message, values)
+        self.values = require(
+            values,
+            lambda v: v[1:] > v[:-1],
+            "values must increase from point to point; got {got}. Sort the points, and move equal ones apart.",
+        )
         self.colors = finite_array("colors", colors, (n, 3))
         extinction = finite_array("extinction", extinction, (n,))
-        message = f"extinction must not be negative; got {extinction}."
-        self.extinction = require(extinction >= 0, message, extinction)
+        self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
 
     @classmethod
     def from_points(
@@ -116,7 +116,5 @@ def extinction_of(opacity: ArrayLike | Any, unit_distance: ArrayLike | Any = 1.0
     largest float32 below 1. **Raises** `ValueError` for an opacity outside [0, 1].
     """
     unit_distance = number("unit_distance", unit_distance, above=0)
-    opacity = finite_array("opacity", opacity, (None,))
-    message = f"opacity must be in [0, 1]; got {opacity}."
-    opacity = require((opacity >= 0) & (opacity <= 1), message, opacity)
-    return -jnp.log1p(-jnp.minimum(opacity, 1 - np.float32(2) ** -24)) / unit_distance
+    opacity = unit_interval("opacity", opacity, (None,))
+    return -jnp.log1p(-jnp.minimum(opacity, 1 - 2.0**-24)) / unit_distance

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, Shaped
 
-from .checks import finite_array, is_traced, require
+from .checks import finite, finite_array, is_traced, require
 from .triple import Scalar, Triple
 
 
@@ -50,7 +50,7 @@ class Volume(eqx.Module):
     ):
         self.data = _voxels(data)
         spacing = finite_array("spacing", spacing, (3,))
-        self.spacing = require(spacing > 0, f"spacing must be positive along every axis; got {spacing}.", spacing)
+        self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}.")
         self.origin = finite_array("origin", origin, (3,))
         self.labels = None if labels is None else _labels(labels, self.data.shape)
 
@@ -165,11 +165,9 @@ def _voxels(data: ArrayLike | Any) -> Array:
     if data.size >= 2**31:
         raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
     if data.dtype.kind not in "ui":
-        bad = ~jnp.isfinite(data) if is_traced(data) else ~np.isfinite(np.asarray(data, dtype=np.float32))
-        count = "some" if is_traced(data) else f"{int(bad.sum())} of {data.size}"
-        data = require(
-            ~bad, f"data must be finite; got {count} voxels that are NaN or infinite. Replace them first.", data
-        )
+        count = "some" if is_traced(data) else f"{np.sum(~finite(np.asarray(data)))} of {data.size}"
+        message = f"data must be finite; got {count} voxels that are NaN or infinite. Replace them first."
+        data = require(data, finite, message)
     return jnp.asarray(data)
 
 

@@ -1,0 +1,9 @@
+"""`python -m jaxvol` is the command `jaxvol`."""
+
+import sys
+
+from .cli import main
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""Which arrays are in a NumPy file? Read without numpy's own loader, which would take memory on trust."""
+
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .files import CORRUPT, MOST_VOXELS, Header, Stream, as_array, check_size, decoding, file_size, read_all
+
+
+def read_npy(path: Path, header: Header) -> dict[str, Any]:
+    """Reader of `.npy`: one array, which is the data."""
+    header.refuse(path)
+    held = file_size(path)
+    with decoding(path), path.open("rb") as stream:
+        return {"data": _npy_array(path, stream, held)}
+
+
+def read_npz(path: Path, header: Header) -> dict[str, Any]:
+    """Reader of `.npz`: arrays named as the arguments of `Volume`, or one array of any name."""
+    header.refuse(path)
+    file_size(path)
+    with decoding(path), zipfile.ZipFile(path) as archive:
+        arrays = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        if "data" in arrays:
+            arrays = {k: arrays[k] for k in ("data", "spacing", "origin", "labels") if k in arrays}
+        elif len(arrays) == 1:
+            arrays = {"data": next(iter(arrays.values()))}
+        else:
+            raise ValueError(
+                f"path: {path} must hold an array called data, or one array; got {sorted(arrays)}. "
+                "Save it with np.savez(path, data=...)."
+            )
+        found = {}
+        for name, member in arrays.items():
+            with archive.open(member) as stream:
+                found[name] = _npy_array(path, stream, member.file_size)
+        return found
+
+
+def _npy_array(path: Path, stream: Stream, held: int) -> np.ndarray:
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    try:
+        shape, fortran, dtype = readers[np.lib.format.read_magic(stream)](stream)
+    except CORRUPT:
+        raise
+    except Exception as fault:  # what numpy raises depends on how the header is broken
+        raise ValueError(f"path: {path} has no valid .npy header ({fault!r}).") from fault
+    if dtype.kind not in "iuf":
+        raise ValueError(
+            f"path: {path} holds an array of type {dtype}; expected integers or floats. "
+            "Arrays of objects are pickles, which are never read."
+        )
+    if not 0 < math.prod(shape) <= MOST_VOXELS or min(shape, default=1) < 0:
+        raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
+    expected = math.prod(shape) * dtype.itemsize
+    check_size(path, held - stream.tell(), expected)
+    return as_array(read_all(path, stream, expected), shape, dtype, "F" if fortran else "C")

@@ -1,0 +1,136 @@
+"""How far is a point from the surface of a shape, and in which box does the shape lie?
+
+Distances are signed, negative inside, and in world units: exact for round shapes, and to first
+order at the surface for the others.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+
+Point: TypeAlias = Sequence[float | int]
+Block: TypeAlias = Float[np.ndarray, "_ _ _"]
+Distance: TypeAlias = Callable[[Block, Block, Block], Block]
+
+
+class Shape(NamedTuple):
+    """Signed distance at open (x, y, z), and two corners of the box the shape lies in."""
+
+    distance: Distance
+    low: Point
+    high: Point
+
+
+def _around(distance: Distance, center: Point, half: Point) -> Shape:
+    low, high = (tuple(c + s * h for c, h in zip(center, half, strict=True)) for s in (-1, 1))
+    return Shape(distance, low, high)
+
+
+def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
+    """`yaw` turns it about the z axis through its centre, in radians."""
+    (cx, cy, cz), (rx, ry, rz) = center, radii
+    c, s, small = float(np.cos(yaw)), float(np.sin(yaw)), min(radii)
+
+    def distance(x, y, z):
+        x, y, z = x - cx, y - cy, z - cz
+        if yaw:
+            x, y = c * x + s * y, c * y - s * x
+        level = np.sqrt((x / rx) ** 2 + (y / ry) ** 2 + (z / rz) ** 2)
+        slope = np.sqrt((x / rx**2) ** 2 + (y / ry**2) ** 2 + (z / rz**2) ** 2)
+        # level / slope is 0 / 0 at the centre; the terms added make it the smallest radius there
+        return (level - 1) * (level + 1e-3) / (slope + 1e-3 / small)
+
+    wide = max(rx, ry)
+    return _around(distance, center, (wide, wide, rz) if yaw else radii)
+
+
+def ball(center: Point, radius: float) -> Shape:
+    return ellipsoid(center, (radius,) * 3)
+
+
+def to_segment(x: Block, y: Block, z: Block, a: Point, b: Point) -> tuple[Block, Block]:
+    """Distance to the segment a b, and how far along it the nearest point is, 0 to 1."""
+    dx, dy, dz = (float(q - p) for p, q in zip(a, b, strict=True))
+    x, y, z = x - float(a[0]), y - float(a[1]), z - float(a[2])
+    square = dx * dx + dy * dy + dz * dz
+    t = np.clip(x * (dx / square) + y * (dy / square) + z * (dz / square), 0, 1)
+    return np.sqrt((x - t * dx) ** 2 + (y - t * dy) ** 2 + (z - t * dz) ** 2), t
+
+
+def capsule(a: Point, b: Point, radius: float, end_radius: float | None = None) -> Shape:
+    """The points near the segment a b; its radius goes linearly from `radius` to `end_radius`."""
+    end = radius if end_radius is None else end_radius
+
+    def distance(x, y, z):
+        away, t = to_segment(x, y, z, a, b)
+        return away - (radius + t * (end - radius))
+
+    wide = max(radius, end)
+    low = tuple(min(p, q) - wide for p, q in zip(a, b, strict=True))
+    high = tuple(max(p, q) + wide for p, q in zip(a, b, strict=True))
+    return Shape(distance, low, high)
+
+
+def tube(points: Sequence[Point], radius: float) -> list[Shape]:
+    return [capsule(a, b, radius) for a, b in pairwise(points)]
+
+
+def box(center: Point, half: Point, rounding: float = 0.02) -> Shape:
+    def distance(x, y, z):
+        q = [abs(v - c) - (h - rounding) for v, c, h in zip((x, y, z), center, half, strict=True)]
+        outside = np.sqrt(sum(np.maximum(v, 0) ** 2 for v in q))
+        return outside + np.minimum(np.maximum(np.maximum(q[0], q[1]), q[2]), 0) - rounding
+
+    return _around(distance, center, half)
+
+
+def cylinder(axis: int, center: Point, radius: float, half: float, sides: int = 0, wave: int = 0) -> Shape:
+    """Along a coordinate axis. `sides`: a prism instead. `wave`: this many gear teeth around it."""
+    tooth = 0.012 if wave else 0.0
+    turns = (np.arange(sides) * (2 * np.pi / max(sides, 1))).tolist()
+
+    def distance(x, y, z):
+        p = [v - float(c) for v, c in zip((x, y, z), center, strict=True)]
+        along = p.pop(axis)
+        u, v = p
+        if sides:
+            side = reduce(np.maximum, (float(np.cos(t)) * u + float(np.sin(t)) * v for t in turns)) - radius
+        else:
+            side = np.sqrt(u * u + v * v) - radius
+        if wave:
+            side = side + tooth * np.sin(wave * np.arctan2(u, v))
+        return np.maximum(side, abs(along) - half)
+
+    wide = radius / float(np.cos(np.pi / sides)) if sides else radius + tooth
+    return _around(distance, center, tuple(half if i == axis else wide for i in range(3)))
+
+
+def ring(center: Point, radius: float, thickness: float) -> Shape:
+    """A torus about the z direction."""
+    cx, cy, cz = center
+
+    def distance(x, y, z):
+        across = np.sqrt((x - cx) ** 2 + (y - cy) ** 2) - radius
+        return np.sqrt(across**2 + (z - cz) ** 2) - thickness
+
+    return _around(distance, center, (radius + thickness, radius + thickness, thickness))
+
+
+def pair(*shapes: Shape) -> list[Shape]:
+    """Every shape and its mirror image in the plane x = 0."""
+
+    def mirror(shape: Shape) -> Shape:
+        low, high = (-shape.high[0], *shape.low[1:]), (-shape.low[0], *shape.high[1:])
+        return Shape(lambda x, y, z: shape.distance(-x, y, z), low, high)
+
+    return [side for shape in shapes for side in (shape, mirror(shape))]
+
+
+def lengths(line: Float[np.ndarray, "points axes"]) -> Float[np.ndarray, " points"]:
+    """Length of a polyline from its first point up to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])

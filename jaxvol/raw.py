@@ -1,0 +1,91 @@
+"""Which array is in a file that has no header of its own?
+
+Its shape and type are told by the caller, by a JSON beside it, or by its name.
+"""
+
+import gzip
+import json
+import math
+import operator
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, read_all
+
+
+JSON_KEYS = {"size": "shape", "type": "dtype", "spacing": "spacing", "origin": "origin"}
+SCIVIS_NAME = re.compile(r"_([0-9]+)x([0-9]+)x([0-9]+)_([^_.]+)\.raw(\.gz)?$", re.IGNORECASE)
+RAW_DTYPE = re.compile(r"(u?int8|u?int16|float16|float32|float64)(le|be)?", re.IGNORECASE)
+
+
+def read_raw(path: Path, header: Header) -> dict[str, Any]:
+    """Reader of `.raw` and `.raw.gz`, x fastest."""
+    held = file_size(path)
+    given = {name: said for name, said in header._asdict().items() if said is not None}
+    said = _name_header(path) | _json_header(path) | given
+    if not {"shape", "dtype"} <= said.keys():
+        raise ValueError(
+            f"path: nothing says which shape and dtype {path} has. Give load(path, shape=(nx, ny, nz), "
+            f'dtype="uint8"), or call it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
+            '{"size": [nx, ny, nz], "type": "uint8"}.'
+        )
+    shape, dtype = _raw_shape(path, said.pop("shape")), _raw_dtype(path, said.pop("dtype"))
+    expected = math.prod(shape) * dtype.itemsize
+    if path.name.lower().endswith(".gz"):
+        # the size in gzip's trailer is the writer's claim, and modulo 2**32: only reading tells
+        with decoding(path), gzip.open(path) as stream:
+            content = read_all(path, stream, expected)
+    else:
+        check_size(path, held, expected)
+        with path.open("rb") as stream:
+            content = read_all(path, stream, expected)
+    return {"data": as_array(content, shape, dtype, "F"), **said}
+
+
+def _name_header(path: Path) -> dict[str, Any]:
+    match = SCIVIS_NAME.search(path.name)
+    return {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
+
+
+def _json_header(path: Path) -> dict[str, Any]:
+    bare = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+    beside = [file for name in (path.name, bare) if (file := path.with_name(f"{name}.json")).is_file()]
+    if not beside:
+        return {}
+    try:
+        said = json.loads(beside[0].read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as fault:
+        raise ValueError(f"path: the header {beside[0]} is not JSON ({fault}).") from fault
+    if not isinstance(said, dict):
+        raise ValueError(
+            f"path: the header {beside[0]} must be a JSON object with the keys {', '.join(JSON_KEYS)}; "
+            f"got {type(said).__name__}."
+        )
+    return {name: said[key] for key, name in JSON_KEYS.items() if key in said}
+
+
+def _raw_shape(path: Path, shape: Any) -> tuple[int, ...]:
+    try:
+        sizes = tuple(map(operator.index, shape))
+    except TypeError:
+        sizes = ()
+    if len(sizes) != 3 or min(sizes) < 1 or math.prod(sizes) > MOST_VOXELS:
+        raise ValueError(
+            "shape must be three positive integers (nx, ny, nz) with a product less than 2**31; "
+            f"got {shape!r} for {path}."
+        )
+    return sizes
+
+
+def _raw_dtype(path: Path, dtype: Any) -> np.dtype:
+    match = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8 is called "uint8"
+    if match is None:
+        raise ValueError(
+            "dtype must be uint8, int8, uint16, int16, float16, float32 or float64, with le or be appended "
+            f"for its byte order; got {dtype!r} for {path}."
+        )
+    name, order = match[1].lower(), (match[2] or "le").lower()
+    return np.dtype(name).newbyteorder("<" if order == "le" else ">")

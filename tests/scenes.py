@@ -1,0 +1,103 @@
+"""Small scenes that share shapes, so that one compiled program serves them all."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvol as jv
+
+
+RESOLUTION = 24
+SIZE = (20, 16)
+
+# eight control points each, on the values of the phantoms scaled to [0, 1]
+SOFT = [
+    (0.0, (0.1, 0.2, 0.9), 0.0),
+    (0.1, (0.2, 0.3, 0.8), 0.0),
+    (0.25, (0.3, 0.9, 0.2), 0.1),
+    (0.4, (0.9, 0.4, 0.1), 0.3),
+    (0.55, (0.9, 0.8, 0.2), 0.2),
+    (0.7, (0.6, 0.6, 0.6), 0.6),
+    (0.85, (0.9, 0.9, 0.9), 0.8),
+    (1.0, (1.0, 1.0, 1.0), 0.9),
+]
+
+
+def soft_transfer(unit_distance: float = 0.5) -> jv.TransferFunction:
+    """Clear below 0.1, denser above."""
+    return jv.TransferFunction.from_points(SOFT, unit_distance)
+
+
+def uniform_transfer(extinction: float, color=(1.0, 1.0, 1.0)) -> jv.TransferFunction:
+    """The same colour and extinction for every value."""
+    return jv.TransferFunction(np.linspace(0, 1, 8), np.tile(color, (8, 1)), np.full(8, extinction))
+
+
+def scaled_phantom(name: str, resolution: int = RESOLUTION) -> jv.Volume:
+    """A phantom with float32 values in [0, 1]."""
+    volume = jv.phantom(name, resolution)
+    top = 255.0 if volume.data.dtype == jnp.uint8 else 1.0
+    return jv.Volume(np.asarray(volume.data, np.float32) / top, volume.spacing, volume.origin)
+
+
+def anisotropic_noise(seed: int = 0) -> jv.Volume:
+    """Independent values at every node, on a grid with three different spacings away from the origin."""
+    data = np.random.default_rng(seed).random((RESOLUTION,) * 3, dtype=np.float32)
+    return jv.Volume(data, spacing=(0.05, 0.08, 0.11), origin=(0.3, -1.2, 0.4))
+
+
+VOLUMES: dict[str, Callable[[], jv.Volume]] = {
+    "head": lambda: scaled_phantom("sphere"),
+    "cut_block": lambda: scaled_phantom("cut_block"),
+    "noise": anisotropic_noise,
+}
+
+
+def around(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
+    """A camera that sees all of the volume from a direction without symmetry."""
+    return jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=size)
+
+
+def inside(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
+    """A camera in the volume."""
+    low, high = volume.corners
+    return jv.Camera(low + 0.4 * (high - low), high, (0, 0, 1), 70.0, size=size)
+
+
+def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
+    """A parallel view along +z, from outside."""
+    low, high = volume.corners
+    position = volume.center - jnp.asarray([0.0, 0.0, 1.0]) * (high - low)[2]
+    return jv.Camera(position, volume.center, (0, 1, 0), size=size, parallel_scale=0.55 * (high - low)[1])
+
+
+CAMERAS = {"around": around, "inside": inside, "orthographic": orthographic}
+
+TRANSFORMS: dict[str, tuple[jv.Transform, ...]] = {
+    "plain": (),
+    "aligned": (jv.AlphaCorrection(),),
+    "terminated": (jv.EarlyTermination(0.05),),
+    "aligned, terminated": (jv.AlphaCorrection(), jv.EarlyTermination(0.05)),
+}
+
+
+@contextmanager
+def in_float64() -> Iterator[None]:
+    """JAX with 64-bit types; make what is to be float64 inside, or cast it by `doubled`."""
+    with jax.enable_x64(True):
+        yield
+
+
+def doubled(tree):
+    """The same numbers in float64. Voxels keep their type."""
+
+    def double(leaf):
+        if eqx.is_inexact_array(leaf) and leaf.ndim < 3:
+            return jnp.asarray(np.asarray(leaf, np.float64))
+        return leaf
+
+    return jax.tree.map(double, tree)

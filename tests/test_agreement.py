@@ -1,0 +1,108 @@
+"""One truth: render, the reference engine and an independent float64 marcher give the same image."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+from . import oracle
+from .scenes import CAMERAS, TRANSFORMS, VOLUMES, doubled, in_float64, soft_transfer
+
+
+STEP = 0.07
+
+
+def oracle_image(volume, transfer, camera, march):
+    """The independent marcher's rgba and samples, for the rays that the camera gave."""
+    origins, directions = camera.rays()
+    kinds = {type(t): t for t in march.transforms}
+    ending = kinds.get(jv.EarlyTermination)
+    rgba, samples = oracle.march(
+        volume.data,
+        volume.spacing,
+        volume.origin,
+        (transfer.values, transfer.colors, transfer.extinction),
+        origins,
+        directions,
+        float(march.step),
+        midpoint=march.quadrature == "midpoint",
+        align=jv.AlphaCorrection in kinds,
+        opacity_left=None if ending is None else float(ending.opacity_left),
+    )
+    shape = origins.shape[:-1]
+    return rgba.reshape(*shape, 4), samples.reshape(shape)
+
+
+def compare(rendering, rgba, samples, *, tolerance, left=0.0):
+    """Within the tolerance where as many samples were taken. Where rounding moved the sample at which a
+    ray leaves or ends, by no more than one, the images may differ by what that one sample adds."""
+    off = np.abs(np.asarray(rendering.rgba) - rgba).max(axis=-1)
+    moved = np.asarray(rendering.samples) != samples
+    assert np.abs(np.asarray(rendering.samples) - samples).max() <= 1
+    assert moved.mean() < 0.01
+    assert off[~moved].max() <= tolerance
+    assert not moved.any() or off[moved].max() <= max(left, tolerance)
+
+
+@eqx.filter_jit
+def reference_image(volume, transfer, origins, directions, march):
+    def one(origin, direction):
+        return jv.render_ray_reference(volume, transfer, origin, direction, march)
+
+    return jax.vmap(jax.vmap(one))(origins, directions)
+
+
+@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("transforms", TRANSFORMS)
+def test_three_engines_agree(transforms, quadrature):
+    march = jv.March(STEP, TRANSFORMS[transforms], quadrature, max_samples=80)
+    left = 0.05 if "terminated" in transforms else 0.0
+    transfer = soft_transfer()
+    for volume in (make() for make in VOLUMES.values()):
+        for view in CAMERAS.values():
+            camera = view(volume)
+            rendering = jv.render(volume, transfer, camera, march)
+            compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5, left=left)
+            reference = reference_image(volume, transfer, *camera.rays(), march)
+            assert not np.any(reference.exhausted)
+            compare(rendering, reference.rgba, np.asarray(reference.samples), tolerance=2e-5, left=left)
+            np.testing.assert_array_equal(rendering.aligned, reference.aligned)
+
+
+@pytest.mark.parametrize("transforms", TRANSFORMS)
+def test_reference_in_float64_is_the_independent_marcher_to_rounding(transforms):
+    with in_float64():
+        march = doubled(jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80))
+        transfer = doubled(soft_transfer())
+        for make in VOLUMES.values():
+            volume = doubled(make())
+            camera = doubled(CAMERAS["around"](volume))
+            reference = reference_image(volume, transfer, *camera.rays(), march)
+            assert reference.rgba.dtype == jnp.float64
+            rgba, samples = oracle_image(volume, transfer, camera, march)
+            np.testing.assert_array_equal(reference.samples, samples)
+            np.testing.assert_allclose(reference.rgba, rgba, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("file", "spacing", "points"),
+    [
+        ("engine_256x256x128_uint8.raw.gz", (1, 1, 1), [(50, 0.0), (120, 0.05), (255, 0.3)]),
+        ("lidc0314_airway_256x192x200_int16le.raw.gz", (0.78125, 0.78125, 1), [(-600, 0.0), (0, 0.05), (1500, 0.3)]),
+        ("cthead_256x256x113_uint16le.raw.gz", (1, 1, 2), [(300, 0.0), (1000, 0.02), (3000, 0.3)]),
+    ],
+)
+def test_real_volumes_agree_with_the_independent_marcher(real_volume, file, spacing, points):
+    volume = jv.load(real_volume(file), spacing=spacing)
+    colors = [(0.2, 0.1, 0.1), (0.8, 0.5, 0.3), (1.0, 1.0, 1.0)]
+    transfer = jv.TransferFunction.from_points(
+        [(value, color, opacity) for (value, opacity), color in zip(points, colors, strict=True)]
+    )
+    camera = CAMERAS["around"](volume, (40, 40))
+    march = jv.March(0.8, (jv.AlphaCorrection(),), "left")
+    rendering = jv.render(volume, transfer, camera, march)
+    assert float(rendering.rgba[..., 3].max()) > 0.9
+    compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5)

@@ -1,0 +1,122 @@
+"""Which ray belongs to which pixel."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+
+POSITION, FOCUS = (3.0, -4.0, 2.0), (0.5, 1.0, 0.0)
+
+
+def unit(v):
+    return np.asarray(v) / np.linalg.norm(v)
+
+
+def test_the_middle_of_the_image_looks_at_the_focal_point():
+    origins, directions = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=(5, 3)).rays()
+    assert origins.shape == directions.shape == (3, 5, 3)
+    np.testing.assert_allclose(directions[1, 2], unit(np.subtract(FOCUS, POSITION)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
+    np.testing.assert_allclose(origins, np.broadcast_to(POSITION, origins.shape), atol=1e-7)
+
+
+@pytest.mark.parametrize("parallel_scale", [None, 2.0])
+def test_pixel_0_0_is_the_top_left(parallel_scale):
+    camera = jv.Camera((0, 0, 5), (0, 0, 0), (0, 1, 0), size=(8, 6), parallel_scale=parallel_scale)
+    origins, directions = camera.rays()
+    seen = origins + 5 * directions
+    assert seen[0, 0, 0] < 0 < seen[0, -1, 0]  # x to the right, looking along -z with y up
+    assert seen[0, 0, 1] > 0 > seen[-1, 0, 1]
+
+
+def test_view_angle_spans_the_height_and_pixels_are_square():
+    _, directions = jv.Camera((0, 0, 1), (0, 0, 0), size=(40, 20), view_angle=50).rays()
+    plane = np.asarray(directions / -directions[..., 2:])
+    pixel = 2 * np.tan(np.radians(25)) / 20
+    np.testing.assert_allclose(plane[0, 0, :2], (-19.5 * pixel, 9.5 * pixel), rtol=1e-5)
+    np.testing.assert_allclose(np.diff(plane[:, :, 0], axis=1), pixel, rtol=1e-4)
+    np.testing.assert_allclose(np.diff(plane[:, :, 1], axis=0), -pixel, rtol=1e-4)
+
+
+def test_parallel_scale_is_half_the_height():
+    origins, directions = jv.Camera((0, 0, 1), (0, 0, 0), size=(40, 20), parallel_scale=3).rays()
+    np.testing.assert_allclose(directions, np.broadcast_to((0, 0, -1), directions.shape), atol=1e-7)
+    np.testing.assert_allclose(origins[0, 0], (-5.85, 2.85, 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("parallel_scale", [None, 2.0])
+def test_crop_gives_the_same_rays(parallel_scale):
+    camera = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=(30, 20), parallel_scale=parallel_scale)
+    crop = camera.crop(7, 3, 12, 9)
+    assert crop.size == (12, 9)
+    for part, whole in zip(crop.rays(), camera.rays(), strict=True):
+        np.testing.assert_allclose(part, whole[3:12, 7:19], atol=1e-6)
+    for part, whole in zip(crop.crop(2, 1, 4, 5).rays(), camera.rays(), strict=True):
+        np.testing.assert_allclose(part, whole[4:9, 9:13], atol=1e-6)
+
+
+def test_zoom_magnifies_around_a_point():
+    camera = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=(40, 20))
+    _, whole = camera.rays()
+    _, zoomed = camera.zoom(4).rays()
+    # the middle quarter, at four times the pixels: four of them make one
+    coarse = unit_each(zoomed.reshape(5, 4, 10, 4, 3).sum((1, 3)))
+    np.testing.assert_allclose(coarse[2, 5], unit(whole[9:11, 20:21].sum((0, 1))), atol=2e-2)
+    _, corner = camera.zoom(2, center=(0.25, 0.25)).rays()
+    np.testing.assert_allclose(unit(corner[0:2, 0:2].sum((0, 1))), whole[0, 0], atol=1e-4)
+
+
+def unit_each(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def test_looking_at_sees_every_corner_of_the_volume():
+    volume = jv.Volume(np.zeros((4, 5, 6), np.uint8), spacing=(10, 3, 1), origin=(7, -5, 2))
+    low, high = (np.asarray(end) for end in volume.corners)
+    for size in ((40, 20), (20, 40)):
+        camera = jv.Camera.looking_at(volume, (1, 2, 0.5), size=size)
+        right, up, forward = (np.asarray(axis) for axis in camera._axes())
+        for corner in np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3):
+            view = corner - np.asarray(camera.position)
+            height = np.tan(np.radians(15)) * (view @ forward)
+            assert abs(view @ up) <= height
+            assert abs(view @ right) <= height * size[0] / size[1]
+
+
+def test_rays_are_differentiable_in_the_camera():
+    def middle(position):
+        return jv.Camera(position, FOCUS, (0, 0, 1), size=(3, 3)).rays()[1][1, 1]
+
+    jacobian = jax.jacfwd(middle)(jnp.asarray(POSITION))
+    view = np.subtract(FOCUS, POSITION)
+    expected = -(np.eye(3) - np.outer(unit(view), unit(view))) / np.linalg.norm(view)
+    np.testing.assert_allclose(jacobian, expected, atol=1e-6)
+
+
+BAD = {
+    "at its focal point": (lambda: jv.Camera(FOCUS, FOCUS), "position must differ from focal_point"),
+    "up along the view": (lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 1, 0)), "view_up must not be zero or point along"),
+    "up zero": (lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 0, 0)), "view_up must not be zero"),
+    "size 0": (lambda: jv.Camera(POSITION, FOCUS, size=(0, 5)), r"size must be .* at least 1; got \(0, 5\)"),
+    "half a pixel": (lambda: jv.Camera(POSITION, FOCUS, size=(4.5, 5)), "size must be"),
+    "one size": (lambda: jv.Camera(POSITION, FOCUS, size=5), "size must be"),
+    "angle 180": (lambda: jv.Camera(POSITION, FOCUS, view_angle=180), "view_angle must be .* less than 180 degrees"),
+    "NaN": (lambda: jv.Camera((0, np.nan, 0), FOCUS), "position must be finite"),
+    "scale 0": (lambda: jv.Camera(POSITION, FOCUS, parallel_scale=0), "parallel_scale must be greater than 0"),
+    "crop outside": (lambda: jv.Camera(POSITION, FOCUS, size=(9, 9)).crop(5, 5, 5, 2), "crop must be a rectangle inside"),
+    "zoom 0": (lambda: jv.Camera(POSITION, FOCUS).zoom(0), "zoom factor must be greater than 0"),
+    "no direction": (
+        lambda: jv.Camera.looking_at(jv.Volume(np.zeros((2, 2, 2), np.uint8)), (0, 0, 0)),
+        "direction must not be zero",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,151 @@
+"""Tiles and batches do not show; nothing is compiled twice; memory does not grow with the image."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol import engine
+
+from .scenes import anisotropic_noise, around, soft_transfer
+
+
+MARCH = jv.March(0.07, (jv.AlphaCorrection(),))
+
+
+def assert_same(a, b, tolerance=1e-6):
+    for name in ("rgba", "depth", "samples", "aligned", "exhausted"):
+        left, right = np.asarray(getattr(a, name), float), np.asarray(getattr(b, name), float)
+        np.testing.assert_array_equal(np.isinf(left), np.isinf(right))
+        np.testing.assert_allclose(left, right, atol=tolerance, rtol=0, err_msg=name)
+
+
+@pytest.mark.parametrize("size", [(70, 3), (3, 70), (65, 65), (1, 1)])
+def test_tiles_do_not_show(size, monkeypatch):
+    volume = anisotropic_noise()
+    camera = around(volume, size)
+    whole = jv.render(volume, soft_transfer(), camera, MARCH)
+    assert whole.rgba.shape == (size[1], size[0], 4)
+    assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
+    monkeypatch.setattr(engine, "TILE", 16)
+    jax.clear_caches()
+    assert_same(whole, jv.render(volume, soft_transfer(), camera, MARCH))
+    jax.clear_caches()
+
+
+def test_rays_of_ones_own_see_what_the_camera_sees():
+    volume = anisotropic_noise()
+    camera = around(volume, (70, 66))
+    origins, directions = camera.rays()
+    rays = jv.render_rays(volume, soft_transfer(), origins, 3 * directions, MARCH)
+    assert_same(rays, jv.render(volume, soft_transfer(), camera, MARCH), 2e-5)
+    alone = jv.render_rays(volume, soft_transfer(), origins[3, 5], directions[3, 5], MARCH)
+    assert alone.rgba.shape == (4,)
+    np.testing.assert_allclose(alone.rgba, rays.rgba[3, 5], atol=2e-5)
+    none = jv.render_rays(volume, soft_transfer(), origins[:0], directions[:0], MARCH)
+    assert none.rgba.shape == (0, 70, 4)
+
+
+@pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
+def test_adjoints_share_one_image(adjoint):
+    volume = anisotropic_noise()
+    camera = around(volume, (12, 10))
+    plain = jv.render(volume, soft_transfer(), camera, MARCH)
+    assert_same(plain, jv.render(volume, soft_transfer(), camera, MARCH, adjoint=adjoint))
+
+
+def test_crop_renders_the_same_pixels():
+    volume = anisotropic_noise()
+    camera = around(volume, (30, 20))
+    whole = jv.render(volume, soft_transfer(), camera, MARCH)
+    part = jv.render(volume, soft_transfer(), camera.crop(11, 4, 9, 7), MARCH)
+    np.testing.assert_allclose(part.rgba, whole.rgba[4:11, 11:20], atol=2e-5)
+
+
+def test_one_program_serves_all_cameras_steps_transfer_functions_and_volumes():
+    traces = 0
+
+    class Counting(jv.TransferFunction):
+        def over(self, volume):
+            nonlocal traces
+            traces += 1
+            return super().over(volume)
+
+    for i in range(4):
+        volume = anisotropic_noise(seed=i)
+        transfer = Counting(*jax.tree.leaves(soft_transfer(0.3 + 0.1 * i)))
+        camera = around(volume, (6, 5)).zoom(1 + i)
+        march = jv.March(0.05 + 0.01 * i, (jv.AlphaCorrection(), jv.EarlyTermination(0.01 + 0.01 * i)))
+        jax.block_until_ready(jv.render(volume, transfer, camera, march))
+    assert traces == 1
+
+
+def test_runs_inside_jit_and_vmap():
+    volume = anisotropic_noise()
+    cameras = [around(volume, (6, 5)), around(volume, (6, 5)).zoom(2)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+
+    @eqx.filter_jit
+    def both(cameras):
+        return eqx.filter_vmap(lambda camera: jv.render(volume, soft_transfer(), camera, MARCH))(cameras)
+
+    renderings = both(stacked)
+    for i, camera in enumerate(cameras):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], renderings)
+        assert_same(one, jv.render(volume, soft_transfer(), camera, MARCH), 2e-5)
+
+
+def test_memory_beside_the_image_does_not_grow_with_it():
+    volume = anisotropic_noise()
+
+    def workspace(side):
+        arguments = volume, soft_transfer(), around(volume, (side, side)), MARCH
+        return eqx.filter_jit(jv.render).lower(*arguments).compile().compiled.memory_analysis().temp_size_in_bytes
+
+    small, large = workspace(256), workspace(1024)
+    pixels = 1024**2 - 256**2
+    bytes_per_pixel = 4 * 4 + 4 + 4 + 1 + 1  # of a Rendering, in tiles before they are put together
+    assert large - small <= 1.1 * bytes_per_pixel * pixels
+
+
+@pytest.mark.parametrize("transforms", [(), (jv.AlphaCorrection(),), (jv.EarlyTermination(0.1),)])
+def test_a_transform_that_is_not_asked_for_leaves_no_trace(transforms):
+    """The program of a plain march is smaller, in operations, than that of any other."""
+    volume = anisotropic_noise()
+
+    def operations(transforms):
+        arguments = volume, soft_transfer(), around(volume, (8, 8)), jv.March(0.07, transforms)
+        return eqx.filter_jit(jv.render).lower(*arguments).compile().compiled.cost_analysis()["flops"]
+
+    assert operations(()) <= operations(transforms)
+    assert (operations(()) == operations(transforms)) == (transforms == ())
+
+
+def test_an_unknown_adjoint_is_named():
+    # not through render, whose annotation the checker of the tests enforces first
+    with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
+        engine._Loop.of("reverse", anisotropic_noise(), MARCH)
+
+
+def test_direct_under_jit_asks_for_the_number_of_samples():
+    volume = anisotropic_noise()
+
+    @jax.jit
+    def image(step):
+        return jv.render(volume, soft_transfer(), around(volume), jv.March(step), adjoint="direct").rgba
+
+    with pytest.raises(ValueError, match=r"March\(max_samples=...\) must be given"):
+        image(0.1)
+
+
+def test_direct_under_jit_with_the_number_of_samples_given():
+    volume = anisotropic_noise()
+
+    @jax.jit
+    def image(step):
+        march = jv.March(step, (jv.AlphaCorrection(),), max_samples=64)
+        return jv.render(volume, soft_transfer(), around(volume), march, adjoint="direct").rgba
+
+    np.testing.assert_allclose(image(0.07), jv.render(volume, soft_transfer(), around(volume), MARCH).rgba, atol=2e-5)

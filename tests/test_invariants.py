@@ -1,0 +1,245 @@
+"""What holds for every combination of transforms: energy, exactness, order, gradients."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.special import erf
+
+import jaxvol as jv
+from jaxvol.locate import Affine, enter
+from jaxvol.triple import apart
+
+from . import oracle
+from .scenes import (
+    CAMERAS,
+    TRANSFORMS,
+    VOLUMES,
+    around,
+    doubled,
+    in_float64,
+    scaled_phantom,
+    soft_transfer,
+    uniform_transfer,
+)
+
+
+def whitened(transfer):
+    """All colours white, so that a colour channel is the sum of the weights."""
+    return jv.TransferFunction(transfer.values, np.ones((8, 3)), transfer.extinction)
+
+
+@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("transforms", TRANSFORMS)
+def test_weights_and_what_is_left_sum_to_one(transforms, quadrature):
+    march = jv.March(0.07, TRANSFORMS[transforms], quadrature)
+    for make in VOLUMES.values():
+        volume = make()
+        for view in CAMERAS.values():
+            rgba = jv.render(volume, whitened(soft_transfer(0.2)), view(volume), march).rgba
+            transmittance = 1 - rgba[..., 3]
+            np.testing.assert_allclose(rgba[..., 0] + transmittance, 1, atol=1e-6)
+            assert float(transmittance.min()) >= 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    step=st.floats(0.004, 5),
+    extinction=st.one_of(st.just(0.0), st.floats(1e-3, 100)),
+    quadrature=st.sampled_from(["left", "midpoint"]),
+)
+def test_a_constant_volume_is_exact_at_any_step_under_alpha_correction(step, extinction, quadrature):
+    volume = scaled_phantom("constant")
+    march = jv.March(step, (jv.AlphaCorrection(),), quadrature)
+    camera = around(volume)
+    color = (0.25, 0.5, 1.0)
+    rgba = jv.render(volume, uniform_transfer(extinction, color), camera, march).rgba
+    exact = -np.expm1(-extinction * lengths_inside(volume, camera))
+    np.testing.assert_allclose(rgba, exact[..., None] * np.array([*color, 1.0]), atol=1e-6)
+
+
+@eqx.filter_jit
+def rounded_lengths(volume, camera):
+    """Length of each ray inside the volume, as float32 has it; `test_rays` checks it."""
+    space = Affine(volume)
+    enter_all = jax.vmap(jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (jnp.int32(0), jnp.int32(0))).length))
+    return enter_all(*camera.rays())
+
+
+def lengths_inside(volume, camera):
+    return np.asarray(rounded_lengths(volume, camera), np.float64)
+
+
+@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+def test_a_constant_volume_is_exact_to_rounding_in_float64(quadrature):
+    with in_float64():
+        volume = doubled(scaled_phantom("constant"))
+        camera = doubled(around(volume))
+        for step in (0.013, 0.4, 5.0):
+            march = jv.March(step, (jv.AlphaCorrection(),), quadrature)
+            opacity = jv.render(volume, uniform_transfer(3.0), camera, march).rgba[..., 3]
+            t_in, t_out = true_interval(camera)
+            exact = -np.expm1(-3.0 * np.maximum(t_out - t_in, 0)).reshape(opacity.shape)
+            np.testing.assert_allclose(opacity, exact, atol=1e-12)
+
+
+def true_interval(camera):
+    """Entry and exit of every pixel's ray into [-1, 1]³, by the independent clip."""
+    origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
+    return oracle.box_interval(origins, directions, [-1] * 3, [1] * 3)
+
+
+def gaussian_opacity(camera, extinction):
+    """Opacity of the Gaussian blob exp(-r²/(2 w²)), w = 0.3, by its closed line integral."""
+    width = 0.3
+    origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
+    t_in, t_out = true_interval(camera)
+    middle = -np.sum(origins * directions, axis=1)
+    nearest = np.sum((origins + middle[:, None] * directions) ** 2, axis=1)
+    ends = [erf((t - middle) / (np.sqrt(2) * width)) for t in (t_in, np.maximum(t_in, t_out))]
+    depth = extinction * np.exp(-nearest / (2 * width**2)) * width * np.sqrt(np.pi / 2) * (ends[1] - ends[0])
+    return 1 - np.exp(-depth)
+
+
+class Gaussian(jv.Volume):
+    """The blob itself in place of its voxels, so that the step is the only approximation."""
+
+    def value(self, coordinate):
+        x, y, z = (c * self.spacing[i] + self.origin[i] for i, c in enumerate(coordinate))
+        return jnp.exp(-(x**2 + y**2 + z**2) / (2 * 0.3**2))
+
+
+@pytest.mark.parametrize(("quadrature", "order"), [("left", 1), ("midpoint", 2)])
+def test_the_error_falls_with_the_order_claimed_for_image_and_gradient(quadrature, order):
+    steps = np.array([0.16, 0.08, 0.04, 0.02])
+    with in_float64():
+        volume = Gaussian(np.zeros((24, 24, 24), np.float32), [2 / 23] * 3, [-1.0] * 3)
+        # aside of the middle, so that the entry face cuts the blob and the first order shows
+        camera = jv.Camera((0.2, -0.35, 0.1), (0.0, 1.0, 0.0), (0, 0, 1), 60.0, size=(12, 10))
+        exact = gaussian_opacity(camera, 2.0).reshape(10, 12)
+
+        def image(extinction, step):
+            transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), jnp.stack([0 * extinction, extinction]))
+            march = jv.March(step, (jv.AlphaCorrection(),), quadrature)
+            return jv.render(volume, transfer, camera, march, adjoint="forward").rgba[..., 3]
+
+        h = 1e-6
+        exact_slope = (gaussian_opacity(camera, 2 + h) - gaussian_opacity(camera, 2 - h)).reshape(10, 12) / (2 * h)
+        errors = []
+        for step in steps:
+            value, slope = jax.jvp(lambda e, step=step: image(e, step), (jnp.float64(2.0),), (jnp.float64(1.0),))
+            errors.append([np.sqrt(np.mean((value - exact) ** 2)), np.sqrt(np.mean((slope - exact_slope) ** 2))])
+    fitted = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    np.testing.assert_allclose(fitted, order, atol=0.15)
+
+
+def loss_of_leaves(volume, march, adjoint, size=(6, 5)):
+    """A scalar of the image, as a function of all that carries a gradient."""
+    weights = np.random.default_rng(5).normal(size=(size[1], size[0], 4))
+
+    def loss(leaves):
+        transfer = jv.TransferFunction(soft_transfer().values, leaves["colors"], leaves["extinction"])
+        camera = jv.Camera(leaves["position"], leaves["focal_point"], (0, 0, 1), leaves["view_angle"], size=size)
+        scene = jv.Volume(leaves["data"], volume.spacing, volume.origin)
+        rgba = jv.render(scene, transfer, camera, march, adjoint=adjoint).rgba
+        return jnp.sum(rgba * jnp.asarray(weights, rgba.dtype))
+
+    return loss
+
+
+@pytest.mark.parametrize("adjoint", ["replay", "direct", "forward"])
+def test_gradients_match_central_differences(adjoint):
+    with in_float64():
+        volume = VOLUMES["noise"]()
+        small = jv.Volume(np.asarray(volume.data[:6, :5, :7], np.float64), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1))
+        march = jv.March(0.11, (jv.AlphaCorrection(),), "midpoint", max_samples=64)
+        transfer = doubled(soft_transfer())
+        leaves = {
+            "colors": transfer.colors,
+            "extinction": transfer.extinction + 0.1,
+            "position": jnp.asarray([1.9, -1.3, 1.7]),
+            "focal_point": small.center,
+            "view_angle": jnp.asarray(40.0),
+            "data": small.data,
+        }
+        loss = jax.jit(loss_of_leaves(small, march, adjoint))
+        random = np.random.default_rng(0)
+        keys = list(leaves)
+        direction = {k: jnp.asarray(random.normal(size=leaves[k].shape)) for k in keys}
+        for key in keys:
+            along = {k: direction[k] if k == key else jnp.zeros_like(direction[k]) for k in keys}
+            h = 1e-6
+            ends = [jax.tree.map(lambda a, d, s=s: a + s * h * d, leaves, along) for s in (1, -1)]
+            difference = (loss(ends[0]) - loss(ends[1])) / (2 * h)
+            if adjoint == "forward":
+                slope = jax.jvp(loss, (leaves,), (along,))[1]
+            else:
+                gradient = jax.grad(loss)(leaves)
+                slope = sum(jnp.vdot(gradient[k], along[k]) for k in keys)
+            np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-8, err_msg=key)
+
+
+@pytest.mark.parametrize("extinction", [0.0, 1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("adjoint", ["replay", "direct"])
+def test_values_and_gradients_are_finite_at_the_extremes(extinction, adjoint):
+    volume = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)
+    origins = jnp.asarray([[-1, 1, 1], [-1, 5, 1], [1, 1, 1], [-1, 0, 0], [-1, -1, -1], [1, 1, 9]], jnp.float32)
+    directions = jnp.asarray([[1, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 1], [0, 0, 1]], jnp.float32)
+
+    def loss(leaves):
+        transfer = jv.TransferFunction(np.linspace(0, 1, 8), leaves["colors"], leaves["extinction"])
+        scene = jv.Volume(leaves["data"], volume.spacing)
+        march = jv.March(0.3, (jv.AlphaCorrection(), jv.EarlyTermination(1e-3)))
+        rendering = jv.render_rays(scene, transfer, leaves["origins"], leaves["directions"], march, adjoint=adjoint)
+        return jnp.sum(rendering.rgba**2)
+
+    leaves = {
+        "colors": jnp.ones((8, 3)),
+        "extinction": jnp.full(8, extinction),
+        "data": volume.data,
+        "origins": origins,
+        "directions": directions,
+    }
+    value, gradient = jax.value_and_grad(loss)(leaves)
+    assert np.isfinite(value)
+    for name, leaf in gradient.items():
+        assert np.isfinite(leaf).all(), name
+
+
+def test_alpha_correction_makes_the_image_continuous_in_the_camera():
+    """Without it the image jumps when a sample crosses the exit: a derivative misses what differences see."""
+    volume = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)
+    directions = [[1.0, 0.0, 0.0]]
+
+    def slopes(transforms):
+        def opacity(x):
+            origin = jnp.stack([x, jnp.ones_like(x), jnp.ones_like(x)])[None]
+            march = jv.March(0.3, transforms)
+            return jv.render_rays(volume, uniform_transfer(1.0), origin, directions, march, adjoint="forward").rgba[0, 3]
+
+        inside = jnp.float32(0.25)  # the camera stands in the volume: moving on shortens the ray
+        derivative = jax.jvp(opacity, (inside,), (jnp.ones_like(inside),))[1]
+        return float(derivative), float((opacity(inside + 0.3) - opacity(inside - 0.15)) / 0.45)
+
+    derivative, difference = slopes((jv.AlphaCorrection(),))
+    assert derivative == pytest.approx(-np.exp(-1.75), rel=1e-4)
+    assert difference == pytest.approx(-(np.exp(-1.45) - np.exp(-1.9)) / 0.45, rel=1e-3)
+    derivative, difference = slopes(())
+    assert derivative == 0
+    assert difference < -0.1
+
+
+def test_reference_has_second_derivatives():
+    volume = scaled_phantom("constant")
+    march = jv.March(0.1, (jv.AlphaCorrection(),))
+
+    def opacity(extinction):
+        transfer = jv.TransferFunction(np.linspace(0, 1, 8), np.ones((8, 3)), jnp.full(8, extinction))
+        origin, direction = jnp.asarray([-3.0, 0.1, 0.2]), jnp.asarray([1.0, 0.0, 0.0])
+        return jv.render_ray_reference(volume, transfer, origin, direction, march).rgba[3]
+
+    second = jax.grad(jax.grad(opacity))(jnp.float32(0.5))
+    np.testing.assert_allclose(second, -4 * np.exp(-1.0), rtol=1e-4)
+

@@ -1,0 +1,154 @@
+"""The seams: what a march asks its transforms, and how transforms of one's own join in."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.locate import Affine
+from jaxvol.march import Cell
+
+from .scenes import around, scaled_phantom, soft_transfer, uniform_transfer
+
+
+class Shift(jv.Transform):
+    """Starts half a step in."""
+
+    def start(self, steps, ray):
+        return steps + 0.5
+
+
+class Stride(jv.Transform):
+    """After the first transparent sample takes half steps."""
+
+    def remember(self, ray):
+        return jnp.zeros_like(ray.length, bool)
+
+    def advance(self, steps, memory, ray, transparent):
+        memory = memory | transparent
+        return jnp.where(memory, steps / 2, steps), memory
+
+
+class Halves(jv.Transform):
+    """Samples each half of a cell on its own."""
+
+    def cut(self, cell, ray, volume):
+        half = cell.width / 2
+        return Cell(cell.front, half, cell.cut), Cell(cell.front + half, half, cell.cut)
+
+
+class Moved(jv.Transform):
+    """The volume, moved in the world."""
+
+    def locate(self, space, volume):
+        return Affine(jv.Volume(volume.data, volume.spacing, volume.origin + 10.0))
+
+
+BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
+RAY = ([[-1.0, 1.0, 1.0]], [[1.0, 0.0, 0.0]])
+
+
+def opacity(transforms, quadrature="left", step=0.3):
+    march = jv.March(step, transforms, quadrature)
+    rendering = jv.render_rays(BOX, uniform_transfer(1.0), *RAY, march)
+    return float(rendering.rgba[0, 3]), int(rendering.samples[0]), bool(rendering.aligned[0])
+
+
+def seen(length):
+    return pytest.approx(1 - np.exp(-length), abs=1e-6)
+
+
+def test_plain_cells_reach_past_the_exit():
+    assert opacity(()) == (seen(7 * 0.3), 7, False)  # samples at 0, 0.3, … 1.8
+
+
+def test_alpha_correction_cuts_the_last_cell():
+    assert opacity((jv.AlphaCorrection(),)) == (seen(2), 7, True)
+
+
+def test_midpoint_samples_only_inside():
+    assert opacity((), "midpoint") == (seen(7 * 0.3), 7, False)  # at 0.15, … 1.95
+    assert opacity((), "midpoint", step=0.55) == (seen(4 * 0.55), 4, False)  # 1.925; the next would be 2.475
+    assert opacity((), "midpoint", step=0.6) == (seen(3 * 0.6), 3, False)  # 1.5; the next would be 2.1
+    assert opacity((jv.AlphaCorrection(),), "midpoint", step=0.6) == (seen(2), 4, True)
+
+
+def test_start_moves_the_first_cell():
+    assert opacity((Shift(),)) == (seen(7 * 0.3), 7, False)  # at 0.15, … 1.95
+    assert opacity((Shift(), jv.AlphaCorrection())) == (seen(2 - 0.15), 7, True)
+
+
+def test_cut_may_divide_a_cell():
+    assert opacity((Halves(),)) == (seen(2.1), 14, False)  # half cells at 0, 0.15, … 1.95
+    for order in ((Halves(), jv.AlphaCorrection()), (jv.AlphaCorrection(), Halves())):
+        length, _, aligned = opacity(order)
+        assert length == seen(2)
+        assert aligned
+
+
+def test_advance_remembers_along_the_ray():
+    clear = jv.TransferFunction(np.linspace(0, 1, 8), np.ones((8, 3)), np.zeros(8))
+    rendering = jv.render_rays(BOX, clear, *RAY, jv.March(0.3, (Stride(),)))
+    assert int(rendering.samples[0]) == 14  # half steps from the first sample on
+    assert opacity((Stride(),))[1] == 7
+
+
+def test_locate_replaces_the_space():
+    origins, directions = np.array(RAY)
+    march = jv.March(0.3, (Moved(), jv.AlphaCorrection()))
+    rendering = jv.render_rays(BOX, uniform_transfer(1.0), np.concatenate([origins, origins + 10]), directions.repeat(2, 0), march)
+    np.testing.assert_allclose(rendering.rgba[:, 3], [0, 1 - np.exp(-2)], atol=1e-5)
+
+
+def test_early_termination_stops_where_little_is_left():
+    march = jv.March(0.1, (jv.EarlyTermination(0.5),))
+    rendering = jv.render_rays(BOX, uniform_transfer(1.0), *RAY, march)
+    assert int(rendering.samples[0]) == 7  # exp(-0.7) is the first below one half
+    np.testing.assert_allclose(rendering.rgba[0, 3], 1 - np.exp(-0.7), atol=1e-6)
+
+
+def test_early_termination_errs_by_less_than_what_is_left():
+    volume, transfer = scaled_phantom("head"), soft_transfer(0.1)
+    camera = around(volume)
+    full = jv.render(volume, transfer, camera, jv.March(0.05))
+    for left in (1 / 255, 0.1):
+        ended = jv.render(volume, transfer, camera, jv.March(0.05, (jv.EarlyTermination(left),)))
+        off = np.asarray(full.rgba - ended.rgba)
+        assert (off > -1e-6).all()
+        assert 0 < off.max() <= left
+        assert (ended.samples <= full.samples).all()
+        assert int(ended.samples.sum()) < int(full.samples.sum())
+
+
+def test_a_march_that_runs_out_of_samples_says_so():
+    march = jv.March(0.3, max_samples=5)
+    rendering = jv.render_rays(BOX, uniform_transfer(1.0), [RAY[0][0]] * 2, [[1, 0, 0], [0, 1, 0]], march)
+    np.testing.assert_array_equal(rendering.exhausted, [True, False])
+    assert int(rendering.samples[0]) == 5
+    assert not jv.render_rays(BOX, uniform_transfer(1.0), *RAY, jv.March(0.3)).exhausted[0]
+
+
+BAD = {
+    "step 0": (lambda: jv.March(0), "step must be greater than 0; got 0"),
+    "negative step": (lambda: jv.March(-0.1), "step must be greater than 0; got -0.1"),
+    "NaN step": (lambda: jv.March(np.nan), "step must be finite; got nan"),
+    "text": (lambda: jv.March("half"), "step must be numbers"),
+    "two steps": (lambda: jv.March([0.1, 0.2]), "step must have shape"),
+    "a transform twice": (
+        lambda: jv.March(0.1, (jv.AlphaCorrection(), jv.EarlyTermination(0.1), jv.AlphaCorrection())),
+        "transforms must each be given once; got AlphaCorrection 2 times",
+    ),
+    "a class": (lambda: jv.March(0.1, (jv.AlphaCorrection,)), "transforms must hold jaxvol transforms"),
+    "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
+    "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),
+    "no samples": (lambda: jv.March(0.1, max_samples=0), "max_samples must be at least 1; got 0"),
+    "opacity left 0": (lambda: jv.EarlyTermination(0), "opacity_left must be greater than 0 and less than 1; got 0"),
+    "opacity left 1": (lambda: jv.EarlyTermination(1), "opacity_left must be .*; got 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()

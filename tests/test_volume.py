@@ -1,0 +1,162 @@
+"""Values, gradients and labels between the nodes of a grid, and what is no volume."""
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+import jaxvol as jv
+from jaxvol.triple import apart
+
+
+DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32"]
+SHAPE = (5, 7, 6)
+
+
+def random_data(dtype: str, seed: int = 0) -> np.ndarray:
+    """Values all over the type's range, or some of it."""
+    random = np.random.default_rng(seed)
+    if dtype in ("float16", "bfloat16", "float32"):
+        return random.normal(0, 100, SHAPE).astype(ml_dtypes.bfloat16 if dtype == "bfloat16" else dtype)
+    limits = np.iinfo(dtype)
+    return random.integers(limits.min, limits.max, SHAPE, dtype=dtype, endpoint=True)
+
+
+def random_coordinates(n: int = 200) -> np.ndarray:
+    """Points in the grid and up to one node outside, with all nodes at its corners among them."""
+    corners = np.array([(x, y, z) for x in (0, 4) for y in (0, 6) for z in (0, 5)], float)
+    inside = np.random.default_rng(1).uniform(-1, np.array(SHAPE), (n, 3))
+    return np.concatenate([corners, inside]).astype(np.float32)
+
+
+def at(function, coordinates):
+    return jax.vmap(lambda c: function(apart(c)))(jnp.asarray(coordinates))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_values_are_trilinear_and_voxels_keep_their_type(dtype):
+    data = random_data(dtype)
+    volume = jv.Volume(data)
+    assert str(volume.data.dtype) == dtype
+    coordinates = random_coordinates()
+    expected = map_coordinates(data.astype(np.float64), coordinates.T, order=1, mode="nearest")
+    scale = np.abs(data.astype(np.float64)).max()
+    np.testing.assert_allclose(at(volume.value, coordinates), expected, atol=1e-6 * scale, rtol=0)
+
+
+def test_value_at_a_node_is_the_voxel_exactly():
+    data = random_data("float32")
+    nodes = np.argwhere(np.ones(SHAPE, bool)).astype(np.float32)
+    np.testing.assert_array_equal(at(jv.Volume(data).value, nodes), data.reshape(-1))
+
+
+def test_a_coordinate_that_is_not_a_number_reads_no_memory_outside():
+    assert jnp.isnan(jv.Volume(random_data("float32")).value((jnp.nan * jnp.ones(()),) * 3))
+
+
+def test_trilinear_gradient_is_the_derivative_of_the_value():
+    volume = jv.Volume(random_data("float32"), spacing=(0.5, 2.0, 3.0))
+    coordinates = np.random.default_rng(2).uniform(0.1, np.array(SHAPE) - 1.1, (50, 3)).astype(np.float32)
+    slopes = jax.vmap(jax.grad(lambda c: volume.value(apart(c))))(jnp.asarray(coordinates))
+    found = jnp.stack(at(lambda c: volume.gradient(c, "trilinear"), coordinates), axis=-1)
+    np.testing.assert_allclose(found, np.asarray(slopes) / np.asarray(volume.spacing), rtol=1e-4, atol=1e-2)
+
+
+@pytest.mark.parametrize("method", ["trilinear", "central"])
+def test_gradient_of_a_linear_field_is_its_slope_up_to_the_faces(method):
+    x, y, z = np.meshgrid(*(np.arange(n) for n in SHAPE), indexing="ij")
+    spacing = np.array([0.5, 2.0, 3.0])
+    slope = np.array([3.0, -1.0, 0.25])
+    data = sum(s * h * axis for s, h, axis in zip(slope, spacing, (x, y, z), strict=True))
+    volume = jv.Volume(data.astype(np.float32), spacing)
+    inside = np.random.default_rng(3).uniform(0, np.array(SHAPE) - 1, (100, 3)).astype(np.float32)
+    found = np.stack(at(lambda c: volume.gradient(c, method), inside), axis=-1)
+    np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), rtol=1e-4, atol=1e-4)
+
+
+def test_central_gradient_falls_to_the_true_one_with_the_square_of_the_spacing():
+    def error(n: int) -> float:
+        axis = np.linspace(-1, 1, n, dtype=np.float32)
+        x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+        volume = jv.Volume(np.sin(3 * x) * np.cos(2 * y) * np.exp(z), spacing=[2 / (n - 1)] * 3)
+        middle = (n - 1) // 2 + (n - 1) // 8
+        p = axis[middle]
+        found = np.stack(volume.gradient(tuple(jnp.full(3, float(middle)))))
+        true = [
+            3 * np.cos(3 * p) * np.cos(2 * p) * np.exp(p),
+            -2 * np.sin(3 * p) * np.sin(2 * p) * np.exp(p),
+            np.sin(3 * p) * np.cos(2 * p) * np.exp(p),
+        ]
+        return float(np.abs(found - true).max())
+
+    order = np.log2(error(17) / error(33))
+    assert 1.8 < order < 2.2
+
+
+def test_label_is_that_of_the_nearest_node():
+    labels = np.arange(np.prod(SHAPE)).reshape(SHAPE).astype(np.uint8)
+    volume = jv.Volume(random_data("uint8"), labels=labels)
+    coordinates = random_coordinates()
+    nearest = np.clip(np.floor(coordinates + 0.5).astype(int), 0, np.array(SHAPE) - 1)
+    np.testing.assert_array_equal(at(volume.label, coordinates), labels[tuple(nearest.T)])
+
+
+def test_bounds_span_from_the_first_node_to_the_last():
+    volume = jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, 2, 3), origin=(10, 20, 30))
+    np.testing.assert_allclose(volume.bounds, (10, 14, 20, 32, 30, 45))
+    np.testing.assert_allclose(volume.center, (12, 26, 37.5))
+    assert volume.shape == SHAPE
+
+
+def test_float64_data_follow_jax():
+    assert jv.Volume(np.zeros(SHAPE)).data.dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert jv.Volume(np.zeros(SHAPE)).data.dtype == jnp.float64
+
+
+BAD = {
+    "2-D": (lambda: jv.Volume(np.zeros((4, 4), np.uint8)), r"data\[x, y, z\].*shape \(4, 4\).*stack"),
+    "an axis of one voxel": (lambda: jv.Volume(np.zeros((4, 1, 4), np.uint8)), r"at least 2 voxels.*\(4, 1, 4\)"),
+    "objects": (lambda: jv.Volume(np.full(SHAPE, None)), r"data must be of type.*got object"),
+    "int64": (lambda: jv.Volume(np.zeros(SHAPE, np.int64)), r"got int64\. Convert"),
+    "bool": (lambda: jv.Volume(np.zeros(SHAPE, bool)), r"got bool"),
+    "complex": (lambda: jv.Volume(np.zeros(SHAPE, complex)), r"got complex128"),
+    "text": (lambda: jv.Volume("engine.raw"), r"shape \(\)"),
+    "zero spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, 0, 1)), r"spacing must be positive"),
+    "negative spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, -1, 1)), r"spacing must be positive"),
+    "NaN spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, np.nan, 1)), r"spacing must be finite"),
+    "one spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=1.0), r"spacing must have shape \(3,\)"),
+    "infinite origin": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), origin=(0, 0, np.inf)), r"origin must be finite"),
+    "labels of another shape": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.zeros((5, 7, 5), np.uint8)),
+        r"labels must stand on the grid of data, shape \(5, 7, 6\); got shape \(5, 7, 5\)",
+    ),
+    "labels that are no integers": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.zeros(SHAPE)),
+        r"labels must be integers; got float64",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
+def test_voxels_that_are_not_finite_are_counted(dtype):
+    data = random_data(dtype)
+    data[0, 0, 0], data[1, 2, 3], data[4, 6, 5] = np.nan, np.inf, -np.inf
+    with pytest.raises(ValueError, match=r"data must be finite; got 3 of 210 voxels"):
+        jv.Volume(data)
+
+
+def test_traced_voxels_that_are_not_finite_fail_when_the_program_runs():
+    build = jax.jit(lambda data: jv.Volume(data).data.sum())
+    assert build(jnp.ones(SHAPE)) == 210
+    with pytest.raises(Exception, match="data must be finite"):
+        jax.block_until_ready(build(jnp.full(SHAPE, jnp.nan)))
