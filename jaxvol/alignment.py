@@ -27,4 +27,3 @@ class AlphaCorrection(Transform):
         # A cell that lies past the exit altogether is not sampled; its width just has to be ≥ 0.
         left = jnp.maximum(ray.length - cell.front, 0)
         return (Cell(cell.front, jnp.where(reaches_past, left, cell.width), cell.cut | reaches_past),)
-

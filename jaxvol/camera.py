@@ -9,9 +9,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
-from .checks import finite_array, number, require
+from .checks import Arrayable, finite_array, number, require
 from .triple import Triple, along, apart
 from .volume import Volume
 
@@ -46,14 +46,14 @@ class Camera(eqx.Module):
 
     def __init__(
         self,
-        position: ArrayLike | Any,
-        focal_point: ArrayLike | Any,
-        view_up: ArrayLike | Any = (0.0, 1.0, 0.0),
-        view_angle: ArrayLike | Any = 30.0,
+        position: Arrayable,
+        focal_point: Arrayable,
+        view_up: Arrayable = (0.0, 1.0, 0.0),
+        view_angle: Arrayable = 30.0,
         *,
         size: tuple[int, int] | Any = (512, 512),
-        parallel_scale: ArrayLike | Any | None = None,
-        window: ArrayLike | Any | None = None,
+        parallel_scale: Arrayable | None = None,
+        window: Arrayable | None = None,
     ):
         self.size = width, height = _image_size(size)
         self.focal_point = finite_array("focal_point", focal_point, (3,))
@@ -83,9 +83,9 @@ class Camera(eqx.Module):
     def looking_at(
         cls,
         volume: Volume,
-        direction: ArrayLike | Any = (0.5, -1.0, 0.4),
-        view_up: ArrayLike | Any = (0.0, 0.0, 1.0),
-        view_angle: ArrayLike | Any = 30.0,
+        direction: Arrayable = (0.5, -1.0, 0.4),
+        view_up: Arrayable = (0.0, 0.0, 1.0),
+        view_angle: Arrayable = 30.0,
         *,
         size: tuple[int, int] | Any = (512, 512),
     ) -> "Camera":
@@ -110,8 +110,8 @@ class Camera(eqx.Module):
         **Raises:** `ValueError` for a rectangle that is empty or leaves the image.
         """
         full_width, full_height = self.size
-        inside = 0 <= left and 0 <= top and left + width <= full_width and top + height <= full_height
-        if not inside or width < 1 or height < 1:
+        fits = 0 <= left < left + width <= full_width and 0 <= top < top + height <= full_height
+        if not fits:
             raise ValueError(
                 f"crop must be a rectangle inside the {full_width} x {full_height} image; "
                 f"got left={left}, top={top}, width={width}, height={height}."
@@ -120,7 +120,7 @@ class Camera(eqx.Module):
         y = [self._row(edge) for edge in (top + height, top)]
         return self._showing(jnp.stack([*x, *y]), (width, height))
 
-    def zoom(self, factor: ArrayLike | Any, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
+    def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
         """The camera that shows 1/`factor` of the image in an image of the same size, around
         `center`, given as fractions of width and height from the top left.
 
@@ -196,4 +196,3 @@ def _image_size(size: tuple[int, int] | Any) -> tuple[int, int]:
     if (width, height) != tuple(size) or width < 1 or height < 1:
         raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size}.")
     return width, height
-

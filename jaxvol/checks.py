@@ -5,16 +5,21 @@ traced values show is raised by `equinox.error_if` when the compiled program run
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 
 T = TypeVar("T")
+
+Arrayable: TypeAlias = Any
+"""What a caller may give for an array: an array of any library, nested sequences, a number. Any, since it
+is checked by its value, with an error that names the argument."""
 
 
 def is_traced(*values: Any) -> bool:
@@ -47,7 +52,7 @@ def finite(values: Any) -> Any:
     return abs(values) < np.inf
 
 
-def finite_array(name: str, value: ArrayLike | Any, shape: tuple[int | None, ...]) -> Array:
+def finite_array(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> Array:
     """`value` as an array of JAX's default float type, of this shape (None: any length)."""
     spelled = str(shape).replace("None", "n")
     try:
@@ -67,7 +72,7 @@ def finite_array(name: str, value: ArrayLike | Any, shape: tuple[int | None, ...
 
 
 def number(
-    name: str, value: ArrayLike | Any, *, above: float = -np.inf, below: float = np.inf, unit: str = ""
+    name: str, value: Arrayable, *, above: float = -np.inf, below: float = np.inf, unit: str = ""
 ) -> Array:
     """`value` as a finite scalar strictly between `above` and `below`."""
     bounds = (("greater than", above), ("less than", below))
@@ -79,7 +84,14 @@ def number(
     )
 
 
-def unit_interval(name: str, value: ArrayLike | Any, shape: tuple[int | None, ...]) -> Array:
+def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> Array:
     """`value` as an array of numbers in [0, 1]."""
     array = finite_array(name, value, shape)
     return require(array, lambda a: (a >= 0) & (a <= 1), f"{name} must be in [0, 1]; got {{got}}.")
+
+
+def integer(name: str, value: Any, least: int) -> int:
+    """`value` as a whole number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}.")
+    return int(value)

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -67,16 +68,28 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    one.add_argument("file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]")
-    one.add_argument("-o", "--output", type=Path, default=Path("out.png"), help="picture to write (default: %(default)s)")
+    one.add_argument(
+        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
+    )
+    one.add_argument(
+        "-o", "--output", type=Path, default=Path("out.png"), help="picture to write (default: %(default)s)"
+    )
     one.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
-    one.add_argument("--step", type=float, help="distance between samples, world length (default: half a voxel)")
-    one.add_argument("--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB")
+    one.add_argument(
+        "--step", type=float, help="distance between samples, world length (default: half a voxel)"
+    )
+    one.add_argument(
+        "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
+    )
 
     what = one.add_argument_group("the data", "needed where the file and its name do not tell")
-    what.add_argument("--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file")
+    what.add_argument(
+        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
+    )
     what.add_argument("--dtype", help="such as uint8 or uint16le")
-    what.add_argument("--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels")
+    what.add_argument(
+        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
+    )
 
     look = one.add_argument_group("the look")
     kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
@@ -84,8 +97,12 @@ def _parser() -> argparse.ArgumentParser:
     chosen.add_argument("--preset", metavar="NAME", help=kinds)
     chosen.add_argument("--cmap", metavar="NAME", help="a matplotlib colormap over --clim (default: gray)")
     look.add_argument("--opacity", default="linear", metavar="RAMP", help="with --cmap: linear or sigmoid")
-    look.add_argument("--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values to stretch it over")
-    look.add_argument("--unit-distance", type=float, default=1.0, help="length over which opacities count (default: 1)")
+    look.add_argument(
+        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values to stretch it over"
+    )
+    look.add_argument(
+        "--unit-distance", type=float, default=1.0, help="length over which opacities count (default: 1)"
+    )
 
     view = one.add_argument_group("the camera")
     view.add_argument(
@@ -104,7 +121,9 @@ def _parser() -> argparse.ArgumentParser:
         help="without --camera: the side from which to see the whole volume",
     )
     view.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
-    view.add_argument("--view-angle", type=float, default=30, help="degrees between lower and upper edge (default: 30)")
+    view.add_argument(
+        "--view-angle", type=float, default=30, help="degrees between lower and upper edge (default: 30)"
+    )
     view.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
     one.set_defaults(run=_render)
     return parser
@@ -153,16 +172,17 @@ def _timed(
 ) -> None:
     """Render to a file, and tell where it is and what it took, compilation apart."""
     begun = time.perf_counter()
-    program = eqx.filter_jit(render).lower(volume, transfer, camera, march).compile()
+    program: Any = eqx.filter_jit(render)  # Any: its declared type is that of the function
+    program = program.lower(volume, transfer, camera, march).compile()
     compiled = time.perf_counter()
     rendering: Rendering = jax.block_until_ready(program(volume, transfer, camera, march))
     rendered = time.perf_counter()
     path = save_png(output, rendering.image(background))
-    width, height = camera.size
     device = jax.devices()[0]
+    millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     print(
-        f"{path}: {width} x {height} pixels of {' x '.join(map(str, volume.shape))} voxels, "
-        f"{np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6:.1f} million samples in {rendered - compiled:.2f} s "
+        f"{path}: {' x '.join(map(str, camera.size))} pixels of {' x '.join(map(str, volume.shape))} voxels, "
+        f"{millions:.1f} million samples in {rendered - compiled:.2f} s "
         f"+ {compiled - begun:.2f} s of compilation, on {device.device_kind} ({device.platform})"
     )
     if np.any(rendering.exhausted):

@@ -2,11 +2,12 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
+
+from .checks import Arrayable
 
 
 def to_srgb(linear: Float[Array, "*image"]) -> Float[Array, "*image"]:
@@ -22,7 +23,7 @@ def from_srgb(display: Float[Array, "*image"]) -> Float[Array, "*image"]:
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 
-def save_png(path: str | os.PathLike[str], linear: ArrayLike | Any) -> Path:
+def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     """Write a linear RGB image (height, width, 3) as an 8-bit sRGB PNG.
 
     **Raises:** `ValueError` for another shape and for NaN.
@@ -36,5 +37,7 @@ def save_png(path: str | os.PathLike[str], linear: ArrayLike | Any) -> Path:
         raise ValueError(f"image must not hold NaN; got {int(np.isnan(image).sum())} in {image.size} values.")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    imsave(path, np.asarray(jnp.round(to_srgb(jnp.asarray(image)) * 255)).astype(np.uint8), check_contrast=False)
+    imsave(
+        path, np.asarray(jnp.round(to_srgb(jnp.asarray(image)) * 255)).astype(np.uint8), check_contrast=False
+    )
     return path

@@ -13,10 +13,10 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .camera import Camera
-from .checks import finite, require
+from .checks import Arrayable, finite, require
 from .locate import enter
 from .march import March
 from .reference import Progress, begin, end, samples_across, step
@@ -75,8 +75,8 @@ def render(
 def render_rays(
     volume: Volume,
     transfer: TransferFunction,
-    origins: ArrayLike | Any,
-    directions: ArrayLike | Any,
+    origins: Arrayable,
+    directions: Arrayable,
     march: March,
     *,
     adjoint: Adjoint = "replay",
@@ -94,7 +94,9 @@ def render_rays(
     """
     origins, directions = _rays("origins", origins), _rays("directions", directions)
     if origins.shape != directions.shape:
-        raise ValueError(f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}.")
+        raise ValueError(
+            f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}."
+        )
     message = "directions must not have length 0."
     directions = require(directions, lambda d: jnp.any(d != 0, axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
@@ -207,7 +209,7 @@ def _march(
     return jax.vmap(end)(ray, loop.run(lambda at: advance(ray, at), start))
 
 
-def _rays(name: str, rays: ArrayLike | Any) -> Float[Array, "*rays 3"]:
+def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:
     rays = jnp.asarray(rays, dtype=float)
     if rays.ndim < 1 or rays.shape[-1] != 3:
         raise ValueError(f"{name} must have shape (*rays, 3); got {rays.shape}.")

@@ -8,6 +8,7 @@ in the grid gives another `Path`, and the rest of the march does not notice.
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
@@ -57,13 +58,18 @@ def enter(
     space: Space, origin: Triple, direction: Triple, pixel: tuple[Int[Array, ""], Int[Array, ""]]
 ) -> Ray:
     """The part of a ray inside the volume and not behind its origin, which may lie inside."""
-    t_in, t_out = space.interval(origin, direction)
-    t_in = jnp.maximum(t_in, 0)
-    hit = t_out > t_in
-    t_in = jnp.where(hit, t_in, 0)  # a miss has infinite distances, whose products are NaN
-    entry = along(origin, direction, t_in)
-    length = jnp.where(hit, t_out - t_in, 0)
-    return Ray(entry, direction, t_in, length, space.path(entry, direction), pixel)
+    near, far = space.interval(origin, direction)
+    # Float32 rounds the distance of a far camera by more than the volume can stand. So the ray begins
+    # anew near the entry, where distances are short, and the interval is measured again from there.
+    base = jax.lax.stop_gradient(jnp.where(far > near, jnp.maximum(near, 0), 0))
+    close = along(origin, direction, base)
+    near, far = space.interval(close, direction)
+    start = jnp.maximum(near, -base)
+    hit = far > start
+    start = jnp.where(hit, start, 0)  # a miss has infinite distances, whose products are NaN
+    entry = along(close, direction, start)
+    length = jnp.where(hit, far - start, 0)
+    return Ray(entry, direction, base + start, length, space.path(entry, direction), pixel)
 
 
 class Straight(Path):
@@ -111,4 +117,3 @@ def _slab(origin: Scalar, direction: Scalar, low: Scalar, high: Scalar) -> tuple
     near = jnp.where(parallel, jnp.where(between, -jnp.inf, jnp.inf), jnp.minimum(a, b))
     far = jnp.where(parallel, jnp.where(between, jnp.inf, -jnp.inf), jnp.maximum(a, b))
     return near, far
-

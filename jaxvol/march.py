@@ -17,7 +17,6 @@ others as they are; every seam passes through all transforms in turn, so that an
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -50,7 +49,7 @@ class Transform(eqx.Module):
         return space
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
-        """Steps from the entry to the front of the first cell; may be negative where `cut` trims that cell."""
+        """Steps from the entry to the front of the first cell; negative if `cut` trims what lies before."""
         return steps
 
     def remember(self, ray: Ray) -> Any:
@@ -115,7 +114,9 @@ class March(eqx.Module):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {transform!r}.")
             if kinds.count(type(transform)) > 1:
                 name = type(transform).__name__
-                raise ValueError(f"transforms must each be given once; got {name} {kinds.count(type(transform))} times.")
+                raise ValueError(
+                    f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
+                )
         if quadrature not in ("left", "midpoint"):
             raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
         self.quadrature = quadrature

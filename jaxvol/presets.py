@@ -5,9 +5,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .checks import finite_array, unit_interval
+from .checks import Arrayable, finite_array, unit_interval
 from .display import from_srgb
 from .transfer import TransferFunction, extinction_of
 
@@ -125,9 +125,7 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
 }
 
 
-def preset(
-    name: str, clim: Sequence[float] | None = None, unit_distance: float = 1.0
-) -> TransferFunction:
+def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float = 1.0) -> TransferFunction:
     """A transfer function by name.
 
     **Arguments:**
@@ -152,7 +150,7 @@ def preset(
 def colormap(
     cmap: str | Any,
     clim: Sequence[float],
-    opacity: str | ArrayLike | Any = "linear",
+    opacity: str | Arrayable = "linear",
     unit_distance: float = 1.0,
     n_colors: int = 256,
 ) -> TransferFunction:

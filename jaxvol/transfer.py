@@ -1,14 +1,14 @@
 """Which colour and extinction has this value?"""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .checks import finite_array, number, require, unit_interval
+from .checks import Arrayable, finite_array, number, require, unit_interval
 from .triple import Scalar, Triple
 from .volume import Volume
 
@@ -38,7 +38,7 @@ class TransferFunction(eqx.Module):
     colors: Float[Array, "n 3"]
     extinction: Float[Array, " n"]
 
-    def __init__(self, values: ArrayLike | Any, colors: ArrayLike | Any, extinction: ArrayLike | Any):
+    def __init__(self, values: Arrayable, colors: Arrayable, extinction: Arrayable):
         values = finite_array("values", values, (None,))
         n = values.shape[0]
         if n < 2:
@@ -46,7 +46,7 @@ class TransferFunction(eqx.Module):
         self.values = require(
             values,
             lambda v: v[1:] > v[:-1],
-            "values must increase from point to point; got {got}. Sort the points, and move equal ones apart.",
+            "values must increase from point to point; got {got}. Sort them, and move equal ones apart.",
         )
         self.colors = finite_array("colors", colors, (n, 3))
         extinction = finite_array("extinction", extinction, (n,))
@@ -72,7 +72,9 @@ class TransferFunction(eqx.Module):
         try:
             values, colors, opacities = zip(*points, strict=True)
         except (TypeError, ValueError) as fault:
-            raise ValueError(f"points must be triples (value, (r, g, b), opacity); got {points!r}.") from fault
+            raise ValueError(
+                f"points must be triples (value, (r, g, b), opacity); got {points!r}."
+            ) from fault
         return cls(values, colors, extinction_of(opacities, unit_distance))
 
     def __call__(self, value: Scalar) -> tuple[Triple, Scalar]:
@@ -109,7 +111,7 @@ class TransferFunction(eqx.Module):
         return look_up
 
 
-def extinction_of(opacity: ArrayLike | Any, unit_distance: ArrayLike | Any = 1.0) -> Float[Array, " n"]:
+def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:
     """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity.
 
     Inverse of `1 - exp(-extinction unit_distance)`; an opacity above 1 - 2⁻²⁴ counts as that, the

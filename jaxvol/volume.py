@@ -5,14 +5,14 @@ grid of n nodes spans n - 1 steps along an axis. Between nodes the value is tril
 the grid it is that of the nearest point of the grid.
 """
 
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Integer, Shaped
+from jaxtyping import Array, Float, Int, Integer, Shaped
 
-from .checks import finite, finite_array, is_traced, require
+from .checks import Arrayable, finite, finite_array, is_traced, require
 from .triple import Scalar, Triple
 
 
@@ -43,14 +43,16 @@ class Volume(eqx.Module):
 
     def __init__(
         self,
-        data: ArrayLike | Any,
-        spacing: ArrayLike | Any = (1.0, 1.0, 1.0),
-        origin: ArrayLike | Any = (0.0, 0.0, 0.0),
-        labels: ArrayLike | Any | None = None,
+        data: Arrayable,
+        spacing: Arrayable = (1.0, 1.0, 1.0),
+        origin: Arrayable = (0.0, 0.0, 0.0),
+        labels: Arrayable | None = None,
     ):
         self.data = _voxels(data)
         spacing = finite_array("spacing", spacing, (3,))
-        self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}.")
+        self.spacing = require(
+            spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}."
+        )
         self.origin = finite_array("origin", origin, (3,))
         self.labels = None if labels is None else _labels(labels, self.data.shape)
 
@@ -138,17 +140,16 @@ class Volume(eqx.Module):
 
     def _central_slopes(self, coordinate: Triple) -> Triple:
         def slope(axis: int) -> Scalar:
-            before, after = list(coordinate), list(coordinate)
-            before[axis] = jnp.clip(coordinate[axis] - 1, 0, self.shape[axis] - 1)
-            after[axis] = jnp.clip(coordinate[axis] + 1, 0, self.shape[axis] - 1)
-            rise = self.value(tuple(after)) - self.value(tuple(before))
+            last = self.shape[axis] - 1
+            before, after = (jnp.clip(coordinate[axis] + side, 0, last) for side in (-1, 1))
+            rise = self.value(_with(coordinate, axis, after)) - self.value(_with(coordinate, axis, before))
             # at least half a node apart for any coordinate less than half a node outside the grid
-            return rise / jnp.maximum(after[axis] - before[axis], 0.5)
+            return rise / jnp.maximum(after - before, 0.5)
 
         return slope(0), slope(1), slope(2)
 
 
-def _voxels(data: ArrayLike | Any) -> Array:
+def _voxels(data: Arrayable) -> Array:
     if not is_traced(data) and not hasattr(data, "dtype"):
         data = np.asarray(data)
     dtype = str(data.dtype)
@@ -171,7 +172,7 @@ def _voxels(data: ArrayLike | Any) -> Array:
     return jnp.asarray(data)
 
 
-def _labels(labels: ArrayLike | Any, shape: tuple[int, ...]) -> Array:
+def _labels(labels: Arrayable, shape: tuple[int, ...]) -> Array:
     labels = labels if hasattr(labels, "dtype") else np.asarray(labels)
     if labels.dtype.kind not in "ui":
         raise ValueError(f"labels must be integers; got {labels.dtype}.")
@@ -185,6 +186,11 @@ def _split(c: Scalar, n: int) -> tuple[Int[Array, ""], Scalar]:
     c = jnp.clip(c, 0, n - 1)
     low = jnp.clip(c.astype(jnp.int32), 0, n - 2)  # also keeps NaN inside the array
     return low, c - low.astype(c.dtype)
+
+
+def _with(coordinate: Triple, axis: int, component: Scalar) -> Triple:
+    x, y, z = (component if i == axis else c for i, c in enumerate(coordinate))
+    return x, y, z
 
 
 def _fetch(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:

@@ -98,15 +98,27 @@ def test_rays_are_differentiable_in_the_camera():
 
 BAD = {
     "at its focal point": (lambda: jv.Camera(FOCUS, FOCUS), "position must differ from focal_point"),
-    "up along the view": (lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 1, 0)), "view_up must not be zero or point along"),
+    "up along the view": (
+        lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 1, 0)),
+        "view_up must not be zero or point along",
+    ),
     "up zero": (lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 0, 0)), "view_up must not be zero"),
     "size 0": (lambda: jv.Camera(POSITION, FOCUS, size=(0, 5)), r"size must be .* at least 1; got \(0, 5\)"),
     "half a pixel": (lambda: jv.Camera(POSITION, FOCUS, size=(4.5, 5)), "size must be"),
     "one size": (lambda: jv.Camera(POSITION, FOCUS, size=5), "size must be"),
-    "angle 180": (lambda: jv.Camera(POSITION, FOCUS, view_angle=180), "view_angle must be .* less than 180 degrees"),
+    "angle 180": (
+        lambda: jv.Camera(POSITION, FOCUS, view_angle=180),
+        "view_angle must be .* less than 180 degrees",
+    ),
     "NaN": (lambda: jv.Camera((0, np.nan, 0), FOCUS), "position must be finite"),
-    "scale 0": (lambda: jv.Camera(POSITION, FOCUS, parallel_scale=0), "parallel_scale must be greater than 0"),
-    "crop outside": (lambda: jv.Camera(POSITION, FOCUS, size=(9, 9)).crop(5, 5, 5, 2), "crop must be a rectangle inside"),
+    "scale 0": (
+        lambda: jv.Camera(POSITION, FOCUS, parallel_scale=0),
+        "parallel_scale must be greater than 0",
+    ),
+    "crop outside": (
+        lambda: jv.Camera(POSITION, FOCUS, size=(9, 9)).crop(5, 5, 5, 2),
+        "crop must be a rectangle inside",
+    ),
     "zoom 0": (lambda: jv.Camera(POSITION, FOCUS).zoom(0), "zoom factor must be greater than 0"),
     "no direction": (
         lambda: jv.Camera.looking_at(jv.Volume(np.zeros((2, 2, 2), np.uint8)), (0, 0, 0)),

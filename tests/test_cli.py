@@ -33,7 +33,21 @@ def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
 
 def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
     output = tmp_path / "folder" / "engine.png"
-    camera = ["--camera", "40", "-30", "20", "11.5", "11.5", "11.5", "--view-up", "0", "0", "1", "--zoom", "1.5"]
+    camera = [
+        "--camera",
+        "40",
+        "-30",
+        "20",
+        "11.5",
+        "11.5",
+        "11.5",
+        "--view-up",
+        "0",
+        "0",
+        "1",
+        "--zoom",
+        "1.5",
+    ]
     look = ["--preset", "engine", "--size", "32", "24", "--step", "0.4", "--background", "0", "0", "0"]
     assert main(["render", str(volume_file), *camera, *look, "-o", str(output)]) == 0
     assert "million samples" in capsys.readouterr().out
@@ -83,7 +97,9 @@ def test_a_slip_in_the_options_is_told_by_usage(capsys):
 
 
 def test_help_names_commands_presets_and_examples():
-    told = subprocess.run([sys.executable, "-m", "jaxvol", "--help"], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(
+        [sys.executable, "-m", "jaxvol", "--help"], capture_output=True, text=True, check=True
+    ).stdout
     for word in ("demo", "render", "examples:"):
         assert word in told
     told = subprocess.run(

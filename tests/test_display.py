@@ -12,7 +12,9 @@ def test_srgb_and_back():
     ramp = jnp.linspace(0, 1, 1001)
     np.testing.assert_allclose(jv.from_srgb(jv.to_srgb(ramp)), ramp, atol=1e-6)
     # the standard's own numbers: mid grey, and where its straight part ends
-    np.testing.assert_allclose(jv.to_srgb(jnp.array([0.0, 0.0031308, 0.21404, 1.0])), [0, 0.04045, 0.5, 1], atol=1e-5)
+    np.testing.assert_allclose(
+        jv.to_srgb(jnp.array([0.0, 0.0031308, 0.21404, 1.0])), [0, 0.04045, 0.5, 1], atol=1e-5
+    )
 
 
 def test_png_holds_srgb_and_clips(tmp_path):
@@ -38,6 +40,8 @@ def test_image_over_a_background():
     no, count = jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32)
     rendering = jv.Rendering(rgba, jnp.ones(shape), count, no, no)
     np.testing.assert_allclose(rendering.image((1, 1, 1)), [[[0.7, 0.6, 0.5], [1, 1, 1]]])
-    np.testing.assert_allclose(rendering.image(jnp.full((1, 2, 3), 0.5)), [[[0.45, 0.35, 0.25], [0.5, 0.5, 0.5]]])
+    np.testing.assert_allclose(
+        rendering.image(jnp.full((1, 2, 3), 0.5)), [[[0.45, 0.35, 0.25], [0.5, 0.5, 0.5]]]
+    )
     with pytest.raises(ValueError, match="background must be one colour"):
         rendering.image(jnp.zeros((5, 3)))

@@ -102,7 +102,13 @@ def test_memory_beside_the_image_does_not_grow_with_it():
 
     def workspace(side):
         arguments = volume, soft_transfer(), around(volume, (side, side)), MARCH
-        return eqx.filter_jit(jv.render).lower(*arguments).compile().compiled.memory_analysis().temp_size_in_bytes
+        return (
+            eqx.filter_jit(jv.render)
+            .lower(*arguments)
+            .compile()
+            .compiled.memory_analysis()
+            .temp_size_in_bytes
+        )
 
     small, large = workspace(256), workspace(1024)
     pixels = 1024**2 - 256**2
@@ -148,4 +154,6 @@ def test_direct_under_jit_with_the_number_of_samples_given():
         march = jv.March(step, (jv.AlphaCorrection(),), max_samples=64)
         return jv.render(volume, soft_transfer(), around(volume), march, adjoint="direct").rgba
 
-    np.testing.assert_allclose(image(0.07), jv.render(volume, soft_transfer(), around(volume), MARCH).rgba, atol=2e-5)
+    np.testing.assert_allclose(
+        image(0.07), jv.render(volume, soft_transfer(), around(volume), MARCH).rgba, atol=2e-5
+    )

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import files, formats
-from jaxvol.formats import load, register
+from jaxvol import formats
+from jaxvol.formats import files, load, register
 
 
 SHAPE = (5, 4, 3)

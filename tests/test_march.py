@@ -96,7 +96,9 @@ def test_advance_remembers_along_the_ray():
 def test_locate_replaces_the_space():
     origins, directions = np.array(RAY)
     march = jv.March(0.3, (Moved(), jv.AlphaCorrection()))
-    rendering = jv.render_rays(BOX, uniform_transfer(1.0), np.concatenate([origins, origins + 10]), directions.repeat(2, 0), march)
+    rendering = jv.render_rays(
+        BOX, uniform_transfer(1.0), np.concatenate([origins, origins + 10]), directions.repeat(2, 0), march
+    )
     np.testing.assert_allclose(rendering.rgba[:, 3], [0, 1 - np.exp(-2)], atol=1e-5)
 
 
@@ -142,7 +144,10 @@ BAD = {
     "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
     "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),
     "no samples": (lambda: jv.March(0.1, max_samples=0), "max_samples must be at least 1; got 0"),
-    "opacity left 0": (lambda: jv.EarlyTermination(0), "opacity_left must be greater than 0 and less than 1; got 0"),
+    "opacity left 0": (
+        lambda: jv.EarlyTermination(0),
+        "opacity_left must be greater than 0 and less than 1; got 0",
+    ),
     "opacity left 1": (lambda: jv.EarlyTermination(1), "opacity_left must be .*; got 1"),
 }
 

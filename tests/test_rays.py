@@ -28,7 +28,9 @@ def part_inside(origin, direction):
 
 def see(origins, directions):
     """Opacity of rays through the box filled with one extinction."""
-    rendering = jv.render_rays(BOX, uniform_transfer(SIGMA), np.array(origins, float), np.array(directions, float), EXACT)
+    rendering = jv.render_rays(
+        BOX, uniform_transfer(SIGMA), np.array(origins, float), np.array(directions, float), EXACT
+    )
     assert not np.any(rendering.exhausted)
     return rendering
 
@@ -75,7 +77,9 @@ def test_entry_and_exit_agree_with_an_independent_clip(seed):
     direction = random.normal(size=3) * random.choice([0, 1e-3, 1], 3) + 1e-12
     direction = (direction / np.linalg.norm(direction)).astype(np.float32)
     t_in, length, entry = part_inside(origin, direction)
-    (near,), (far,) = oracle.box_interval(origin[None].astype(float), direction[None].astype(float), LOW, HIGH)
+    (near,), (far,) = oracle.box_interval(
+        origin[None].astype(float), direction[None].astype(float), LOW, HIGH
+    )
     expected = max(far - near, 0)
     if expected > 1e-4:
         np.testing.assert_allclose(t_in, near, atol=1e-4)

@@ -64,7 +64,9 @@ def test_presets_show_something_and_hide_something(name):
     stretched = jv.preset(name, clim=(0, 4000), unit_distance=2.0)
     where = np.linspace(low, high, 50)
     expected = evaluate(transfer, where)[1] / 2
-    np.testing.assert_allclose(evaluate(stretched, (where - low) / (high - low) * 4000)[1], expected, rtol=2e-3, atol=1e-5)
+    np.testing.assert_allclose(
+        evaluate(stretched, (where - low) / (high - low) * 4000)[1], expected, rtol=2e-3, atol=1e-5
+    )
 
 
 def test_colormap_has_the_colours_of_matplotlib_in_linear_light():
@@ -72,7 +74,9 @@ def test_colormap_has_the_colours_of_matplotlib_in_linear_light():
 
     transfer = jv.colormap("viridis", (0, 255), "linear")
     display = np.asarray(jv.to_srgb(transfer.colors))
-    np.testing.assert_allclose(display, matplotlib.colormaps["viridis"](np.linspace(0, 1, 256))[:, :3], atol=1e-5)
+    np.testing.assert_allclose(
+        display, matplotlib.colormaps["viridis"](np.linspace(0, 1, 256))[:, :3], atol=1e-5
+    )
     np.testing.assert_allclose(transfer.opacity()[:-1], np.linspace(0, 1, 256)[:-1], atol=1e-6)
 
 
@@ -86,7 +90,10 @@ def test_opacity_ramps():
 
 white = (1.0, 1.0, 1.0)
 BAD = {
-    "a single point": (lambda: jv.TransferFunction.from_points([(0, white, 0.5)]), "at least 2 control points; got 1"),
+    "a single point": (
+        lambda: jv.TransferFunction.from_points([(0, white, 0.5)]),
+        "at least 2 control points; got 1",
+    ),
     "no points": (lambda: jv.TransferFunction.from_points([]), "points must be triples"),
     "unsorted": (
         lambda: jv.TransferFunction.from_points([(1, white, 0.5), (0, white, 0.5)]),
@@ -119,7 +126,10 @@ BAD = {
         "unit_distance must be greater than 0; got 0",
     ),
     "unknown preset": (lambda: jv.preset("ct-bone"), "preset must be one of ct_bone.*got 'ct-bone'"),
-    "unknown colormap": (lambda: jv.colormap("viridi", (0, 1)), "cmap must be a matplotlib colormap; got 'viridi'"),
+    "unknown colormap": (
+        lambda: jv.colormap("viridi", (0, 1)),
+        "cmap must be a matplotlib colormap; got 'viridi'",
+    ),
     "unknown ramp": (lambda: jv.colormap("gray", (0, 1), "cubic"), "opacity must be"),
     "ramp above 1": (lambda: jv.colormap("gray", (0, 1), [0, 2]), r"opacity must be in \[0, 1\]"),
     "clim": (lambda: jv.preset("engine", clim=(5, 5)), "clim must be .*low < high"),

@@ -118,17 +118,35 @@ def test_float64_data_follow_jax():
 
 BAD = {
     "2-D": (lambda: jv.Volume(np.zeros((4, 4), np.uint8)), r"data\[x, y, z\].*shape \(4, 4\).*stack"),
-    "an axis of one voxel": (lambda: jv.Volume(np.zeros((4, 1, 4), np.uint8)), r"at least 2 voxels.*\(4, 1, 4\)"),
+    "an axis of one voxel": (
+        lambda: jv.Volume(np.zeros((4, 1, 4), np.uint8)),
+        r"at least 2 voxels.*\(4, 1, 4\)",
+    ),
     "objects": (lambda: jv.Volume(np.full(SHAPE, None)), r"data must be of type.*got object"),
     "int64": (lambda: jv.Volume(np.zeros(SHAPE, np.int64)), r"got int64\. Convert"),
     "bool": (lambda: jv.Volume(np.zeros(SHAPE, bool)), r"got bool"),
     "complex": (lambda: jv.Volume(np.zeros(SHAPE, complex)), r"got complex128"),
     "text": (lambda: jv.Volume("engine.raw"), r"shape \(\)"),
-    "zero spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, 0, 1)), r"spacing must be positive"),
-    "negative spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, -1, 1)), r"spacing must be positive"),
-    "NaN spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, np.nan, 1)), r"spacing must be finite"),
-    "one spacing": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=1.0), r"spacing must have shape \(3,\)"),
-    "infinite origin": (lambda: jv.Volume(np.zeros(SHAPE, np.uint8), origin=(0, 0, np.inf)), r"origin must be finite"),
+    "zero spacing": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, 0, 1)),
+        r"spacing must be positive",
+    ),
+    "negative spacing": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, -1, 1)),
+        r"spacing must be positive",
+    ),
+    "NaN spacing": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, np.nan, 1)),
+        r"spacing must be finite",
+    ),
+    "one spacing": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=1.0),
+        r"spacing must have shape \(3,\)",
+    ),
+    "infinite origin": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), origin=(0, 0, np.inf)),
+        r"origin must be finite",
+    ),
     "labels of another shape": (
         lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.zeros((5, 7, 5), np.uint8)),
         r"labels must stand on the grid of data, shape \(5, 7, 6\); got shape \(5, 7, 5\)",

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import integer
 from ..volume import Volume
 from . import colon, engine, formulas, frog, head, vessels
-from .arguments import integer
 from .colon import colon_path as colon_path
 
 
@@ -38,7 +38,8 @@ def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> V
 
     Spacing is 2 / (resolution - 1) and the origin (-1, -1, -1). The value at a world point does not
     depend on the resolution, but for boundaries of the uint8 phantoms, which are ramps 2 voxels
-    wide. `u` below stands for (world + 1) / 2, which runs over the unit cube.
+    wide (in `labels` 0.06 world units at every resolution). `u` below stands for (world + 1) / 2, which
+    runs over the unit cube.
 
     | name | type | what | seed |
     |---|---|---|---|
@@ -50,8 +51,8 @@ block 150, steel parts 240 | none |
 180, wall 220 | polyps, folds, tissue texture |
     | `vessels` | uint8 | branching tubes (230 on 0) from a root at the -z face, radii 0.12 to 0.02 world \
 units, less than 3 % filled | the tree |
-    | `labels` | uint8 | frog facing -y, with organs, soft-edged, and `labels`: 0 outside, 1 body, 2 and 3 lungs \
-(right, left), 4 liver, 5 stomach; organs that touch share a curved face | none |
+    | `labels` | uint8 | frog facing -y, with organs, soft-edged, and `labels`: 0 outside, 1 body, 2 and 3 \
+lungs (right, left), 4 liver, 5 stomach; organs that touch share a curved face | none |
     | `plane` | float32 | inclined plane, 1 / (1 + exp(-(u_z - h) / 0.004)) with h = 0.25 + 0.35 u_x; seen \
 along +z | none |
     | `cut_block` | float32 | 0.5 + 0.1 sin(40 u_z) for u_x < 0.5, which the box's faces cut through; \

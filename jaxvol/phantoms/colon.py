@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from .arguments import integer
+from ..checks import integer
 from .canvas import FAR, Canvas
 from .shapes import ball, box, capsule, lengths, to_segment
 from .waves import Waves

@@ -12,13 +12,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from jaxtyping import ArrayLike
-
+from ..checks import Arrayable
+from ..volume import Volume
 from .files import Header
 from .medical import read_medical
 from .npy import read_npy, read_npz
 from .raw import read_raw
-from .volume import Volume
 
 
 Reader: TypeAlias = Callable[[Path, Header], dict[str, Any]]
@@ -37,8 +36,8 @@ def load(
     *,
     shape: Sequence[int] | Any | None = None,
     dtype: str | Any | None = None,
-    spacing: ArrayLike | Any | None = None,
-    origin: ArrayLike | Any | None = None,
+    spacing: Arrayable | None = None,
+    origin: Arrayable | None = None,
 ) -> Volume:
     """The volume in a file, its kind told by the ending of its name.
 
