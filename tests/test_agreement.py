@@ -110,5 +110,5 @@ def test_real_volumes_agree_with_the_independent_marcher(real_volume, file, spac
     camera = CAMERAS["around"](volume, (40, 40))
     march = jv.March(0.8, (jv.AlphaCorrection(),), "left")
     rendering = jv.render(volume, transfer, camera, march)
-    assert float(rendering.rgba[..., 3].max()) > 0.9
+    assert float(rendering.rgba[..., 3].max()) > 0.5
     compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5)
