@@ -147,6 +147,7 @@ class Camera(eqx.Module):
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return position, (dx / norm, dy / norm, dz / norm)
 
+    @eqx.filter_jit  # compiled, as the renderer's rays are, so that both round alike
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
         """Origins and unit directions of all pixels' rays, `[row, column]`."""
         width, height = self.size
