@@ -10,6 +10,7 @@ from .camera import Camera as Camera
 from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to_srgb
 from .engine import render as render, render_rays as render_rays
 from .formats import load as load
+from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .march import March as March, Transform as Transform
 from .phantoms import phantom as phantom
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset

@@ -1,0 +1,122 @@
+"""Where does the march begin, so that its steps do not show? Jittered sampling, and empty-space jittering.
+
+Samples at the same depths in all pixels draw their distance to a surface as rings over the image: wood
+grain. Both transforms here shift the samples of each pixel by a random part ξ of a step, which turns the
+rings into noise. Neither makes the image more accurate: the energy of its error stays what it was.
+"""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from .checks import integer, is_traced
+from .locate import Ray
+from .march import Cell, Transform
+from .noise import blue_tile, hashed_uniforms
+from .triple import Scalar
+from .volume import Volume
+
+
+Pattern = Literal["white", "blue"]
+
+
+class Noise(eqx.Module):
+    """One random number in [0, 1) for each pixel, which depends on seed, stream and pixel alone.
+
+    `pattern`: `"white"`: independent from pixel to pixel. `"blue"`: low frequencies suppressed, so that
+    the eye sees less of it; a tile of 128 x 128 numbers, each once, repeated over the image from an
+    origin that the seed chooses.
+    """
+
+    seed: UInt32[Array, ""]
+    tile: Float[Array, "side side"] | None
+    stream: int = eqx.field(static=True)
+
+    def __init__(self, seed: int | Any, pattern: Pattern | Any, stream: int):
+        if not is_traced(seed):
+            seed = integer("seed", seed.item() if hasattr(seed, "item") else seed, 0)
+        if pattern not in ("white", "blue"):
+            raise ValueError(f'pattern must be "white" or "blue"; got {pattern!r}.')
+        self.seed = jnp.asarray(seed).astype(jnp.uint32)
+        self.tile = blue_tile() if pattern == "blue" else None
+        self.stream = stream
+
+    def __call__(self, pixel: tuple[Int[Array, ""], Int[Array, ""]], dtype: Any) -> Scalar:
+        column, row = pixel
+        if self.tile is None:
+            return hashed_uniforms(column, row, self.seed, dtype)[self.stream]
+        side = self.tile.shape[0]
+        # where the tile begins: the same for all pixels, another for each seed and stream
+        here = jnp.full_like(column, self.stream)
+        shift_x, shift_y, _ = hashed_uniforms(here, here, self.seed, jnp.float32)
+        x = (column + (shift_x * side).astype(column.dtype)) % side
+        y = (row + (shift_y * side).astype(row.dtype)) % side
+        return self.tile[y, x].astype(dtype)
+
+
+class Jitter(Transform):
+    """Begin each ray a random part ξ of a step past its entry.
+
+    Breaks wood grain into noise. Where the volume's bounds cut through material it makes noise of its
+    own, since each ray leaves out the first ξ d of the material.
+
+    **Arguments:**
+
+    - `seed`: integer ≥ 0. The random number of a pixel depends on seed and pixel alone.
+    - `pattern`: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
+    - `front_residual`: give the piece that is left out a narrow cell of its own, from the entry to ξ d,
+      sampled at the entry; the noise on cut faces then falls to that of the sample's value.
+
+    Source: jittered sampling as in Kye 2013, section 2.2.
+    """
+
+    noise: Noise
+    front_residual: bool = eqx.field(static=True)
+
+    def __init__(
+        self, seed: int | Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool = False
+    ):
+        self.noise = Noise(seed, pattern, stream=0)
+        self.front_residual = front_residual
+
+    def start(self, steps: Scalar, ray: Ray) -> Scalar:
+        offset = self.noise(ray.pixel, steps.dtype)
+        return steps + (offset - 1 if self.front_residual else offset)
+
+    def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+        if not self.front_residual:
+            return (cell,)
+        front = jnp.maximum(cell.front, 0)
+        return (Cell(front, cell.width - (front - cell.front), cell.cut),)
+
+
+class EmptySpaceJitter(Transform):
+    """At the first transparent sample of a ray move on by a random part ξ of a step, instead of a whole one.
+
+    A ray begins at its entry without an offset, so faces on which the volume's bounds cut material stay
+    smooth; what lies behind empty space is jittered, so wood grain breaks all the same. ξ < 1 keeps
+    the moved sample within the cell that is known to be empty. Once per ray, since every shortened step
+    costs a sample. Transparent means an extinction of exactly 0.
+
+    The image jumps where the sample at which a ray is first transparent changes; gradients do not see that.
+
+    **Arguments:** `seed`, `pattern`: as in `Jitter`, whose numbers are independent of these.
+
+    Source: Kye 2013, section 3.1.
+    """
+
+    noise: Noise
+
+    def __init__(self, seed: int | Any = 0, pattern: Pattern | Any = "white"):
+        self.noise = Noise(seed, pattern, stream=1)
+
+    def remember(self, ray: Ray) -> tuple[Scalar, Bool[Array, ""]]:
+        return self.noise(ray.pixel, ray.length.dtype), jnp.ones(ray.length.shape, bool)
+
+    def advance(
+        self, steps: Scalar, memory: tuple[Scalar, Bool[Array, ""]], ray: Ray, transparent: Bool[Array, ""]
+    ) -> tuple[Scalar, tuple[Scalar, Bool[Array, ""]]]:
+        part, pending = memory
+        return jnp.where(pending & transparent, steps - 1 + part, steps), (part, pending & ~transparent)

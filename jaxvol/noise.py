@@ -1,0 +1,97 @@
+"""Which random number belongs to a pixel? Hashes, and a tile of blue noise."""
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt32
+
+from .triple import Triple
+
+
+def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""], dtype: Any) -> Triple:
+    """Three numbers in [0, 1), independent of each other and from key to key.
+
+    A hash rather than `jax.random`, whose every number costs some hundred operations where this takes
+    twenty: drawing them must not show in the time of a frame. Source: pcg3d of Jarzynski and Olano,
+    "Hash Functions for GPU Rendering", JCGT 9(3), 2020.
+    """
+    a, b, c = (key.astype(jnp.uint32) * np.uint32(1664525) + np.uint32(1013904223) for key in (x, y, seed))
+    a, b, c = _stir(a, b, c)
+    a, b, c = (word ^ (word >> np.uint32(16)) for word in (a, b, c))
+    a, b, c = _stir(a, b, c)
+
+    def unit(word: UInt32[Array, ""]) -> Float[Array, ""]:
+        # 24 bits are what float32 holds exactly; rounding up to 1 is so ruled out
+        return (word >> np.uint32(8)).astype(dtype) * (2.0**-24)
+
+    return unit(a), unit(b), unit(c)
+
+
+def _stir(a, b, c):
+    a = a + b * c
+    b = b + c * a
+    c = c + a * b
+    return a, b, c
+
+
+@cache
+def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
+    """Ranks 0 … side² - 1 on a torus, neighbours far apart in rank: void and cluster (Ulichney 1993).
+
+    Each rank goes to the emptiest place, that farthest, in the sense of a Gaussian of `sigma` pixels, from
+    those taken so far; the pattern to begin with is evened out by moving its tightest point into its
+    largest void until it stays there.
+    """
+    distance = np.minimum(np.arange(side), side - np.arange(side))
+    bell = np.exp(-(distance**2) / (2 * sigma**2)).astype(np.float32)
+    kernel = np.tile(np.outer(bell, bell), (2, 2))
+    taken = np.zeros((side, side), bool)
+    crowd = np.zeros((side, side), np.float32)
+
+    def put(place: tuple[int, int], sign: int) -> None:
+        nonlocal crowd
+        y, x = place
+        taken[y, x] = sign > 0
+        crowd += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
+
+    def largest_void() -> tuple[int, int]:
+        return np.unravel_index(np.where(taken, np.inf, crowd).argmin(), taken.shape)  # type: ignore[return-value]
+
+    def tightest_cluster() -> tuple[int, int]:
+        return np.unravel_index(np.where(taken, crowd, -np.inf).argmax(), taken.shape)  # type: ignore[return-value]
+
+    first = side * side // 10
+    for place in np.random.default_rng(0).permutation(side * side)[:first]:
+        put(divmod(int(place), side), 1)
+    while True:
+        moved = tightest_cluster()
+        put(moved, -1)
+        void = largest_void()
+        put(void, 1)
+        if void == moved:
+            break
+
+    ranks = np.zeros((side, side), np.int64)
+    order = []
+    start = taken.copy(), crowd.copy()
+    for _ in range(first):
+        order.append(tightest_cluster())
+        put(order[-1], -1)
+    for rank, place in enumerate(reversed(order)):
+        ranks[place] = rank
+    taken[:], crowd = start
+    for rank in range(first, side * side):
+        place = largest_void()
+        ranks[place] = rank
+        put(place, 1)
+    return ranks
+
+
+def blue_tile() -> Float[Array, "side side"]:
+    """Numbers in (0, 1), each as often as any other, low frequencies suppressed, on a torus."""
+    ranks = _blue_ranks()
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray((ranks + 0.5) / ranks.size, jnp.float32)
