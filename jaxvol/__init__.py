@@ -11,11 +11,13 @@ from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to
 from .engine import render as render, render_rays as render_rays
 from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
+from .labels import LabelTransferFunction as LabelTransferFunction
 from .march import March as March, Transform as Transform
 from .phantoms import phantom as phantom
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
 from .rendering import Rendering as Rendering
 from .termination import EarlyTermination as EarlyTermination
+from .toroidal import ToroidalMap as ToroidalMap
 from .transfer import TransferFunction as TransferFunction
 from .volume import Volume as Volume

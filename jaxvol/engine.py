@@ -21,7 +21,7 @@ from .locate import enter
 from .march import March
 from .reference import Progress, begin, end, samples_across, step
 from .rendering import Rendering
-from .transfer import TransferFunction
+from .transfer import Transfer
 from .volume import Volume
 
 
@@ -40,7 +40,7 @@ CHECKPOINTS = 16
 
 def render(
     volume: Volume,
-    transfer: TransferFunction,
+    transfer: Transfer,
     camera: Camera,
     march: March,
     *,
@@ -74,7 +74,7 @@ def render(
 
 def render_rays(
     volume: Volume,
-    transfer: TransferFunction,
+    transfer: Transfer,
     origins: Arrayable,
     directions: Arrayable,
     march: March,
@@ -139,9 +139,7 @@ class _Loop(eqx.Module):
 
 
 @eqx.filter_jit
-def _render(
-    volume: Volume, transfer: TransferFunction, camera: Camera, march: March, loop: _Loop
-) -> Rendering:
+def _render(volume: Volume, transfer: Transfer, camera: Camera, march: March, loop: _Loop) -> Rendering:
     width, height = camera.size
     side = min(TILE, max(width, height))
     across, down = -(-width // side), -(-height // side)
@@ -163,7 +161,7 @@ def _render(
 @eqx.filter_jit
 def _render_rays(
     volume: Volume,
-    transfer: TransferFunction,
+    transfer: Transfer,
     origins: Float[Array, "*rays 3"],
     directions: Float[Array, "*rays 3"],
     march: March,
@@ -193,7 +191,7 @@ def _render_rays(
 
 def _march(
     volume: Volume,
-    transfer: TransferFunction,
+    transfer: Transfer,
     rays: tuple[Points, Points],
     pixel: Pixels,
     wanted: Bool[Array, " rays"],

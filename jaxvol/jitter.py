@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .checks import integer, is_traced
@@ -35,8 +36,7 @@ class Noise(eqx.Module):
     stream: int = eqx.field(static=True)
 
     def __init__(self, seed: int | Any, pattern: Pattern | Any, stream: int):
-        if not is_traced(seed):
-            seed = integer("seed", seed.item() if hasattr(seed, "item") else seed, 0)
+        seed = seed if is_traced(seed) else integer("seed", np.asarray(seed).item(), 0)
         if pattern not in ("white", "blue"):
             raise ValueError(f'pattern must be "white" or "blue"; got {pattern!r}.')
         self.seed = jnp.asarray(seed).astype(jnp.uint32)

@@ -6,21 +6,30 @@ in the grid gives another `Path`, and the rest of the march does not notice.
 """
 
 from abc import abstractmethod
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from .triple import Scalar, Triple, along, apart
 from .volume import Volume
 
 
 class Path(eqx.Module):
-    """A ray as seen in the grid: the coordinate at depth `s`, the world length past the entry."""
+    """A ray as seen in the grid."""
+
+    gaps: ClassVar[bool] = False
+    """Whether a ray may leave the grid between its entry and its exit."""
 
     @abstractmethod
-    def __call__(self, s: Scalar) -> Triple: ...
+    def __call__(self, s: Scalar) -> Triple:
+        """The grid coordinate at depth `s`, the world length past the entry."""
+
+    def contains(self, coordinate: Triple) -> Bool[Array, ""]:
+        """Whether there is anything at a coordinate of this path. False in gaps alone."""
+        return jnp.ones((), bool)
 
 
 class Space(eqx.Module):
@@ -29,6 +38,10 @@ class Space(eqx.Module):
     @abstractmethod
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
         """Distances at which the line enters and leaves the grid; the first exceeds the second on a miss."""
+
+    @abstractmethod
+    def coordinate(self, point: Triple) -> Triple:
+        """The grid coordinate of a world point."""
 
     @abstractmethod
     def path(self, entry: Triple, direction: Triple) -> Path:
@@ -95,16 +108,38 @@ class Affine(Space):
         self.spacing = apart(volume.spacing)
 
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
-        slabs = [_slab(*ends) for ends in zip(origin, direction, self.low, self.high, strict=True)]
-        (near_x, far_x), (near_y, far_y), (near_z, far_z) = slabs
-        near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
-        far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
-        return near, far
+        return slab_interval(origin, direction, self.low, self.high)
+
+    def coordinate(self, point: Triple) -> Triple:
+        x, y, z = ((p - low) / step for p, low, step in zip(point, self.low, self.spacing, strict=True))
+        return x, y, z
 
     def path(self, entry: Triple, direction: Triple) -> Straight:
-        ex, ey, ez = ((e - low) / step for e, low, step in zip(entry, self.low, self.spacing, strict=True))
         dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
-        return Straight((ex, ey, ez), (dx, dy, dz))
+        return Straight(self.coordinate(entry), (dx, dy, dz))
+
+
+def slab_interval(origin: Triple, direction: Triple, low: Triple, high: Triple) -> tuple[Scalar, Scalar]:
+    """Distances at which a line enters and leaves a box; the first exceeds the second on a miss."""
+    (near_x, far_x), (near_y, far_y), (near_z, far_z) = (
+        _slab(*ends) for ends in zip(origin, direction, low, high, strict=True)
+    )
+    near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
+    far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
+    return near, far
+
+
+def world_gradient(
+    volume: Volume, space: Space, point: Triple, method: Literal["trilinear", "central"] = "central"
+) -> Triple:
+    """Gradient of the value at a world point, value units per world length, wherever the grid lies.
+
+    As `Volume.gradient`, turned and scaled by the transposed derivative of `space.coordinate`.
+    """
+    coordinate, transpose = jax.vjp(space.coordinate, point)
+    slopes = volume.gradient(coordinate, method)
+    per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))
+    return transpose(per_node)[0]
 
 
 def _slab(origin: Scalar, direction: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:

@@ -21,7 +21,7 @@ from .checks import is_traced
 from .locate import Ray, enter
 from .march import Cell, March
 from .rendering import Rendering
-from .transfer import Classify, TransferFunction
+from .transfer import Classify, Transfer
 from .triple import Scalar, Triple, apart
 from .volume import Volume
 
@@ -73,8 +73,9 @@ def step(march: March, ray: Ray, volume: Volume, classify: Classify, at: Progres
     for piece in march.cut(cell, ray, volume):
         depth = march.sample(piece)
         live = ~at.finished & (depth < ray.length)
-        (red, green, blue), extinction = classify(ray.path(depth))
-        extinction = jnp.where(live, extinction, 0)
+        coordinate = ray.path(depth)
+        (red, green, blue), extinction = classify(coordinate)
+        extinction = jnp.where(live & ray.path.contains(coordinate), extinction, 0)
         weight = (1 - opacity) * -jnp.expm1(-extinction * piece.width)  # expm1: thin cells keep their digits
         r, g, b = r + weight * red, g + weight * green, b + weight * blue
         opacity, moment = opacity + weight, moment + weight * depth
@@ -111,7 +112,7 @@ def end(ray: Ray, at: Progress) -> Rendering:
 
 def render_ray_reference(
     volume: Volume,
-    transfer: TransferFunction,
+    transfer: Transfer,
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     march: March,

@@ -1,12 +1,12 @@
 """Which colour and extinction has this value?"""
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .checks import Arrayable, finite_array, number, require, unit_interval
 from .triple import Scalar, Triple
@@ -15,6 +15,15 @@ from .volume import Volume
 
 Classify: TypeAlias = Callable[[Triple], tuple[Triple, Scalar]]
 """From a grid coordinate to colour (r, g, b) and extinction (1/length)."""
+
+
+class Transfer(Protocol):
+    """What a renderer asks of a transfer function, of whatever kind."""
+
+    def over(self, volume: Volume) -> Classify:
+        """Classification of grid coordinates of this volume. What does not depend on the coordinate is
+        computed here, once, outside the march's loop."""
+        ...
 
 
 class TransferFunction(eqx.Module):
@@ -79,36 +88,50 @@ class TransferFunction(eqx.Module):
 
     def __call__(self, value: Scalar) -> tuple[Triple, Scalar]:
         """Colour (r, g, b) and extinction of a value."""
-        return self._rows()(value)
+        return self._look_up()(value)
 
     def over(self, volume: Volume) -> Classify:
-        """Classification of grid coordinates of this volume. What does not depend on the coordinate
-        is computed here, once, outside the march's loop."""
-        look_up = self._rows()
+        """Classification of grid coordinates of this volume."""
+        look_up = self._look_up()
         return lambda coordinate: look_up(volume.value(coordinate))
 
     def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
         """Opacity at the control points of a layer of thickness `unit_distance`."""
         return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
 
-    def _rows(self) -> Callable[[Scalar], tuple[Triple, Scalar]]:
-        """A table with one row per interval: all that a sample needs, so that it costs one gather."""
+    def _look_up(self) -> Callable[[Scalar], tuple[Triple, Scalar]]:
+        rows, last = self.rows(), self.values.shape[0] - 2
+
+        def look_up(value: Scalar) -> tuple[Triple, Scalar]:
+            row = rows.at[jnp.clip(points_below(self.values, value) - 1, 0, last)].get(
+                mode="promise_in_bounds"
+            )
+            return interpolated(row, value)
+
+        return look_up
+
+    def rows(self) -> Float[Array, "n-1 10"]:
+        """A table with one row for each interval between points: all that a sample there needs, so that it
+        costs one gather. Start, inverse width, channels at the start, and how much they rise."""
         values = jax.lax.stop_gradient(self.values)
         channels = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         inverse = 1 / (values[1:] - values[:-1])
         columns = [values[:-1, None], inverse[:, None], channels[:-1], channels[1:] - channels[:-1]]
-        rows = jnp.concatenate(columns, axis=1)
-        last = rows.shape[0] - 1
-        # Comparing with every point is one fused kernel, the faster one while there are few points.
-        search = "compare_all" if last < 32 else "scan_unrolled"
+        return jnp.concatenate(columns, axis=1)
 
-        def look_up(value: Scalar) -> tuple[Triple, Scalar]:
-            i = jnp.searchsorted(values, value, side="right", method=search).astype(jnp.int32) - 1
-            row = rows.at[jnp.clip(i, 0, last)].get(mode="promise_in_bounds")
-            f = jnp.clip((value - row[0]) * row[1], 0, 1)
-            return (row[2] + f * row[6], row[3] + f * row[7], row[4] + f * row[8]), row[5] + f * row[9]
 
-        return look_up
+def points_below(values: Float[Array, " n"], value: Scalar) -> Int[Array, ""]:
+    """How many control points lie at or below a value."""
+    # Comparing with every point is one fused kernel, the faster one while there are few points.
+    search = "compare_all" if values.shape[0] <= 32 else "scan_unrolled"
+    values = jax.lax.stop_gradient(values)
+    return jnp.searchsorted(values, value, side="right", method=search).astype(jnp.int32)
+
+
+def interpolated(row: Float[Array, "10"], value: Scalar) -> tuple[Triple, Scalar]:
+    """Colour and extinction of a value, from the row of its interval."""
+    f = jnp.clip((value - row[0]) * row[1], 0, 1)
+    return (row[2] + f * row[6], row[3] + f * row[7], row[4] + f * row[8]), row[5] + f * row[9]
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:

@@ -1,0 +1,57 @@
+"""Which colour and extinction has a value within this structure? One transfer function for each label."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .transfer import Classify, TransferFunction, interpolated, points_below
+from .triple import Scalar, Triple
+from .volume import Volume
+
+
+class LabelTransferFunction(eqx.Module):
+    """A transfer function for each label of a segmented volume.
+
+    **Arguments:**
+
+    - `functions`: that of label 0, 1, 2, …, or None for a label that is not seen. All have the same number
+      of control points. A label beyond the last is not seen either.
+
+    The label is that of the nearest node, so it changes along a ray at once, half-way between nodes;
+    `AlphaCorrection(labels=True)` cuts cells there.
+
+    **Raises:** `ValueError` for no function at all, and for different numbers of control points; and when
+    rendering a volume without labels.
+    """
+
+    stacked: TransferFunction
+    """All functions as one, with a leading axis for the label; the last is that of labels not seen."""
+
+    def __init__(self, functions: Sequence[TransferFunction | None]):
+        seen = [function for function in functions if function is not None]
+        if not seen:
+            raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
+        counts = sorted({function.values.shape[0] for function in seen})
+        if len(counts) > 1:
+            raise ValueError(f"functions must have the same number of control points; got {counts}.")
+        hidden = TransferFunction(seen[0].values, 0 * seen[0].colors, 0 * seen[0].extinction)
+        given = [hidden if function is None else function for function in [*functions, None]]
+        self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
+
+    def over(self, volume: Volume) -> Classify:
+        """Classification of grid coordinates of this volume."""
+        tables = jax.vmap(TransferFunction.rows)(self.stacked)
+        unseen, intervals = tables.shape[0] - 1, tables.shape[1]
+        rows = tables.reshape(-1, tables.shape[2])
+
+        def classify(coordinate: Triple) -> tuple[Triple, Scalar]:
+            value, label = volume.value(coordinate), volume.label(coordinate)
+            label = jnp.where((label < 0) | (label > unseen), unseen, label)
+            values = self.stacked.values.at[label].get(mode="promise_in_bounds")
+            interval = jnp.clip(points_below(values, value) - 1, 0, intervals - 1)
+            row = rows.at[label * intervals + interval].get(mode="promise_in_bounds")
+            return interpolated(row, value)
+
+        return classify

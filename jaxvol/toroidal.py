@@ -1,0 +1,250 @@
+"""Where does a swept ultrasound fan lie in the world? Toroidal coordinates (Kim, Kwon and Shin 2008).
+
+A mechanical probe turns a fan of beams about a motor axis. Its samples are a box in (β, σ, γ): the motor's
+angle, the beam's angle in the fan, the depth along the beam. In the world, whose x axis is the motor's
+axis and whose z axis points along the middle beam at β = σ = π/2, the box is a sector of a torus:
+
+    ρ = sqrt(y² + z²)    R = ρ - a    β = π/2 + atan2(y, z)    σ = π/2 + atan2(x, R)    γ = sqrt(x² + R²) - b
+
+with `a` from the motor axis to the fan's apex and `b` from the apex to the first sample. The volume is
+rendered as it was acquired, without resampling: straight rays in the world are curved in its grid.
+"""
+
+import math
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .checks import Arrayable, finite_array, number, require
+from .locate import Path, Space, slab_interval
+from .march import Transform
+from .triple import Scalar, Triple, along, apart
+from .volume import Volume
+
+
+class ToroidalMap(Transform):
+    """Read `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, nodes evenly spaced over the ranges.
+
+    The volume's own spacing and origin mean nothing under this map; the world is the probe's, with its
+    origin on the motor axis. Outside the swept sector there is nothing. A ray may leave the sector through
+    its hollow near side and come back; `AlphaCorrection` cuts cells at each such face.
+
+    **Arguments:**
+
+    - `a`: distance from the motor axis to the fan's apex, world length (mm); negative where the apex lies
+      behind the axis, as in probes whose array turns about a near axis.
+    - `b`: distance from the apex to depth γ = 0, world length.
+    - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
+      [0, π], increasing.
+    - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
+      b + first > 0.
+
+    All are differentiable. Values and gradients are finite everywhere, and 0 is taken for the gradient of
+    an angle where it has none: on the motor axis (y = z = 0) and at the apex (x = R = 0).
+
+    **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
+
+    Source: Kim, Kwon and Shin 2008, equation 1, which prints `atan`; `atan2` is the same where z > 0 and
+    R > 0, and outside of every sector elsewhere.
+    """
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    beta_range: Float[Array, "2"]
+    sigma_range: Float[Array, "2"]
+    gamma_range: Float[Array, "2"]
+
+    def __init__(
+        self,
+        a: Arrayable,
+        b: Arrayable,
+        beta_range: Arrayable,
+        sigma_range: Arrayable,
+        gamma_range: Arrayable,
+    ):
+        self.a = number("a", a)
+        self.b = number("b", b)
+        self.beta_range = _angles("beta_range", beta_range)
+        self.sigma_range = _angles("sigma_range", sigma_range)
+        self.gamma_range = require(
+            _range("gamma_range", gamma_range),
+            lambda gamma, b: b + gamma[0] > 0,
+            "gamma_range must begin beyond the apex, b + gamma_range[0] > 0; got {got}.",
+            self.b,
+        )
+
+    def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
+        """(β, σ, γ) of world points (*points, 3)."""
+        return jnp.stack(self._forward(_components("points", points)), axis=-1)
+
+    def to_world(self, toroidal: Arrayable) -> Float[Array, "*points 3"]:
+        """World points of (β, σ, γ), (*points, 3): inverse of `to_toroidal` where γ > -b and ρ > 0."""
+        beta, sigma, gamma = _components("toroidal", toroidal)
+        depth = gamma + self.b
+        rho = self.a + depth * jnp.sin(sigma)  # sin σ = cos(σ - π/2)
+        world = -depth * jnp.cos(sigma), -rho * jnp.cos(beta), rho * jnp.sin(beta)
+        return jnp.stack(world, axis=-1)
+
+    @property
+    def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Lowest and highest world coordinates of the swept sector; tight."""
+        half = math.pi / 2
+        depth = self.b + self.gamma_range
+        # depth and angles act separately: the extremes are at the ends of ranges, or where a cosine peaks
+        fan, turn = self.sigma_range - half, self.beta_range - half
+        middle_fan, middle_turn = (jnp.clip(0.0, angles[0], angles[1]) for angles in (fan, turn))
+        x = jnp.outer(depth, jnp.sin(fan))
+        rho = self.a + jnp.outer(depth, jnp.cos(jnp.append(fan, middle_fan)))
+        rho = jnp.maximum(jnp.stack([rho.min(), rho.max()]), 0)
+        y = jnp.outer(rho, jnp.sin(turn))
+        z = jnp.outer(rho, jnp.cos(jnp.append(turn, middle_turn)))
+        return jnp.stack([x.min(), y.min(), z.min()]), jnp.stack([x.max(), y.max(), z.max()])
+
+    @property
+    def bounds(self) -> Float[Array, "6"]:
+        """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the swept sector; tight."""
+        return jnp.stack(self.corners, axis=-1).reshape(-1)
+
+    @property
+    def center(self) -> Float[Array, "3"]:
+        """Middle of the bounds."""
+        low, high = self.corners
+        return (low + high) / 2
+
+    def locate(self, space: Space, volume: Volume) -> Space:
+        return _Sector(self, volume.shape)
+
+    def _forward(self, point: Triple) -> Triple:
+        x, y, z = point
+        off = _hypot(y, z) - self.a
+        half = math.pi / 2
+        return half + _atan2(y, z), half + _atan2(x, off), _hypot(x, off) - self.b
+
+
+class _Sector(Space):
+    """The space of a volume under a `ToroidalMap`."""
+
+    probe: ToroidalMap
+    shape: tuple[int, int, int] = eqx.field(static=True)
+
+    def coordinate(self, point: Triple) -> Triple:
+        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        beta, sigma, gamma = (
+            (value - ends[0]) / (ends[1] - ends[0]) * (n - 1)
+            for value, ends, n in zip(self.probe._forward(point), ranges, self.shape, strict=True)
+        )
+        return beta, sigma, gamma
+
+    def path(self, entry: Triple, direction: Triple) -> "_Curved":
+        return _Curved(self, entry, direction)
+
+    def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
+        """First entry, not behind the origin, and last exit: between them the ray may be outside.
+
+        No closed form is worth it (the faces are two tori, two cones and two planes); but each face's
+        distance is one, so each end is approached by steps of the distance that is still to go at least.
+        A ray that grazes a face may be given some of what lies before it, which is empty.
+        """
+        low, high = (apart(corner) for corner in self.probe.corners)
+        near, far = slab_interval(origin, direction, low, high)
+        near = jnp.maximum(near, 0)
+        hit = far > near
+        near, far = jnp.where(hit, near, 0), jnp.where(hit, far, 0)
+        first = self._face(origin, direction, near, far - near, 1)
+        last = self._face(origin, direction, far, far - near, -1)
+        hit &= last > first
+        return jnp.where(hit, first, jnp.inf), jnp.where(hit, last, -jnp.inf)
+
+    def _face(self, origin: Triple, direction: Triple, begin: Scalar, length: Scalar, sign: int) -> Scalar:
+        """Where the sector begins, coming from `begin` and going at most `length` along `sign` × the ray."""
+        tolerance = 1e-6 * (self.probe.a + self.probe.b + self.probe.gamma_range[1])
+        fixed = jax.lax.stop_gradient((self, origin, direction, begin, length, tolerance))
+
+        def go_on(state: tuple[Scalar, Scalar, Scalar]) -> Bool[Array, ""]:
+            gone, outside, steps = state
+            return (outside > fixed[5]) & (gone <= fixed[4]) & (steps < 96)
+
+        def go(state: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+            gone, outside, steps = state
+            gone = gone + outside
+            return gone, fixed[0]._outside(along(fixed[1], fixed[2], fixed[3] + sign * gone)), steps + 1
+
+        start = fixed[0]._outside(along(fixed[1], fixed[2], fixed[3]))
+        gone, outside, _ = jax.lax.while_loop(go_on, go, (0 * start, start, 0 * start))
+        t = fixed[3] + sign * gone
+        # One Newton step: it takes what the tolerance left, and carries the implicit function's gradient.
+        one = jnp.ones_like(t)
+        value, slope = jax.jvp(lambda t: self._outside(along(origin, direction, t)), (t,), (one,))
+        slope = jax.lax.stop_gradient(slope)
+        at_face = (jnp.abs(outside) <= 4 * fixed[5]) & (jnp.abs(slope) > 1e-3)
+        return jnp.where(at_face, t - value / jnp.where(at_face, slope, 1), t)
+
+    def _outside(self, point: Triple) -> Scalar:
+        """How far outside the sector a point is at least; negative inside."""
+        x, y, z = point
+        probe, half = self.probe, math.pi / 2
+        off = _hypot(y, z) - probe.a
+        depth = _hypot(x, off) - probe.b
+        outside = jnp.maximum(probe.gamma_range[0] - depth, depth - probe.gamma_range[1])
+        for (first, last), across, ahead in (
+            (probe.sigma_range - half, x, off),
+            (probe.beta_range - half, y, z),
+        ):
+            before = ahead * jnp.sin(first) - across * jnp.cos(first)
+            beyond = across * jnp.cos(last) - ahead * jnp.sin(last)
+            outside = jnp.maximum(outside, jnp.maximum(before, beyond))
+        return outside
+
+
+class _Curved(Path):
+    """A straight world ray in a sector's grid."""
+
+    gaps: ClassVar[bool] = True
+
+    sector: _Sector
+    entry: Triple
+    direction: Triple
+
+    def __call__(self, s: Scalar) -> Triple:
+        return self.sector.coordinate(along(self.entry, self.direction, s))
+
+    def contains(self, coordinate: Triple) -> Bool[Array, ""]:
+        slack = 1e-3  # of a node: rounding at a face must not decide whether its sample is seen
+        inside = jnp.ones((), bool)
+        for c, n in zip(coordinate, self.sector.shape, strict=True):
+            inside = inside & (c >= -slack) & (c <= n - 1 + slack)
+        return inside
+
+
+def _hypot(a: Scalar, b: Scalar) -> Scalar:
+    """sqrt(a² + b²), with gradient 0 at the origin."""
+    square = a * a + b * b
+    away = square > 0
+    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)
+
+
+def _atan2(a: Scalar, b: Scalar) -> Scalar:
+    """atan2, with value and gradient 0 at the origin."""
+    # not just off 0: the derivative divides by a² + b², which must not underflow
+    away = jnp.maximum(jnp.abs(a), jnp.abs(b)) > float(jnp.finfo(a.dtype).tiny) ** 0.25
+    return jnp.where(away, jnp.arctan2(jnp.where(away, a, 0), jnp.where(away, b, 1)), 0)
+
+
+def _range(name: str, value: Arrayable) -> Float[Array, "2"]:
+    message = f"{name} must be (first, last) with first < last; got {{got}}."
+    return require(finite_array(name, value, (2,)), lambda ends: ends[0] < ends[1], message)
+
+
+def _angles(name: str, value: Arrayable) -> Float[Array, "2"]:
+    message = f"{name} must lie in [0, π] radians; got {{got}}."
+    return require(_range(name, value), lambda ends: (ends >= 0) & (ends <= math.pi + 1e-6), message)
+
+
+def _components(name: str, points: Arrayable) -> tuple[Any, Any, Any]:
+    points = jnp.asarray(points, dtype=float)
+    if points.ndim < 1 or points.shape[-1] != 3:
+        raise ValueError(f"{name} must have shape (*points, 3); got {points.shape}.")
+    return points[..., 0], points[..., 1], points[..., 2]
