@@ -1,7 +1,7 @@
 """How wide is a cell that meets a face? Sampling alignment, also called alpha correction (Kye 2013)."""
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -15,6 +15,8 @@ from .volume import Volume
 
 
 Region: TypeAlias = Callable[[Scalar], Int[Array, ""]]
+Bracket: TypeAlias = tuple[Scalar, Scalar, Bool[Array, ""]]
+"""Inner end, outer end, whether the region at the outer end is another than that looked for."""
 
 PROBES = 4
 """Places in a cell, beside its front, at which the region is looked up: what lasts a quarter of a step or
@@ -79,29 +81,32 @@ def _divided(cell: Cell, region: Region) -> tuple[Cell, Cell, Cell]:
     places = [front + width * (i / PROBES) for i in range(PROBES + 1)]
     regions = [region(place) for place in places]
 
-    def face(inner: Int[Array, ""], brackets: list[tuple[Scalar, Scalar, Bool[Array, ""]]]) -> Scalar:
-        """Where the region ceases to be `inner`, in the first bracket (its inner end, its outer end) of which
-        it is so at the inner end alone; the first bracket's inner end if there is none."""
+    def face(inner: Int[Array, ""], brackets: list[Bracket]) -> tuple[Scalar, Scalar]:
+        """Either side of the face at which the region ceases to be `inner`, in the first bracket at whose
+        outer end it is another."""
         near, far = brackets[0][0], brackets[0][0]
         for start, stop, changed in reversed(brackets):
             near, far = jnp.where(changed, start, near), jnp.where(changed, stop, far)
 
-        def halve(_: int, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        def halve(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
             near, far = bracket
             middle = (near + far) / 2
             same = region(middle) == inner
             return jnp.where(same, middle, near), jnp.where(same, far, middle)
 
-        return jax.lax.fori_loop(0, BISECTIONS, halve, (near, far))[1]
+        return jax.lax.fori_loop(0, BISECTIONS, halve, (near, far))
 
-    pairs = list(zip(places, places[1:], regions, regions[1:], strict=False))
-    forward = [(p, q, r != regions[0]) for p, q, _, r in pairs]
-    backward = [(q, p, r != regions[-1]) for p, q, r, _ in reversed(pairs)]
-    changes = jnp.any(jnp.stack([r != regions[0] for r in regions]))
+    changed_to = [r != regions[0] for r in regions]
+    changed_from = [r != regions[-1] for r in regions]
+    forward = list(zip(places, places[1:], changed_to[1:], strict=False))
+    backward = list(zip(places[:0:-1], places[-2::-1], changed_from[-2::-1], strict=True))
+    changes = jnp.any(jnp.stack(changed_to))
+    # each piece begins on its own side of the face, where it is sampled
+    _, first = face(regions[0], forward)
+    last, _ = face(regions[-1], backward)
     end = cell.front + cell.width
-    first = jnp.where(changes, face(regions[0], forward), end)
-    last = jnp.where(changes, face(regions[-1], backward), end)
-    last = jnp.maximum(first, last)
+    first = jnp.where(changes, first, end)
+    last = jnp.maximum(first, jnp.where(changes, last, end))
     return (
         Cell(cell.front, first - cell.front, cell.cut & (first >= end)),
         Cell(first, last - first, cell.cut & (first < end) & (last >= end)),

@@ -2,16 +2,15 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .transfer import Classify, TransferFunction, interpolated, points_below
+from .transfer import Classify, Transfer, TransferFunction, interpolated, points_below
 from .triple import Scalar, Triple
 from .volume import Volume
 
 
-class LabelTransferFunction(eqx.Module):
+class LabelTransferFunction(Transfer):
     """A transfer function for each label of a segmented volume.
 
     **Arguments:**

@@ -51,21 +51,20 @@ def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
     taken = np.zeros((side, side), bool)
     crowd = np.zeros((side, side), np.float32)
 
-    def put(place: tuple[int, int], sign: int) -> None:
-        nonlocal crowd
-        y, x = place
+    def put(place: int, sign: int) -> None:
+        y, x = divmod(place, side)
         taken[y, x] = sign > 0
-        crowd += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
+        crowd[...] += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
 
-    def largest_void() -> tuple[int, int]:
-        return np.unravel_index(np.where(taken, np.inf, crowd).argmin(), taken.shape)  # type: ignore[return-value]
+    def largest_void() -> int:
+        return int(np.where(taken, np.inf, crowd).argmin())
 
-    def tightest_cluster() -> tuple[int, int]:
-        return np.unravel_index(np.where(taken, crowd, -np.inf).argmax(), taken.shape)  # type: ignore[return-value]
+    def tightest_cluster() -> int:
+        return int(np.where(taken, crowd, -np.inf).argmax())
 
     first = side * side // 10
     for place in np.random.default_rng(0).permutation(side * side)[:first]:
-        put(divmod(int(place), side), 1)
+        put(int(place), 1)
     while True:
         moved = tightest_cluster()
         put(moved, -1)
@@ -74,20 +73,20 @@ def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
         if void == moved:
             break
 
-    ranks = np.zeros((side, side), np.int64)
-    order = []
+    # from this pattern down to none the tightest go first; from it up to all, the largest voids are filled
     start = taken.copy(), crowd.copy()
+    order = []
     for _ in range(first):
         order.append(tightest_cluster())
         put(order[-1], -1)
-    for rank, place in enumerate(reversed(order)):
-        ranks[place] = rank
-    taken[:], crowd = start
-    for rank in range(first, side * side):
-        place = largest_void()
-        ranks[place] = rank
-        put(place, 1)
-    return ranks
+    order.reverse()
+    taken[...], crowd[...] = start
+    for _ in range(first, side * side):
+        order.append(largest_void())
+        put(order[-1], 1)
+    ranks = np.empty(side * side, np.int64)
+    ranks[order] = np.arange(side * side)
+    return ranks.reshape(side, side)
 
 
 def blue_tile() -> Float[Array, "side side"]:

@@ -25,6 +25,14 @@ from .triple import Scalar, Triple, along, apart
 from .volume import Volume
 
 
+STEPS = 64
+"""Steps towards a face, at most. Those that need more graze it, and pass by it or along it."""
+
+BACK = 0.01
+"""How far behind the origin an entry is looked for, in sizes of the probe. A ray begins anew near its entry
+(`enter`), past which rounding may have brought it: by this much for a camera 1e4 sizes away."""
+
+
 class ToroidalMap(Transform):
     """Read `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, nodes evenly spaced over the ranges.
 
@@ -142,7 +150,8 @@ class _Sector(Space):
         return _Curved(self, entry, direction)
 
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
-        """First entry, not behind the origin, and last exit: between them the ray may be outside.
+        """First entry, not behind the origin by more than `BACK`, and last exit: between them the ray may be
+        outside.
 
         No closed form is worth it (the faces are two tori, two cones and two planes); but each face's
         distance is one, so each end is approached by steps of the distance that is still to go at least.
@@ -150,8 +159,8 @@ class _Sector(Space):
         """
         low, high = (apart(corner) for corner in self.probe.corners)
         near, far = slab_interval(origin, direction, low, high)
-        near = jnp.maximum(near, 0)
-        hit = far > near
+        near = jnp.maximum(near, -BACK * self._size)
+        hit = far > jnp.maximum(near, 0)
         near, far = jnp.where(hit, near, 0), jnp.where(hit, far, 0)
         first = self._face(origin, direction, near, far - near, 1)
         last = self._face(origin, direction, far, far - near, -1)
@@ -160,27 +169,57 @@ class _Sector(Space):
 
     def _face(self, origin: Triple, direction: Triple, begin: Scalar, length: Scalar, sign: int) -> Scalar:
         """Where the sector begins, coming from `begin` and going at most `length` along `sign` × the ray."""
-        tolerance = 1e-6 * (self.probe.a + self.probe.b + self.probe.gamma_range[1])
-        fixed = jax.lax.stop_gradient((self, origin, direction, begin, length, tolerance))
+        tolerance = 8 * jnp.finfo(begin.dtype).eps * self._size
 
-        def go_on(state: tuple[Scalar, Scalar, Scalar]) -> Bool[Array, ""]:
-            gone, outside, steps = state
-            return (outside > fixed[5]) & (gone <= fixed[4]) & (steps < 96)
+        def outside_at(
+            sector: _Sector, origin: Triple, direction: Triple, t: Scalar
+        ) -> tuple[Scalar, Scalar]:
+            """How far outside the sector is, and the slope of that along the ray."""
+            one = jnp.ones_like(t)
+            return jax.jvp(lambda t: sector._outside(along(origin, direction, t)), (t,), (one,))
 
-        def go(state: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
-            gone, outside, steps = state
-            gone = gone + outside
-            return gone, fixed[0]._outside(along(fixed[1], fixed[2], fixed[3] + sign * gone)), steps + 1
+        fixed = jax.lax.stop_gradient((self, origin, direction))
+        begin, length, tolerance = jax.lax.stop_gradient((begin, length, tolerance))
 
-        start = fixed[0]._outside(along(fixed[1], fixed[2], fixed[3]))
-        gone, outside, _ = jax.lax.while_loop(go_on, go, (0 * start, start, 0 * start))
-        t = fixed[3] + sign * gone
+        def go_on(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> Bool[Array, ""]:
+            gone, outside, _, steps = state
+            return (outside > tolerance) & (gone <= length) & (steps < STEPS)
+
+        def go(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+            gone, outside, slope, steps = state
+            here = along(fixed[1], fixed[2], begin + sign * gone)
+            gone = gone + fixed[0]._clear(here, jnp.maximum(outside, tolerance), sign * slope)
+            return gone, *outside_at(*fixed, begin + sign * gone), steps + 1
+
+        outside, slope = outside_at(*fixed, begin)
+        gone, outside, _, _ = jax.lax.while_loop(go_on, go, (0 * outside, outside, slope, 0 * outside))
+        t = begin + sign * gone
         # One Newton step: it takes what the tolerance left, and carries the implicit function's gradient.
-        one = jnp.ones_like(t)
-        value, slope = jax.jvp(lambda t: self._outside(along(origin, direction, t)), (t,), (one,))
+        value, slope = outside_at(self, origin, direction, t)
         slope = jax.lax.stop_gradient(slope)
-        at_face = (jnp.abs(outside) <= 4 * fixed[5]) & (jnp.abs(slope) > 1e-3)
+        at_face = (jnp.abs(outside) <= 4 * tolerance) & (jnp.abs(slope) > 1e-3)
         return jnp.where(at_face, t - value / jnp.where(at_face, slope, 1), t)
+
+    @property
+    def _size(self) -> Scalar:
+        """The length by which rounding is measured."""
+        probe = self.probe
+        return jax.lax.stop_gradient(jnp.abs(probe.a) + probe.b + probe.gamma_range[1])
+
+    def _clear(self, point: Triple, outside: Scalar, slope: Scalar) -> Scalar:
+        """How far on the face that is `outside` away, and comes nearer by `slope` < 0, is not reached yet.
+
+        The distance f to each face has |f'| ≤ 1, so f is clear. Its second derivative along a line is at
+        least -(1/ρ + 1/D), D the distance to the circle of apexes, and this at most doubles within half of
+        the smaller. So f + f' s - ½ k s², k = 4 / min(ρ, D), is a bound, and its root s is clear as well:
+        close to a face it is Newton's step, which does not creep along where the ray meets it obliquely.
+        """
+        x, y, z = point
+        rho = _hypot(y, z)
+        near = jnp.minimum(rho, _hypot(x, rho - self.probe.a))
+        slope = jnp.minimum(slope, 0)
+        root = jnp.sqrt(slope * slope + 8 * outside / jnp.maximum(near, outside))
+        return jnp.maximum(outside, jnp.minimum(2 * outside / (root - slope), near / 2))
 
     def _outside(self, point: Triple) -> Scalar:
         """How far outside the sector a point is at least; negative inside."""
@@ -212,9 +251,16 @@ class _Curved(Path):
         return self.sector.coordinate(along(self.entry, self.direction, s))
 
     def contains(self, coordinate: Triple) -> Bool[Array, ""]:
-        slack = 1e-3  # of a node: rounding at a face must not decide whether its sample is seen
-        inside = jnp.ones((), bool)
-        for c, n in zip(coordinate, self.sector.shape, strict=True):
+        probe, inside = self.sector.probe, jnp.ones((), bool)
+        rounding = 16 * float(jnp.finfo(coordinate[0].dtype).eps)
+        axes = (
+            (probe.beta_range, math.pi),
+            (probe.sigma_range, math.pi),
+            (probe.gamma_range, self.sector._size),
+        )
+        for c, n, (ends, size) in zip(coordinate, self.sector.shape, axes, strict=True):
+            # rounding at a face must not decide whether its sample is seen
+            slack = rounding * size / (ends[1] - ends[0]) * (n - 1)
             inside = inside & (c >= -slack) & (c <= n - 1 + slack)
         return inside
 

@@ -1,7 +1,8 @@
 """Which colour and extinction has this value?"""
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -17,16 +18,16 @@ Classify: TypeAlias = Callable[[Triple], tuple[Triple, Scalar]]
 """From a grid coordinate to colour (r, g, b) and extinction (1/length)."""
 
 
-class Transfer(Protocol):
+class Transfer(eqx.Module):
     """What a renderer asks of a transfer function, of whatever kind."""
 
+    @abstractmethod
     def over(self, volume: Volume) -> Classify:
         """Classification of grid coordinates of this volume. What does not depend on the coordinate is
         computed here, once, outside the march's loop."""
-        ...
 
 
-class TransferFunction(eqx.Module):
+class TransferFunction(Transfer):
     """Colour and extinction, piecewise linear in the volume's value and constant beyond the ends.
 
     **Arguments:**
@@ -110,7 +111,7 @@ class TransferFunction(eqx.Module):
 
         return look_up
 
-    def rows(self) -> Float[Array, "n-1 10"]:
+    def rows(self) -> Float[Array, "intervals 10"]:
         """A table with one row for each interval between points: all that a sample there needs, so that it
         costs one gather. Start, inverse width, channels at the start, and how much they rise."""
         values = jax.lax.stop_gradient(self.values)

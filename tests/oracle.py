@@ -34,10 +34,18 @@ def march(
     midpoint=False,
     align=False,
     opacity_left=None,
+    start=0.0,
+    front_residual=False,
+    empty_jump=None,
 ):
     """(n, 4) premultiplied colour and opacity, and (n,) numbers of samples.
 
-    `points`: (values, colors, extinction), each a NumPy array.
+    - `points`: (values, colors, extinction), each a NumPy array.
+    - `align`: the last cell ends at the exit.
+    - `opacity_left`: a ray ends with this transmittance.
+    - `start`: (n,) the first sample's offset, in steps; with `front_residual` what lies before it is a
+      cell of its own.
+    - `empty_jump`: (n,) after the first transparent sample the next one follows at this part of a step.
     """
     data, spacing, origin = (np.asarray(a, np.float64) for a in (data, spacing, origin))
     origins, directions = (np.asarray(a, np.float64).reshape(-1, 3) for a in (origins, directions))
@@ -47,12 +55,16 @@ def march(
     n = len(origins)
     color, transmittance, samples = np.zeros((n, 3)), np.ones(n), np.zeros(n, int)
     ended = t_out <= t_in
-    for i in range(1_000_000):
-        front = t_in + i * d
-        width = np.full(n, float(d))
+    t_in, t_out = (np.where(ended, 0, t) for t in (t_in, t_out))
+    front = t_in + (np.asarray(start, np.float64) - front_residual) * d
+    jumps = np.zeros(n, bool) if empty_jump is None else np.ones(n, bool)
+    for _ in range(1_000_000):
+        begin = np.maximum(front, t_in) if front_residual else front
+        end = front + d
         if align:
-            width = np.clip(np.where(np.isfinite(t_out), t_out, 0) - front, 0, d)
-        t = front + width / 2 if midpoint else front
+            end = np.minimum(end, t_out)
+        width = np.maximum(end - begin, 0)
+        t = begin + width / 2 if midpoint else begin
         ended = ended | (t >= t_out)
         if ended.all():
             return np.concatenate([color, 1 - transmittance[:, None]], axis=1), samples
@@ -64,6 +76,9 @@ def march(
         color += (transmittance * alpha)[:, None] * rgb
         transmittance *= 1 - alpha
         samples += ~ended
+        jump = jumps & (sigma == 0)
+        front = front + d * np.where(jump, 0 if empty_jump is None else empty_jump, 1)
+        jumps &= ~jump
         if opacity_left is not None:
             ended = ended | (transmittance <= opacity_left)
     raise AssertionError("the march never ended")

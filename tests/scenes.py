@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import combinations
 
 import equinox as eqx
 import jax
@@ -77,12 +78,24 @@ def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
 
 CAMERAS = {"around": around, "inside": inside, "orthographic": orthographic}
 
-TRANSFORMS: dict[str, tuple[jv.Transform, ...]] = {
-    "plain": (),
-    "aligned": (jv.AlphaCorrection(),),
-    "terminated": (jv.EarlyTermination(0.05),),
-    "aligned, terminated": (jv.AlphaCorrection(), jv.EarlyTermination(0.05)),
+KINDS: dict[str, jv.Transform] = {
+    "jittered": jv.Jitter(3),
+    "empty-space jittered": jv.EmptySpaceJitter(4),
+    "aligned": jv.AlphaCorrection(),
+    "terminated": jv.EarlyTermination(0.05),
 }
+
+TRANSFORMS: dict[str, tuple[jv.Transform, ...]] = {
+    ", ".join(names) or "plain": tuple(KINDS[name] for name in names)
+    for count in range(len(KINDS) + 1)
+    for names in combinations(KINDS, count)
+}
+"""Every set of transforms."""
+
+TRANSFORMS["front residual, aligned"] = (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())
+
+FEW = ["plain", "aligned", "empty-space jittered, aligned, terminated", "front residual, aligned"]
+"""Names of a few sets that each transform is in."""
 
 
 @contextmanager

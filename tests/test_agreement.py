@@ -9,7 +9,7 @@ import pytest
 import jaxvol as jv
 
 from . import oracle
-from .scenes import CAMERAS, TRANSFORMS, VOLUMES, doubled, in_float64, soft_transfer
+from .scenes import CAMERAS, FEW, TRANSFORMS, VOLUMES, doubled, in_float64, soft_transfer
 
 
 STEP = 0.07
@@ -19,7 +19,7 @@ def oracle_image(volume, transfer, camera, march):
     """The independent marcher's rgba and samples, for the rays that the camera gave."""
     origins, directions = camera.rays()
     kinds = {type(t): t for t in march.transforms}
-    ending = kinds.get(jv.EarlyTermination)
+    ending, jitter, jump = (kinds.get(t) for t in (jv.EarlyTermination, jv.Jitter, jv.EmptySpaceJitter))
     rgba, samples = oracle.march(
         volume.data,
         volume.spacing,
@@ -31,9 +31,20 @@ def oracle_image(volume, transfer, camera, march):
         midpoint=march.quadrature == "midpoint",
         align=jv.AlphaCorrection in kinds,
         opacity_left=None if ending is None else float(ending.opacity_left),
+        start=0.0 if jitter is None else random_parts(jitter, camera),
+        front_residual=jitter is not None and jitter.front_residual,
+        empty_jump=None if jump is None else random_parts(jump, camera),
     )
     shape = origins.shape[:-1]
     return rgba.reshape(*shape, 4), samples.reshape(shape)
+
+
+def random_parts(transform, camera):
+    """The random number of every pixel, row by row."""
+    width, height = camera.size
+    row, column = (jnp.asarray(index.reshape(-1), jnp.int32) for index in np.mgrid[:height, :width])
+    parts = jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32))(column, row)
+    return np.asarray(parts, np.float64)
 
 
 def compare(rendering, rgba, samples, *, tolerance, left=0.0):
@@ -48,15 +59,22 @@ def compare(rendering, rgba, samples, *, tolerance, left=0.0):
 
 
 @eqx.filter_jit
-def reference_image(volume, transfer, origins, directions, march):
-    def one(origin, direction):
-        return jv.render_ray_reference(volume, transfer, origin, direction, march)
+def reference_image(volume, transfer, camera, march):
+    """Every pixel by the reference engine, one ray each."""
 
-    return jax.vmap(jax.vmap(one))(origins, directions)
+    def one(column, row):
+        origin, direction = (jnp.stack(part) for part in camera.ray(column, row))
+        return jv.render_ray_reference(volume, transfer, origin, direction, march, pixel=(column, row))
+
+    width, height = camera.size
+    across = jax.vmap(one, in_axes=(0, None))
+    return jax.vmap(across, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
 
 
-@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
-@pytest.mark.parametrize("transforms", TRANSFORMS)
+CASES = [(name, "left") for name in TRANSFORMS] + [(name, "midpoint") for name in FEW]
+
+
+@pytest.mark.parametrize(("transforms", "quadrature"), CASES)
 def test_three_engines_agree(transforms, quadrature):
     march = jv.March(STEP, TRANSFORMS[transforms], quadrature, max_samples=80)
     left = 0.05 if "terminated" in transforms else 0.0
@@ -66,13 +84,13 @@ def test_three_engines_agree(transforms, quadrature):
             camera = view(volume)
             rendering = jv.render(volume, transfer, camera, march)
             compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5, left=left)
-            reference = reference_image(volume, transfer, *camera.rays(), march)
+            reference = reference_image(volume, transfer, camera, march)
             assert not np.any(reference.exhausted)
             compare(rendering, reference.rgba, np.asarray(reference.samples), tolerance=2e-5, left=left)
             np.testing.assert_array_equal(rendering.aligned, reference.aligned)
 
 
-@pytest.mark.parametrize("transforms", TRANSFORMS)
+@pytest.mark.parametrize("transforms", FEW)
 def test_reference_in_float64_is_the_independent_marcher_to_rounding(transforms):
     with in_float64():
         march = doubled(jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80))
@@ -80,7 +98,7 @@ def test_reference_in_float64_is_the_independent_marcher_to_rounding(transforms)
         for make in VOLUMES.values():
             volume = doubled(make())
             camera = doubled(CAMERAS["around"](volume))
-            reference = reference_image(volume, transfer, *camera.rays(), march)
+            reference = reference_image(volume, transfer, camera, march)
             assert reference.rgba.dtype == jnp.float64
             rgba, samples = oracle_image(volume, transfer, camera, march)
             np.testing.assert_array_equal(reference.samples, samples)

@@ -15,6 +15,7 @@ from ..checks import integer
 from ..volume import Volume
 from . import colon, engine, formulas, frog, head, vessels
 from .colon import colon_path as colon_path
+from .toroidal import toroidal_phantom as toroidal_phantom
 
 
 # makes the voxels, and perhaps labels, of a scene from a resolution and a source of randomness

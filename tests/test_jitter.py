@@ -1,0 +1,176 @@
+"""Random numbers of pixels, and where they move the samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+from .scenes import anisotropic_noise, around, soft_transfer, uniform_transfer
+
+
+BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
+STEP = 0.3
+SIDE = 128
+
+
+@jax.jit
+def numbers(noise, origin=(0, 0)):
+    """A SIDE x SIDE image of the pixels' random numbers, its first pixel at `origin`."""
+    row, column = jnp.meshgrid(jnp.arange(SIDE), jnp.arange(SIDE), indexing="ij")
+    return drawn(noise, column + origin[0], row + origin[1])
+
+
+def drawn(noise, column, row):
+    return jnp.vectorize(lambda c, r: noise((c, r), jnp.float32))(column, row)
+
+
+def spectrum(image):
+    """Energy by frequency, and the frequencies in cycles per pixel."""
+    power = np.abs(np.fft.fft2(image - image.mean())) ** 2
+    frequency = np.fft.fftfreq(SIDE)
+    return power, np.hypot(*np.meshgrid(frequency, frequency))
+
+
+@pytest.mark.parametrize("pattern", ["white", "blue"])
+@pytest.mark.parametrize("kind", [jv.Jitter, jv.EmptySpaceJitter])
+def test_numbers_are_uniform_in_0_1(kind, pattern):
+    for seed in range(3):
+        image = np.asarray(numbers(kind(seed, pattern).noise))
+        assert image.min() >= 0
+        assert image.max() < 1
+        counts = np.histogram(image, bins=16, range=(0, 1))[0]
+        # chi-squared with 15 degrees of freedom: beyond 45 once in ten thousand times
+        assert ((counts - SIDE**2 / 16) ** 2 / (SIDE**2 / 16)).sum() < 45
+
+
+def test_white_numbers_are_independent_of_neighbours_seeds_and_streams():
+    image = np.asarray(numbers(jv.Jitter(0).noise))
+    others = {
+        "next pixel": np.roll(image, 1, axis=1),
+        "next row": np.roll(image, 1, axis=0),
+        "transposed": image.T,
+        "next seed": numbers(jv.Jitter(1).noise),
+        "other transform": numbers(jv.EmptySpaceJitter(0).noise),
+    }
+    for name, other in others.items():
+        assert abs(np.corrcoef(image.ravel(), np.ravel(other))[0, 1]) < 0.03, name
+    power, frequency = spectrum(image)
+    bands = [power[(frequency >= low) & (frequency < low + 0.1)].mean() for low in (0.02, 0.1, 0.2, 0.3, 0.4)]
+    np.testing.assert_allclose(bands, np.mean(bands), rtol=0.15)
+
+
+def test_blue_noise_has_little_energy_in_the_lowest_eighth_of_frequencies():
+    def low_energy(pattern):
+        power, frequency = spectrum(np.asarray(numbers(jv.Jitter(0, pattern).noise)))
+        return power[frequency < 0.5 / 8].sum()
+
+    assert low_energy("blue") < low_energy("white") / 5
+
+
+def test_a_number_depends_on_seed_and_pixel_alone():
+    for pattern in ("white", "blue"):
+        noise = jv.Jitter(7, pattern).noise
+        whole, part = numbers(noise), numbers(noise, (5, 9))
+        np.testing.assert_array_equal(whole[9:, 5:], part[:-9, :-5])
+        np.testing.assert_array_equal(whole, numbers(jv.Jitter(7, pattern).noise))
+        assert np.abs(np.asarray(whole - numbers(jv.Jitter(8, pattern).noise))).mean() > 0.2
+
+
+def see(transforms, extinction=1.0, count=200):
+    """Many rays along x through the box."""
+    origins = np.tile([-1.0, 1.0, 1.0], (count, 1))
+    directions = np.tile([1.0, 0.0, 0.0], (count, 1))
+    march = jv.March(STEP, transforms)
+    return jv.render_rays(BOX, uniform_transfer(extinction), origins, directions, march)
+
+
+def parts(transform, count=200):
+    place = jnp.arange(count)
+    return np.asarray(drawn(transform.noise, place, 0 * place), np.float64)
+
+
+def test_jitter_starts_each_ray_a_part_of_a_step_in():
+    jitter = jv.Jitter(1)
+    missing = parts(jitter) * STEP
+    np.testing.assert_allclose(
+        see((jitter, jv.AlphaCorrection())).rgba[:, 3], 1 - np.exp(missing - 2), atol=1e-6
+    )
+    cells = np.ceil((2 - missing) / STEP)
+    np.testing.assert_array_equal(see((jitter,)).samples, cells)
+    np.testing.assert_allclose(see((jitter,)).rgba[:, 3], 1 - np.exp(-cells * STEP), atol=1e-6)
+
+
+@pytest.mark.parametrize("pattern", ["white", "blue"])
+def test_front_residual_gives_back_what_jitter_leaves_out(pattern):
+    jitter = jv.Jitter(1, pattern, front_residual=True)
+    rendering = see((jitter, jv.AlphaCorrection()))
+    np.testing.assert_allclose(rendering.rgba[:, 3], 1 - np.exp(-2), atol=1e-6)
+    narrow = parts(jitter) * STEP
+    np.testing.assert_array_equal(rendering.samples, 1 + np.ceil((2 - narrow) / STEP))
+
+
+def test_empty_space_jitter_leaves_rays_without_empty_space_alone():
+    for field in ("rgba", "samples"):
+        np.testing.assert_array_equal(getattr(see((jv.EmptySpaceJitter(1),)), field), getattr(see(()), field))
+
+
+def test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample():
+    """Material, a gap, material again: the first part is sampled as without, the last one shifted once."""
+    data = np.ones((41, 2, 2), np.float32)  # 40 long
+    data[10:20] = 0
+    data[25:30] = 0
+    volume = jv.Volume(data)
+    transfer = jv.TransferFunction([0.4999, 0.5], np.ones((2, 3)), [0.0, 0.05])  # visible from 0.5 on
+    jitter = jv.EmptySpaceJitter(2)
+    count = 50
+    rays = np.tile([-1.0, 0.5, 0.5], (count, 1)), np.tile([1.0, 0.0, 0.0], (count, 1))
+    march = jv.March(1.0, (jitter, jv.AlphaCorrection()))
+    rendering = jv.render_rays(volume, transfer, *rays, march)
+    shift = parts(jitter, count)
+    # whole steps to sample 10, the first transparent one; then from 10 + ξ by whole steps
+    samples = [np.concatenate([np.arange(11.0), np.arange(10 + part, 40)]) for part in shift]
+    inside = [np.interp(s, np.arange(41), data[:, 0, 0]) >= 0.5 for s in samples]
+    widths = [np.minimum(1, 40 - s) for s in samples]
+    opacity = [1 - np.exp(-0.05 * (w * i).sum()) for w, i in zip(widths, inside, strict=True)]
+    np.testing.assert_allclose(rendering.rgba[:, 3], opacity, atol=1e-5)
+    np.testing.assert_array_equal(rendering.samples, [len(s) for s in samples])
+
+
+def test_seeds_do_not_compile_again_and_images_differ_by_noise_alone():
+    traces = 0
+
+    class Counting(jv.TransferFunction):
+        def over(self, volume):
+            nonlocal traces
+            traces += 1
+            return super().over(volume)
+
+    volume = anisotropic_noise()
+    transfer = Counting(*jax.tree.leaves(soft_transfer()))
+    camera = around(volume, (24, 20))
+    images = [
+        np.asarray(jv.render(volume, transfer, camera, jv.March(0.07, (jv.Jitter(seed),))).rgba)
+        for seed in range(8)
+    ]
+    assert traces == 1
+    assert np.abs(images[0] - images[1]).max() > 1e-3
+    exact = np.asarray(jv.render(volume, transfer, camera, jv.March(0.002)).rgba)
+    single = np.sqrt(np.mean((images[0] - exact) ** 2))
+    assert np.sqrt(np.mean((np.mean(images, axis=0) - exact) ** 2)) < 0.6 * single
+
+
+BAD = {
+    "negative seed": (lambda: jv.Jitter(-1), "seed must be an integer of at least 0; got -1"),
+    "half a seed": (lambda: jv.EmptySpaceJitter(0.5), "seed must be an integer"),
+    "pattern": (lambda: jv.Jitter(0, "pink"), 'pattern must be "white" or "blue"; got \'pink\''),
+    "twice": (lambda: jv.March(0.1, (jv.Jitter(0), jv.Jitter(1))), "got Jitter 2 times"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,276 @@
+"""Wood grain is broken, cut faces stay smooth, and the error is no smaller: Kye 2013, measured."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.jitter import Noise
+from jaxvol.metrics import (
+    boundary_noise,
+    comb_frequency,
+    low_frequency_energy,
+    rmse,
+    wood_grain_energy,
+)
+
+
+JITTERS = {"jitter": jv.Jitter, "empty space": jv.EmptySpaceJitter}
+SEEDS = range(5)
+
+
+def rendered(scene, *transforms):
+    """Colour over black, with alpha correction in all images, so that the exit makes no difference."""
+    volume, transfer, camera, step = scene
+    march = jv.March(step, (*transforms, jv.AlphaCorrection()))
+    rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba  # compiles the fastest
+    return np.asarray(rgba[..., :3], np.float64)
+
+
+def converged(scene, refined):
+    """By the midpoint rule, whose error falls with the step's square."""
+    volume, transfer, camera, step = scene
+    march = jv.March(step / refined, (jv.AlphaCorrection(), jv.EarlyTermination(1e-6)), "midpoint")
+    rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba
+    return np.asarray(rgba[..., :3], np.float64)
+
+
+# -- inclined plane ---------------------------------------------------------------------------------------
+# The scene of the measurements in Kye's terms: the unit cube drawn as [-1, 1]³, so a step of 1/128 of it is
+# 2/128, and an extinction of 60 value is 30 value.
+
+SLOPE = 0.35
+
+
+class Plane(jv.Volume):
+    """The field of `jv.phantom("plane")` itself in place of its voxels."""
+
+    def value(self, coordinate):
+        x, _, z = (c * self.spacing[i] + self.origin[i] for i, c in enumerate(coordinate))
+        return jax.nn.sigmoid(((z + 1) / 2 - 0.25 - SLOPE * (x + 1) / 2) / 0.004)
+
+
+class Sphere(jv.Volume):
+    """The field of `jv.phantom("sphere")` itself in place of its voxels."""
+
+    def value(self, coordinate):
+        x, y, z = (c * self.spacing[i] + self.origin[i] for i, c in enumerate(coordinate))
+        return jax.nn.sigmoid((0.5 - jnp.sqrt(x * x + y * y + z * z)) / 0.008)
+
+
+def surface_transfer():
+    """Clear below 0.05, then colour 0.3 + 0.6 value and extinction 30 value."""
+    values = np.array([0, 0.04999, 0.05, 1])
+    colors = np.tile((0.3 + 0.6 * values)[:, None], 3)
+    return jv.TransferFunction(values, colors, [0, 0, 1.5, 30])
+
+
+def seen_along_z(field, scale, size=256):
+    volume = field(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3)
+    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
+    return volume, surface_transfer(), camera, 2 / 128
+
+
+@cache
+def plane(scale=0.5):
+    scene = seen_along_z(Plane, scale)
+    return scene, converged(scene, 16)
+
+
+def comb_of(error, scale=0.5):
+    # x falls along the columns in this view, and so does the depth
+    return wood_grain_energy(error, comb_frequency(2 / 128, (-SLOPE, 0), 2 * scale / 256))
+
+
+@pytest.mark.parametrize("name", JITTERS)
+def test_jitter_breaks_the_comb_of_an_inclined_plane_and_leaves_the_error(name):
+    scene, reference = plane()
+    plain = rendered(scene)
+    comb = comb_of(plain - reference)
+    # the ring's own energy is most of what the error holds beside its mean
+    assert comb > 0.5 * np.sum(np.var(plain - reference, axis=(0, 1)))
+    for seed in SEEDS:
+        image = rendered(scene, JITTERS[name](seed))
+        assert comb_of(image - reference) <= comb / 500, seed
+        assert abs(wood_grain_energy(image - reference)) <= wood_grain_energy(plain - reference) / 10, seed
+        assert rmse(image, reference) == pytest.approx(rmse(plain, reference), rel=0.05), seed
+
+
+def test_one_shift_for_all_pixels_moves_the_comb_and_does_not_break_it():
+    """The measure sees the jitter, not the shift: rays that all begin half a step later."""
+    (volume, transfer, camera, step), reference = plane()
+    later = jv.Camera((0, 0, -1 + step / 2), (0, 0, 1), (0, 1, 0), size=camera.size, parallel_scale=0.5)
+    combs = [comb_of(rendered((volume, transfer, c, step)) - reference) for c in (camera, later)]
+    assert combs[1] == pytest.approx(combs[0], rel=0.05)
+
+
+# -- blue noise -----------------------------------------------------------------------------------------
+
+
+def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
+    pixel = tuple(jnp.asarray(axis.ravel()) for axis in np.meshgrid(*[np.arange(256, dtype=np.int32)] * 2))
+    for seed in SEEDS:
+        slow = {}
+        for pattern in ("white", "blue"):
+            noise = Noise(seed, pattern, stream=0)
+            drawn = np.asarray(jax.vmap(lambda x, y, noise=noise: noise((x, y), jnp.float32))(*pixel))
+            slow[pattern] = low_frequency_energy(drawn.reshape(256, 256))
+        assert slow["blue"] <= slow["white"] / 5, seed
+
+
+@pytest.mark.parametrize(("scale", "bound"), [(0.125, 1 / 5), (0.5, 1 / 2.5)])
+@pytest.mark.parametrize("name", JITTERS)
+def test_blue_jitter_leaves_less_slow_error_where_the_rings_are_wide(name, scale, bound):
+    """The error is a function of ξ + φ, where φ runs through 0 … 1 once per ring. That moves the spectrum
+    of the noise by the comb's frequency, and rings that are narrow (0.5: 11 pixels) move fast noise to
+    where it is slow. At 46 pixels (0.125) the error is as blue as it should be."""
+    scene, reference = plane(scale)
+    slow = {
+        pattern: np.mean(
+            [low_frequency_energy(rendered(scene, JITTERS[name](s, pattern)) - reference) for s in SEEDS]
+        )
+        for pattern in ("white", "blue")
+    }
+    assert slow["blue"] <= bound * slow["white"]
+
+
+# -- any scene ------------------------------------------------------------------------------------------
+
+SIZE = (128, 128)
+
+
+@cache
+def head():
+    return jv.phantom("head", 128)
+
+
+def skin():
+    """The head's surface, opaque; with as many points as the preset has, so that programs are shared."""
+    values = np.array([0, 40, 90, 120, 150, 180, 210, 230, 255])
+    colors = np.tile(np.interp(values, [0, 40, 90, 255], [0.1, 0.2, 0.8, 1.0])[:, None], 3)
+    return jv.TransferFunction(values, colors, np.where(values > 40, 60, 0))
+
+
+def sphere_scene(_):
+    return seen_along_z(Sphere, 0.55, SIZE[0])
+
+
+def head_scene(_, transfer=None):
+    camera = jv.Camera((1.0, -3.2, 0.8), (0, 0, 0), (0, 0, 1), 30.0, size=SIZE)
+    return head(), transfer or jv.preset("head", unit_distance=0.01), camera, 2 / 64
+
+
+def skin_scene(_):
+    return head_scene(_, skin())
+
+
+AIRWAY = "lidc0314_airway_256x192x200_int16le.raw.gz"
+
+
+def airway(real_volume):
+    return jv.load(real_volume(AIRWAY), spacing=(0.78125, 0.78125, 1.0))
+
+
+def airway_scene(real_volume):
+    """In the trachea, looking down it, magnified."""
+    camera = jv.Camera((99.5, 43.7, 182), (99.0, 73.7, 150), (0, 1, 0), 70.0, size=SIZE).zoom(2)
+    return airway(real_volume), jv.preset("ct_airway"), camera, 0.5
+
+
+def engine_scene(real_volume):
+    volume = jv.load(real_volume("engine_256x256x128_uint8.raw.gz"))
+    return volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=SIZE).zoom(2), 2.0
+
+
+@pytest.mark.parametrize("make", [sphere_scene, head_scene, skin_scene, airway_scene, engine_scene])
+def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
+    scene = make(real_volume)
+    reference = converged(scene, 8)
+    plain = rendered(scene)
+    structure = wood_grain_energy(plain - reference)
+    # it is there: a tenth and more of what the error holds beside its mean
+    assert structure > 0.1 * np.sum(np.var(plain - reference, axis=(0, 1)))
+    for kind in JITTERS.values():
+        for seed in (0, 1):
+            image = rendered(scene, kind(seed))
+            assert abs(wood_grain_energy(image - reference)) <= structure / 10, (kind, seed)
+
+
+def chest_scene(real_volume):
+    """Rays enter through tissue, and meet a bone before anything that is transparent."""
+    volume = airway(real_volume)
+    return volume, jv.preset("ct_chest"), jv.Camera.looking_at(volume, size=SIZE).zoom(4), 2.0
+
+
+def cut_head_volume():
+    """The head without its face: its bounds cut through skin, bone and brain."""
+    first = 40
+    data = np.asarray(head().data)[:, first:, :]
+    return jv.Volume(data, head().spacing, head().origin + np.array([0, first * 2 / 127, 0], np.float32))
+
+
+def cut_skull_scene(_):
+    return cut_head(jv.preset("head", unit_distance=0.01))[0]
+
+
+@pytest.mark.parametrize("make", [cut_skull_scene, chest_scene])
+def test_empty_space_jitter_leaves_wood_grain_behind_material_alone(make, real_volume):
+    """Its limit: a ray that meets nothing transparent is not jittered."""
+    scene = make(real_volume)
+    reference = converged(scene, 8)
+    plain, jitter, empty_space = (
+        wood_grain_energy(rendered(scene, *transforms) - reference)
+        for transforms in ((), (jv.Jitter(0),), (jv.EmptySpaceJitter(0),))
+    )
+    assert abs(jitter) <= plain / 10
+    assert 0.5 * plain < empty_space < 1.1 * plain
+
+
+# -- cut faces ------------------------------------------------------------------------------------------
+
+
+def cut_block():
+    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=SIZE, parallel_scale=0.5)
+    origins, _ = camera.rays()
+    return (jv.phantom("cut_block", 128), surface_transfer(), camera, 2 / 128), np.asarray(origins)[
+        ..., 0
+    ] < -0.05
+
+
+def cut_head(transfer):
+    volume = cut_head_volume()
+    # fine enough that the anatomy on the face is smooth from pixel to pixel
+    camera = jv.Camera((0, -3.2, 0.1), (0, 0, 0.1), (0, 0, 1), size=(192, 192), parallel_scale=0.6)
+    origins, _ = (np.asarray(part, np.float64) for part in camera.rays())
+    x, z = (np.round((origins[..., axis] + 1) / (2 / 127)).astype(int) for axis in (0, 2))
+    inside = (x >= 0) & (x <= 127) & (z >= 0) & (z <= 127)
+    face = np.asarray(volume.data)[np.clip(x, 0, 127), 0, np.clip(z, 0, 127)]
+    return (volume, transfer, camera, 2 / 128), inside & (face > 60)
+
+
+CUTS = {
+    "block": cut_block,
+    "head": lambda: cut_head(jv.preset("head", unit_distance=0.01)),
+    "skin": lambda: cut_head(skin()),
+}
+
+# mean square that rounding to float32 leaves in colours up to 1
+ROUNDING = 3 * (2.0**-23) ** 2
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_a_cut_face_is_smooth_under_empty_space_jitter_and_noisy_under_jitter(name):
+    scene, face = CUTS[name]()
+    assert face.mean() > 0.25
+    plain = boundary_noise(rendered(scene), face)
+    for seed in (0, 1):
+        jitter = boundary_noise(rendered(scene, jv.Jitter(seed)), face)
+        residual = boundary_noise(rendered(scene, jv.Jitter(seed, front_residual=True)), face)
+        assert boundary_noise(rendered(scene, jv.EmptySpaceJitter(seed)), face) <= 1.05 * plain + ROUNDING, (
+            seed
+        )
+        assert jitter >= 5 * plain + 1e-6, seed
+        assert residual <= jitter / 2, seed
