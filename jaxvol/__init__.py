@@ -5,6 +5,7 @@ a volume gives values, a transfer function their colour and extinction; the cell
 back into a `Rendering`.
 """
 
+from . import metrics as metrics
 from .alignment import AlphaCorrection as AlphaCorrection
 from .camera import Camera as Camera
 from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to_srgb
@@ -13,7 +14,11 @@ from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .march import March as March, Transform as Transform
-from .phantoms import phantom as phantom
+from .phantoms import (
+    colon_path as colon_path,
+    phantom as phantom,
+    toroidal_phantom as toroidal_phantom,
+)
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
 from .rendering import Rendering as Rendering

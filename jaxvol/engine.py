@@ -21,7 +21,8 @@ from .locate import enter
 from .march import March
 from .reference import Progress, begin, end, samples_across, step
 from .rendering import Rendering
-from .transfer import Transfer
+from .transfer import Classify, Transfer
+from .triple import Scalar, Triple
 from .volume import Volume
 
 
@@ -202,9 +203,27 @@ def _march(
     ray = jax.vmap(enter, in_axes=(None, 0, 0, 0))(march.locate(volume), *rays, pixel)
     ray = eqx.tree_at(lambda r: r.length, ray, jnp.where(wanted, ray.length, 0))
     classify = transfer.over(volume)
-    advance = jax.vmap(lambda ray, at: step(march, ray, volume, classify, at))
+
+    def advance(at: Progress) -> Progress:
+        once = _computed_once(classify, jnp.any(~at.finished))
+        return jax.vmap(lambda ray, at: step(march, ray, volume, once, at))(ray, at)
+
     start = jax.vmap(begin, in_axes=(None, 0))(march, ray)
-    return jax.vmap(end)(ray, loop.run(lambda at: advance(ray, at), start))
+    return jax.vmap(end)(ray, loop.run(advance, start))
+
+
+def _computed_once(classify: Classify, live: Bool[Array, ""]) -> Classify:
+    """The same classification, its result put in memory for all that use it.
+
+    On CPU XLA fuses what a gather feeds into each of its consumers, and would fetch the voxels again for
+    every channel and for each transform that asks for the extinction. It does not fuse across a branch.
+    """
+
+    def nothing(coordinate: Triple) -> tuple[Triple, Scalar]:
+        zero = jnp.zeros_like(coordinate[0])
+        return (zero, zero, zero), zero
+
+    return lambda coordinate: jax.lax.cond(live, classify, nothing, coordinate)
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

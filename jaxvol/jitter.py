@@ -112,11 +112,11 @@ class EmptySpaceJitter(Transform):
     def __init__(self, seed: int | Any = 0, pattern: Pattern | Any = "white"):
         self.noise = Noise(seed, pattern, stream=1)
 
-    def remember(self, ray: Ray) -> tuple[Scalar, Bool[Array, ""]]:
-        return self.noise(ray.pixel, ray.length.dtype), jnp.ones(ray.length.shape, bool)
+    def remember(self, ray: Ray) -> Scalar:
+        """The part of a step to take at the next transparent sample: ξ, and from then on all of it."""
+        return self.noise(ray.pixel, ray.length.dtype)
 
     def advance(
-        self, steps: Scalar, memory: tuple[Scalar, Bool[Array, ""]], ray: Ray, transparent: Bool[Array, ""]
-    ) -> tuple[Scalar, tuple[Scalar, Bool[Array, ""]]]:
-        part, pending = memory
-        return jnp.where(pending & transparent, steps - 1 + part, steps), (part, pending & ~transparent)
+        self, steps: Scalar, memory: Scalar, ray: Ray, transparent: Bool[Array, ""]
+    ) -> tuple[Scalar, Scalar]:
+        return jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)

@@ -9,7 +9,6 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Float64, Shaped
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 
 Image: TypeAlias = Float64[np.ndarray, "height width channels"]
@@ -40,6 +39,8 @@ def psnr(image: Any, reference: Any, data_range: float = 1.0) -> float:
 
     **Raises:** as `rmse`, and `ValueError` for a `data_range` that is not positive.
     """
+    from skimage.metrics import peak_signal_noise_ratio  # here: it takes longer to import than jaxvol
+
     image, reference = _pair(image, reference)
     if not np.any(image != reference):
         return float("inf")
@@ -53,6 +54,8 @@ def ssim(image: Any, reference: Any, data_range: float = 1.0) -> float:
 
     Source: Wang et al. 2004, as scikit-image has it.
     """
+    from skimage.metrics import structural_similarity  # here: it takes longer to import than jaxvol
+
     image, reference = _pair(image, reference)
     _at_least("image", image, 7)
     data_range = _positive("data_range", data_range)
