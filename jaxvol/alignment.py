@@ -35,7 +35,7 @@ class AlphaCorrection(Transform):
     `1 - (1 - α)^(e/d)`. A volume of constant extinction comes out exact at any step.
 
     Where a ray may leave the volume and come back, as under `ToroidalMap`, the faces of such gaps are
-    found by bisection and cells cut there, too.
+    found by bisection and cells cut there, too; a gap shorter than a quarter of a step may be missed.
 
     With it the image is continuous in the camera and in everything else that moves the exit, and its
     gradient is whole. Without it the image jumps when a sample crosses the exit, and the gradient

@@ -64,7 +64,7 @@ def render(
 
     **Returns:** a `Rendering` with leading shape (height, width), in float32.
 
-    **Raises:** `ValueError` for an unknown adjoint, and for `"direct"` where the step or the spacing
+    **Raises:** `ValueError` for an unknown adjoint, and for `"direct"` where the march or the spacing
     is traced and `march.max_samples` is not given.
 
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and

@@ -35,6 +35,11 @@ class Path(eqx.Module):
 class Space(eqx.Module):
     """Where a volume's grid lies in the world."""
 
+    @property
+    @abstractmethod
+    def diagonal(self) -> Scalar:
+        """Length that no ray through the grid exceeds."""
+
     @abstractmethod
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
         """Distances at which the line enters and leaves the grid; the first exceeds the second on a miss."""
@@ -106,6 +111,10 @@ class Affine(Space):
         low, high = volume.corners
         self.low, self.high = apart(low), apart(high)
         self.spacing = apart(volume.spacing)
+
+    @property
+    def diagonal(self) -> Scalar:
+        return jnp.sqrt(sum((high - low) ** 2 for low, high in zip(self.low, self.high, strict=True)))
 
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
         return slab_interval(origin, direction, self.low, self.high)

