@@ -1,0 +1,81 @@
+"""What was measured, on what, with what, and how is it run again? Results as JSON files."""
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+RESULTS = Path(__file__).parent / "results"
+PACKAGES = ("jaxvol", "jax", "jaxlib", "equinox", "numpy", "scikit-image", "matplotlib")
+
+
+def write(path: Path, question: str, result: Any, *, seed: int, command: list[str]) -> Path:
+    """The result as JSON, and all that it takes to run the experiment again.
+
+    - `question`: what the result answers.
+    - `result`: anything that JSON can hold.
+    - `command`: module and arguments, as after `python -m`.
+    """
+    record = {
+        "question": question,
+        "command": shlex.join(["python", "-m", *command]),
+        "seed": seed,
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+        "commit": _commit(),
+        "device": _device(),
+        "result": result,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return path
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A record that `write` wrote."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def arguments(argv: list[str] | None) -> list[str]:
+    """The arguments that a script was given: its caller's, or those of the command line."""
+    return sys.argv[1:] if argv is None else list(argv)
+
+
+def _device() -> dict[str, Any]:
+    device = jax.devices()[0]
+    return {
+        "platform": device.platform,
+        "kind": device.device_kind,
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load when written": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text(encoding="utf-8").splitlines() if information.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """The checkout's commit, with + where files differ from it; None outside a checkout."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -1,0 +1,66 @@
+"""Which volumes are measured, and how are they seen? Four real ones and the head phantom, at steps of one
+voxel, "a size like that of the voxels" (Kye 2013, section 2.1)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jaxvol as jv
+
+
+class Scene(NamedTuple):
+    volume: jv.Volume
+    transfer: jv.TransferFunction
+    camera: jv.Camera
+    step: float
+
+
+VESSELS = [
+    (60, (0.25, 0.02, 0.02), 0.0),
+    (90, (0.60, 0.08, 0.05), 0.25),
+    (160, (0.95, 0.55, 0.40), 0.7),
+    (255, (1.00, 0.95, 0.85), 0.9),
+]
+"""Contrast agent in 8-bit angiography: the vessels alone."""
+
+
+def head(folder: Path | None, size: int, resolution: int = 192) -> Scene:
+    volume = jv.phantom("head", resolution)
+    camera = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.45)
+    return Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
+
+
+def engine(folder: Path, size: int) -> Scene:
+    volume = jv.load(folder / "engine_256x256x128_uint8.raw.gz")
+    camera = jv.Camera.looking_at(volume, (0.6, -0.9, -0.7), (0, 0, -1), size=(size, size)).zoom(1.4)
+    return Scene(volume, jv.preset("engine"), camera, 1.0)
+
+
+def bonsai(folder: Path, size: int) -> Scene:
+    volume = jv.load(folder / "bonsai_256x256x256_uint8.raw.gz")
+    camera = jv.Camera.looking_at(volume, (0.3, 1, 0.3), (0, 0, 1), size=(size, size)).zoom(1.3)
+    return Scene(volume, jv.preset("bonsai"), camera, 1.0)
+
+
+def airway(folder: Path, size: int) -> Scene:
+    """A piece of a chest CT whose faces all cut tissue, from outside."""
+    spacing = 0.78125
+    volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(spacing,) * 3)
+    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.5), (0, 0, 1), size=(size, size)).zoom(1.3)
+    return Scene(volume, jv.preset("ct_chest"), camera, spacing)
+
+
+def aneurism(folder: Path, size: int) -> Scene:
+    volume = jv.load(folder / "aneurism_256x256x256_uint8.raw.gz")
+    camera = jv.Camera.looking_at(volume, (0.5, -1, 0.4), (0, 0, 1), size=(size, size)).zoom(1.3)
+    return Scene(volume, jv.TransferFunction.from_points(VESSELS), camera, 1.0)
+
+
+PHANTOM = "head phantom"
+SCENES: dict[str, Callable[..., Scene]] = {
+    PHANTOM: head,
+    "engine": engine,
+    "bonsai": bonsai,
+    "lidc0314_airway": airway,
+    "aneurism": aneurism,
+}

@@ -1,0 +1,37 @@
+"""How much longer does one program take than another? Both run in turn, and each pair gives a ratio.
+
+A machine's speed drifts by more than what is asked for here. Runs that follow each other see the same
+machine, so their ratio holds still where their times do not; and its median forgets the runs that
+something else disturbed.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+
+def interleaved(programs: dict[str, Callable[[], Any]], repetitions: int) -> dict[str, list[float]]:
+    """Seconds of every run of every program, warm: one run of each to compile it, then rounds of one run
+    each, in an order that turns round from one round to the next."""
+    for program in programs.values():
+        jax.block_until_ready(program())
+    seconds: dict[str, list[float]] = {name: [] for name in programs}
+    for repetition in range(repetitions):
+        for name in list(programs)[:: 1 if repetition % 2 == 0 else -1]:
+            start = time.perf_counter()
+            jax.block_until_ready(programs[name]())
+            seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def ratio(seconds: list[float], base: list[float], seed: int = 0) -> dict[str, float]:
+    """Median of the paired ratios, their quartiles, and the median's 95 % interval by bootstrap."""
+    ratios = np.array(seconds) / np.array(base)
+    drawn = np.random.default_rng(seed).choice(ratios, (2000, len(ratios)))
+    low, high = np.quantile(np.median(drawn, axis=1), (0.025, 0.975))
+    lower, upper = np.quantile(ratios, (0.25, 0.75))
+    found = {"median": np.median(ratios), "lower quartile": lower, "upper quartile": upper}
+    return {k: round(float(v), 4) for k, v in {**found, "low": low, "high": high}.items()}

@@ -1,0 +1,156 @@
+"""How is a scene drawn under several marches: whole and zoomed, with the measures of its error?
+
+Images keep their pixels: one pixel of a picture is one ray, since resampling would smooth what is shown.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+import jaxvol as jv
+from experiments.marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
+from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
+
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+OUTPUT = Path(__file__).parent / "output"
+METHODS = (PLAIN, JITTER, EMPTY, BOTH)
+BLACK = (0.0, 0.0, 0.0)
+DPI = 100
+GAP, HEAD, TEXT = 4, 40, 54  # pixels: between images, of the title, of the text under an image
+
+
+Region: TypeAlias = Callable[["View", jv.Camera], np.ndarray]
+Measures: TypeAlias = dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class View:
+    """A scene, and which part of its image is looked at closely."""
+
+    volume: jv.Volume
+    transfer: jv.TransferFunction
+    camera: jv.Camera
+    step: float
+    factor: float
+    """Magnification of the closer look."""
+    middle: tuple[float, float]
+    """Its middle, as fractions of the image's width and height from the top left."""
+
+    @property
+    def cameras(self) -> dict[str, jv.Camera]:
+        return {"whole": self.camera, "zoomed": self.camera.zoom(self.factor, self.middle)}
+
+    def render(self, camera: jv.Camera, march: jv.March) -> jv.Rendering:
+        rendering = jv.render(self.volume, self.transfer, camera, march)
+        assert not np.any(rendering.exhausted)
+        return rendering
+
+    def entered(self, camera: jv.Camera) -> np.ndarray:
+        """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
+        first = jv.render(self.volume, self.transfer, camera, jv.March(self.step, max_samples=1))
+        return np.asarray(first.rgba[..., 3] > 0)
+
+    def left(self, camera: jv.Camera) -> np.ndarray:
+        """Pixels that alignment changes: their rays leave the volume within visible material."""
+        return np.asarray(self.render(camera, jv.March(self.step, transforms(BOTH))).aligned)
+
+
+def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) -> jv.Volume:
+    """The part of a volume between two corners, given as fractions of its sides."""
+    corners = zip(low, high, volume.shape, strict=True)
+    first, last = zip(*((int(a * n), int(b * n)) for a, b, n in corners), strict=True)
+    part = np.asarray(volume.data)[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
+    origin = np.asarray(volume.origin) + np.array(first) * np.asarray(volume.spacing)
+    return jv.Volume(part, volume.spacing, origin)
+
+
+def options(argv: Sequence[str] | None, about: str) -> argparse.Namespace:
+    """What every figure's script can be told."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="real volumes, in place of phantoms")
+    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER", help="default: %(default)s")
+    parser.add_argument("--size", type=int, default=184, help="pixels along a side of each image")
+    parser.add_argument("--resolution", type=int, default=160, help="voxels along an axis of a phantom")
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that the script runs")
+    chosen = parser.parse_args(argv)
+    if chosen.quick:
+        chosen.size, chosen.resolution = 48, 40
+    return chosen
+
+
+def comparison(
+    view: View,
+    title: str,
+    path: Path,
+    methods: Sequence[str] = METHODS,
+    region: Region = View.entered,
+) -> dict[str, dict[str, Measures]]:
+    """Draw the view under every method, whole above and zoomed below, and print its measures.
+
+    `region`: the pixels of which boundary noise is told. **Returns** the measures by look and method.
+    """
+    page = Page(len(methods), 2, view.camera.size[0], title)
+    measures: dict[str, dict[str, Measures]] = {}
+    for row, (look, camera) in enumerate(view.cameras.items()):
+        truth = np.asarray(view.render(camera, converged(view.step)).image(BLACK))
+        there, measures[look] = region(view, camera), {}
+        for column, method in enumerate(methods):
+            image = np.asarray(view.render(camera, jv.March(view.step, transforms(method))).image(BLACK))
+            measured = measures[look][method] = measure(image, truth, there)
+            page.draw(row, column, image, told(measured), method if row == 0 else "")
+    page.save(path)
+    for look, of_method in measures.items():
+        for method, measured in of_method.items():
+            print(f"{path.stem} {look}, {method}: {', '.join(told(measured).splitlines())}")
+    return measures
+
+
+def measure(image: np.ndarray, truth: np.ndarray, region: np.ndarray) -> Measures:
+    error = image - truth
+    try:
+        noise = boundary_noise(error, region)
+    except ValueError:  # no 3 x 3 pixels of such a face in this image
+        noise = None
+    return {"wood grain": wood_grain_energy(error), "boundary noise": noise, "RMSE": rmse(image, truth)}
+
+
+def told(measured: Measures) -> str:
+    return "\n".join(f"{name} {'none' if v is None else f'{v:.2g}'}" for name, v in measured.items())
+
+
+class Page:
+    """A page of square images on which a pixel stays a pixel."""
+
+    def __init__(self, columns: int, rows: int, side: int, title: str):
+        self.side, self.width = side, columns * side + (columns + 1) * GAP
+        self.height = HEAD + rows * (side + TEXT) + GAP
+        self.figure = plt.figure(figsize=(self.width / DPI, self.height / DPI), dpi=DPI)
+        self.figure.text(GAP / self.width, 1 - 5 / self.height, title, va="top", fontsize=8, weight="bold")
+
+    def draw(self, row: int, column: int, linear: Any, below: str, above: str = "") -> plt.Axes:
+        left = GAP + column * (self.side + GAP)
+        bottom = self.height - HEAD - row * (self.side + TEXT) - self.side
+        box = left / self.width, bottom / self.height, self.side / self.width, self.side / self.height
+        axes = self.figure.add_axes(box)
+        axes.imshow(np.asarray(jv.to_srgb(jnp.asarray(linear))), interpolation="none")
+        axes.axis("off")
+        axes.text(0, -4 / self.side, below, va="top", fontsize=7.5, transform=axes.transAxes, linespacing=1.1)
+        if above:
+            axes.text(0, 1 + 3 / self.side, above, va="bottom", fontsize=8, transform=axes.transAxes)
+        return axes
+
+    def save(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.figure.savefig(path, dpi=DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
+        plt.close(self.figure)
+        print(path)

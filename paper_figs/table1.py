@@ -1,0 +1,58 @@
+"""Kye 2013, Table 1: the time of a whole frame. `experiments/overhead.py` measures it; here it is told in
+Markdown, as ratios to ray casting, beside those of the paper.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import record
+from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
+
+from .common import OUTPUT
+
+
+COLUMNS = (JITTER, EMPTY, BOTH)
+PAPER = {  # seconds, 1024 x 1024 pixels, in the order of the table's columns
+    "head": (0.767, 0.771, 0.775, 0.775),
+    "heart": (3.728, 3.741, 3.739, 3.745),
+    "kidney": (1.768, 1.765, 1.771, 1.772),
+    "vessels": (1.192, 1.196, 1.199, 1.216),
+}
+
+
+def table(measured: dict[str, Any]) -> str:
+    """The record of `experiments/overhead.py`, and the paper's table, as one in Markdown."""
+    lines = [
+        f"| volume | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
+        "|---|" + "---|" * (len(COLUMNS) + 3),
+    ]
+    for name, rows in measured["result"]["volumes"].items():
+        cells = [f"{rows[PLAIN]['seconds']:.3f} s"]
+        for column in COLUMNS:
+            ratio = rows[column]["ratio"]
+            cells.append(f"{ratio['median']:.3f} [{ratio['low']:.3f}, {ratio['high']:.3f}]")
+        cells += [f"{rows[march]['rmse']:.5f}" for march in (PLAIN, BOTH)]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    for name, (plain, *others) in PAPER.items():
+        cells = [f"{plain:.3f} s", *(f"{other / plain:.3f}" for other in others), "–", "–"]
+        lines.append(f"| *paper: {name}* | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
+    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
+    chosen = parser.parse_args(argv)
+    told = table(record.read(chosen.results / "overhead.json"))
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    (chosen.output / "table1.md").write_text(told, encoding="utf-8")
+    print(told)
+
+
+if __name__ == "__main__":
+    main()
