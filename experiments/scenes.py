@@ -44,10 +44,9 @@ def bonsai(folder: Path, size: int) -> Scene:
 
 def airway(folder: Path, size: int) -> Scene:
     """A piece of a chest CT whose faces all cut tissue, from outside."""
-    spacing = 0.78125
-    volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(spacing,) * 3)
+    volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(0.78125, 0.78125, 1))
     camera = jv.Camera.looking_at(volume, (0.4, -1, 0.5), (0, 0, 1), size=(size, size)).zoom(1.3)
-    return Scene(volume, jv.preset("ct_chest"), camera, spacing)
+    return Scene(volume, jv.preset("ct_chest"), camera, 0.78125)
 
 
 def aneurism(folder: Path, size: int) -> Scene:

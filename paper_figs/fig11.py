@@ -33,7 +33,8 @@ def real(folder: Path, size: int) -> View:
 def main(argv: Sequence[str] | None = None) -> None:
     chosen = options(argv, __doc__)
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
-    title = "Fig. 11: a colon in soft tissue in place of the kidney; boundary noise is that of the cut face"
+    shown = "a cut engine" if chosen.data else "a colon in soft tissue"
+    title = f"Fig. 11: {shown} in place of the kidney; boundary noise is that of the cut face"
     comparison(view, title, chosen.output / "fig11.png")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jaxvol as jv
 
-from .common import View, comparison, options
+from .common import View, comparison, cropped, options
 
 
 CONTRAST = [
@@ -25,9 +25,9 @@ def phantom(resolution: int, size: int) -> View:
 
 
 def real(folder: Path, size: int) -> View:
-    """Angiography of an aneurism."""
-    volume = jv.load(folder / "aneurism_256x256x256_uint8.raw.gz")
-    camera = jv.Camera.looking_at(volume, (0.5, -1, 0.4), (0, 0, 1), size=(size, size)).zoom(1.3)
+    """Angiography of an aneurism, cut through its arteries."""
+    volume = cropped(jv.load(folder / "aneurism_256x256x256_uint8.raw.gz"), (0, 0, 0.35), (1, 1, 1))
+    camera = jv.Camera.looking_at(volume, (0.5, -1, 0.6), (0, 0, 1), size=(size, size)).zoom(1.5)
     return View(volume, jv.TransferFunction.from_points(CONTRAST, 2.0), camera, 2.0, 6, (0.5, 0.84))
 
 

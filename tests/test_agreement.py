@@ -71,7 +71,11 @@ def reference_image(volume, transfer, camera, march):
     return jax.vmap(across, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
 
 
-CASES = [(name, "left") for name in TRANSFORMS] + [(name, "midpoint") for name in FEW]
+CASES = [
+    *((name, "left") for name in TRANSFORMS),
+    *(pytest.param(name, "midpoint", marks=pytest.mark.slow) for name in FEW[:2]),
+    *((name, "midpoint") for name in FEW[2:]),
+]
 
 
 @pytest.mark.parametrize(("transforms", "quadrature"), CASES)

@@ -285,7 +285,9 @@ def test_a_ray_from_the_hollow_begins_at_the_near_face():
         np.testing.assert_allclose([t_in[i], t_in[i] + length[i]], [ends[0, 0], ends[-1, 1]], atol=1e-3)
 
 
-@pytest.mark.parametrize("away", [3e2, pytest.param(3e4, marks=pytest.mark.slow), 1e6])
+@pytest.mark.parametrize(
+    "away", [pytest.param(3e2, marks=pytest.mark.slow), pytest.param(3e4, marks=pytest.mark.slow), 1e6]
+)
 def test_a_far_camera_finds_the_faces_and_their_gradients(away):
     """Near its entry a ray begins anew, even where rounding brought it past the face."""
     probe = probe_of("across the middle")
@@ -303,14 +305,8 @@ def test_a_far_camera_finds_the_faces_and_their_gradients(away):
         np.testing.assert_allclose(extent, ends[-1, 1] - ends[0, 0], atol=1e-3 + 8e-7 * away)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "across the middle",
-        pytest.param("apex behind the axis", marks=pytest.mark.slow),
-        pytest.param("above the middle", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["across the middle", "apex behind the axis", "above the middle"])
 def test_gradients_of_entry_and_length_match_finite_differences(name):
     origins, directions = random_rays(PROBES[name], 120, seed=3)
     kept = []
@@ -485,7 +481,9 @@ def reference_image(volume, transfer, camera, march):
 
 
 @pytest.mark.parametrize("quadrature", ["left", pytest.param("midpoint", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("names", COMBINED)
+@pytest.mark.parametrize(
+    "names", ["plain", "all", *(pytest.param(n, marks=pytest.mark.slow) for n in ("aligned", "jittered"))]
+)
 def test_it_composes_with_other_transforms(names, quadrature):
     probe = probe_of("across the middle")
     volume, transfer, camera = noise_volume(), ramp_transfer(), view(probe)
