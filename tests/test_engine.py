@@ -22,7 +22,7 @@ def assert_same(a, b, tolerance=1e-6):
         np.testing.assert_allclose(left, right, atol=tolerance, rtol=0, err_msg=name)
 
 
-@pytest.mark.parametrize("size", [(70, 3), (3, 70), (65, 65), (1, 1)])
+@pytest.mark.parametrize("size", [(70, 3), (65, 65), (1, 1)])
 def test_tiles_do_not_show(size, monkeypatch):
     volume = anisotropic_noise()
     camera = around(volume, size)

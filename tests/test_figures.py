@@ -28,7 +28,7 @@ def measured(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in ("fig09", "fig13") else pytest.param(n, marks=pytest.mark.slow) for n in FIGURES]
+    "name", [n if n == "fig13" else pytest.param(n, marks=pytest.mark.slow) for n in FIGURES]
 )
 def test_figure_is_drawn(name, tmp_path):
     script = importlib.import_module(f"paper_figs.{name}")

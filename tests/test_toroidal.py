@@ -179,6 +179,7 @@ def test_values_and_gradients_are_finite_where_the_map_is_singular(name):
     np.testing.assert_array_equal(at_apex, 0)
 
 
+@pytest.mark.slow
 def test_rays_through_the_singular_points_see_finite_things():
     """Along the motor axis, through the apex, along edges, into corners, from corners."""
     points = singular_points(PROBES["across the middle"])[::12]

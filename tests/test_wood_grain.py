@@ -185,7 +185,10 @@ def engine_scene(real_volume):
     return volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=SIZE).zoom(2), 2.0
 
 
-@pytest.mark.parametrize("make", [sphere_scene, head_scene, skin_scene, airway_scene, engine_scene])
+@pytest.mark.parametrize(
+    "make",
+    [sphere_scene, head_scene, pytest.param(skin_scene, marks=pytest.mark.slow), airway_scene, engine_scene],
+)
 def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
     scene = make(real_volume)
     reference = converged(scene, 8)
@@ -216,7 +219,7 @@ def cut_skull_scene(_):
     return cut_head(jv.preset("head", unit_distance=0.01))[0]
 
 
-@pytest.mark.parametrize("make", [cut_skull_scene, chest_scene])
+@pytest.mark.parametrize("make", [cut_skull_scene, pytest.param(chest_scene, marks=pytest.mark.slow)])
 def test_empty_space_jitter_leaves_wood_grain_behind_material_alone(make, real_volume):
     """Its limit: a ray that meets nothing transparent is not jittered."""
     scene = make(real_volume)
