@@ -46,6 +46,7 @@ def test_every_figure_that_is_told_of_is_there():
         assert (common.OUTPUT / f"{name}.png").stat().st_size < 300_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["jitter_accuracy", "overhead"])
 def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(measured, name):
     found = record.read(measured / f"{name}.json")
@@ -58,6 +59,7 @@ def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(meas
     assert imread(measured / f"{name}.png").std() > 10
 
 
+@pytest.mark.slow
 def test_jitter_breaks_the_comb_and_empty_space_jitter_spares_the_face(measured):
     result = record.read(measured / "jitter_accuracy.json")["result"]
     for rows in (rows for name, rows in result.items() if name.startswith("cut block")):
@@ -69,6 +71,7 @@ def test_jitter_breaks_the_comb_and_empty_space_jitter_spares_the_face(measured)
             assert at[JITTER]["boundary noise"] > 1e-7
 
 
+@pytest.mark.slow
 def test_overhead_is_a_ratio_of_pairs_with_an_error_beside_each_time(measured):
     rows = record.read(measured / "overhead.json")["result"]["volumes"][PHANTOM]
     assert rows[PLAIN]["ratio"]["median"] == 1
@@ -77,6 +80,7 @@ def test_overhead_is_a_ratio_of_pairs_with_an_error_beside_each_time(measured):
         assert row["ratio"]["low"] <= row["ratio"]["median"] <= row["ratio"]["high"]
 
 
+@pytest.mark.slow
 def test_table_1_is_told_from_the_record(measured, tmp_path):
     table1.main(["--results", str(measured), "--output", str(tmp_path)])
     told = (tmp_path / "table1.md").read_text(encoding="utf-8")
