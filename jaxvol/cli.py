@@ -186,4 +186,4 @@ def _timed(
         f"+ {compiled - begun:.2f} s of compilation, on {device.device_kind} ({device.platform})"
     )
     if np.any(rendering.exhausted):
-        print(f"{path}: incomplete: rays ran out of their {march.max_samples} samples; take a longer step")
+        print(f"{path}: incomplete: rays ran out of their {march.most_samples} samples; take a longer step")
