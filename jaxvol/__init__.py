@@ -13,6 +13,7 @@ from .engine import render as render, render_rays as render_rays
 from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .labels import LabelTransferFunction as LabelTransferFunction
+from .leaping import SpaceLeaping as SpaceLeaping
 from .march import March as March, Transform as Transform
 from .phantoms import (
     colon_path as colon_path,

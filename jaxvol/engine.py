@@ -1,39 +1,45 @@
-"""How are many rays rendered? In tiles, each marched as one batch until its last ray is finished.
+"""How is an image rendered? In beams of neighbouring pixels, and waves of beams.
 
-Rays are made tile by tile from the camera, and a tile's memory is all that a march holds beside the
-finished pixels, however large the image. Tiles are square, so that the rays of one see much the same
-part of the volume and finish together.
+Rays are made wave by wave from the camera, and a wave's memory is all that a march holds beside the
+finished pixels, however large the image. How the rays of a wave are marched is `wavefront`'s business; what
+they see is `reference`'s.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .camera import Camera
 from .checks import Arrayable, finite, require
-from .locate import enter
-from .march import March
+from .leaping import FirstHit
+from .locate import Ray, Space, enter
+from .march import March, Survey, View
+from .occupancy import Blocks
+from .packed import with_words, words_of
 from .reference import Progress, begin, end, samples_across, step
 from .rendering import Rendering
-from .transfer import Classify, Transfer
-from .triple import Scalar, Triple
+from .transfer import Transfer
 from .volume import Volume
+from .wavefront import march_beams
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
-Lanes: TypeAlias = Float[Array, " rays"]
+Lanes: TypeAlias = Float[Array, "beams rays"]
 Points: TypeAlias = tuple[Lanes, Lanes, Lanes]
-Pixels: TypeAlias = tuple[Int[Array, " rays"], Int[Array, " rays"]]
+Pixels: TypeAlias = tuple[Int[Array, "beams rays"], Int[Array, "beams rays"]]
 
-TILE = 64
-"""Pixels along the side of a tile: 4096 rays. Smaller batches drown in kernel launches, larger ones
-leave the cache."""
+BEAM = 8
+"""Pixels along the side of a beam."""
+
+WAVE = 4096
+"""Beams in a wave: 262 144 rays. A wave's memory is all that is held beside the finished pixels."""
 
 CHECKPOINTS = 16
 """States that a replay keeps per ray: from the nearest one before it, each sample is computed again."""
@@ -70,7 +76,8 @@ def render(
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
     """
-    return _render(volume, transfer, camera, march, _Loop.of(adjoint, volume, march))
+    how = _How.of(adjoint, volume, march)
+    return _render((volume, transfer, camera, march), how, Known.of(volume, march))
 
 
 def render_rays(
@@ -101,17 +108,31 @@ def render_rays(
     message = "directions must not have length 0."
     directions = require(directions, lambda d: jnp.any(d != 0, axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
-    return _render_rays(volume, transfer, origins, directions, march, _Loop.of(adjoint, volume, march))
+    how = _How.of(adjoint, volume, march)
+    return _render_rays((volume, transfer, origins, directions, march), how, Known.of(volume, march))
 
 
-class _Loop(eqx.Module):
-    """How a tile repeats its step: by a loop that can be differentiated as the adjoint asks."""
+class Known(eqx.Module):
+    """What was found out about a volume before, and is found out anew for other voxels."""
+
+    words: UInt32[Array, " voxels"] | None
+    blocks: Blocks | None
+
+    @classmethod
+    def of(cls, volume: Volume, march: March) -> "Known":
+        return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
+
+
+class _How(eqx.Module):
+    """By which loop rays are marched to their ends: one for the image, others that can be differentiated."""
 
     adjoint: Adjoint = eqx.field(static=True)
     length: int = eqx.field(static=True)
+    backward: bool = eqx.field(static=True, default=False)
+    """Whether the image is made anew to be differentiated."""
 
     @classmethod
-    def of(cls, adjoint: Any, volume: Volume, march: March) -> "_Loop":
+    def of(cls, adjoint: Any, volume: Volume, march: March) -> "_How":
         if adjoint not in get_args(Adjoint):
             raise ValueError(f"adjoint must be one of {', '.join(get_args(Adjoint))}; got {adjoint!r}.")
         if adjoint != "direct":
@@ -120,10 +141,15 @@ class _Loop(eqx.Module):
         # to the next of few lengths, so that a change of step rarely compiles the program again
         return cls(adjoint, min(-(-length // 64) * 64, march.most_samples))
 
-    def tiles(self, tile: Callable[[Any], Rendering], numbered: Any) -> Rendering:
-        """Every tile's rendering, one after the other."""
-        # a replay starts again from what a tile was given, so no tile keeps a state for the backward pass
-        return jax.lax.map(jax.checkpoint(tile) if self.adjoint == "replay" else tile, numbered)
+    @property
+    def plain(self) -> bool:
+        """Whether one cell is marched after the other, by a loop that reverse mode goes through."""
+        return self.backward or self.adjoint == "direct"
+
+    def in_turn(self, wave: Callable[[Any], Rendering], numbered: Any) -> Rendering:
+        """Every wave's rendering, one after the other."""
+        # a replay starts again from what a wave was given, so no wave keeps a state for the backward pass
+        return jax.lax.map(jax.checkpoint(wave) if self.backward else wave, numbered)
 
     def run(self, advance: Callable[[Progress], Progress], start: Progress) -> Progress:
         """The state in which all rays are finished."""
@@ -134,96 +160,142 @@ class _Loop(eqx.Module):
             advance,
             start,
             max_steps=self.length,
-            kind="checkpointed" if self.adjoint == "replay" else "lax",
-            checkpoints=CHECKPOINTS if self.adjoint == "replay" else None,
+            kind="checkpointed",
+            checkpoints=CHECKPOINTS,
         )
 
 
-@eqx.filter_jit
-def _render(volume: Volume, transfer: Transfer, camera: Camera, march: March, loop: _Loop) -> Rendering:
-    width, height = camera.size
-    side = min(TILE, max(width, height))
-    across, down = -(-width // side), -(-height // side)
-    lane = jnp.arange(side * side)
+def _replayed(image: Callable[..., Rendering], scene: Any, how: _How, known: Known) -> Rendering:
+    """`image(scene, how, known)`; in reverse mode, the derivative of the same image made cell by cell."""
+    if how.adjoint != "replay":
+        return image(scene, how, known)
 
-    def tile(number: Int[Array, ""]) -> Rendering:
-        column = (number % across) * side + lane % side
-        row = (number // across) * side + lane // side
-        rays = jax.vmap(camera.ray)(column, row)
-        return _march(volume, transfer, rays, (column, row), (column < width) & (row < height), march, loop)
+    @eqx.filter_custom_vjp
+    def once(scene: Any, known: Known) -> Rendering:
+        return image(scene, how, known)
+
+    @once.def_fwd
+    def _(perturbed: Any, scene: Any, known: Known) -> tuple[Rendering, None]:
+        return image(scene, how, known), None
+
+    @once.def_bwd
+    def _(residuals: None, gradient: Any, perturbed: Any, scene: Any, known: Known) -> Any:
+        moving, still = eqx.partition(scene, perturbed)
+        again = replace(how, backward=True)
+        _, pull = eqx.filter_vjp(lambda moving: image(eqx.combine(moving, still), again, known), moving)
+        return pull(gradient)[0]
+
+    return once(scene, jax.lax.stop_gradient(known))
+
+
+@eqx.filter_jit
+def _render(scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Known) -> Rendering:
+    return _replayed(_image, scene, how, known)
+
+
+def _image(
+    scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Known
+) -> Rendering:
+    volume, transfer, camera, march = scene
+    volume = with_words(volume, known.words)
+    width, height = camera.size
+    across, down = -(-width // BEAM), -(-height // BEAM)
+    beams = min(WAVE, across * down)
+    waves = -(-across * down // beams)
+    within = jnp.arange(BEAM * BEAM)
+    space = march.locate(volume)
+
+    def first_hit(survey: Survey, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
+        first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
+        shape, count = columns.shape, columns.size
+        missing = -count % (BEAM * BEAM)
+        column, row = (jnp.pad(i.reshape(-1), (0, missing)).reshape(-1, BEAM * BEAM) for i in (columns, rows))
+        wanted = (jnp.arange(count + missing) < count).reshape(column.shape)
+        ray = _enter(space, jax.vmap(jax.vmap(camera.ray))(column, row), (column, row), wanted)
+        hits = _march(volume, transfer, ray, first, how, survey)
+        return hits.depth.reshape(-1)[:count].reshape(shape)
+
+    survey = _survey(space, transfer, march, known, how, View(camera.ray, camera.size, first_hit))
+
+    def wave(number: Int[Array, ""]) -> Rendering:
+        beam = (number * beams + jnp.arange(beams))[:, None]
+        column = (beam % across) * BEAM + within % BEAM
+        row = (beam // across) * BEAM + within // BEAM
+        wanted = (column < width) & (row < height)
+        ray = _enter(space, jax.vmap(jax.vmap(camera.ray))(column, row), (column, row), wanted)
+        return _march(volume, transfer, ray, march, how, survey)
 
     def assemble(leaf: Array) -> Array:
-        image = leaf.reshape(down, across, side, side, *leaf.shape[2:]).swapaxes(1, 2)
-        return image.reshape(down * side, across * side, *leaf.shape[2:])[:height, :width]
+        leaf = leaf.reshape(-1, *leaf.shape[2:])[: across * down]
+        image = leaf.reshape(down, across, BEAM, BEAM, *leaf.shape[2:]).swapaxes(1, 2)
+        return image.reshape(down * BEAM, across * BEAM, *leaf.shape[2:])[:height, :width]
 
-    return jax.tree.map(assemble, loop.tiles(tile, jnp.arange(across * down)))
+    return jax.tree.map(assemble, how.in_turn(wave, jnp.arange(waves)))
 
 
 @eqx.filter_jit
-def _render_rays(
-    volume: Volume,
-    transfer: Transfer,
-    origins: Float[Array, "*rays 3"],
-    directions: Float[Array, "*rays 3"],
-    march: March,
-    loop: _Loop,
+def _render_rays(scene: tuple[Volume, Transfer, Array, Array, March], how: _How, known: Known) -> Rendering:
+    return _replayed(_own_rays, scene, how, known)
+
+
+def _own_rays(
+    scene: tuple[Volume, Transfer, Array, Array, March], how: _How, known: Known
 ) -> Rendering:
+    volume, transfer, origins, directions, march = scene
+    volume = with_words(volume, known.words)
     shape = origins.shape[:-1]
     count = math.prod(shape)
-    batch = min(TILE * TILE, max(count, 1))
-    batches = -(-count // batch)
+    lanes = BEAM * BEAM
+    beams = min(WAVE, max(-(-count // lanes), 1))
+    waves = -(-count // (beams * lanes))
+    space = march.locate(volume)
+    survey = _survey(space, transfer, march, known, how, None)
 
-    def in_batches(rays: Float[Array, "*_ 3"]) -> Float[Array, "_ 3 _"]:
-        padded = jnp.pad(rays.reshape(count, 3), ((0, batches * batch - count), (0, 0)), mode="edge")
-        return padded.reshape(batches, batch, 3).swapaxes(1, 2)
+    def in_waves(rays: Float[Array, "*_ 3"]) -> Float[Array, "waves 3 beams lanes"]:
+        padded = jnp.pad(rays.reshape(count, 3), ((0, waves * beams * lanes - count), (0, 0)), mode="edge")
+        return jnp.moveaxis(padded.reshape(waves, beams, lanes, 3), -1, 1)
 
-    def tile(given: tuple[Array, Array, Array]) -> Rendering:
+    def wave(given: tuple[Array, Array, Array]) -> Rendering:
         number, origin, direction = given
-        place = number * batch + jnp.arange(batch)
+        place = (number * beams * lanes + jnp.arange(beams * lanes)).reshape(beams, lanes)
         rays = tuple(origin), tuple(direction)
-        return _march(volume, transfer, rays, (place, jnp.zeros_like(place)), place < count, march, loop)
+        ray = _enter(space, rays, (place, jnp.zeros_like(place)), place < count)
+        return _march(volume, transfer, ray, march, how, survey)
 
     def assemble(leaf: Array) -> Array:
-        return leaf.reshape(-1, *leaf.shape[2:])[:count].reshape(*shape, *leaf.shape[2:])
+        return leaf.reshape(-1, *leaf.shape[3:])[:count].reshape(*shape, *leaf.shape[3:])
 
-    given = jnp.arange(batches), in_batches(origins), in_batches(directions)
-    return jax.tree.map(assemble, loop.tiles(tile, given))
+    given = jnp.arange(waves), in_waves(origins), in_waves(directions)
+    return jax.tree.map(assemble, how.in_turn(wave, given))
+
+
+def _survey(
+    space: Space, transfer: Transfer, march: March, known: Known, how: _How, view: View | None
+) -> Survey | None:
+    if known.blocks is None or how.plain:
+        return None
+    return march.survey(space.occupancy(transfer.visible(known.blocks)), view)
+
+
+def _enter(space: Space, rays: tuple[Points, Points], pixel: Pixels, wanted: Bool[Array, "beams rays"]) -> Ray:
+    """Rays (beams, rays in a beam), cut to the volume. Those that are not wanted fill up beams, and miss it."""
+    ray = jax.vmap(jax.vmap(enter, in_axes=(None, 0, 0, 0)), in_axes=(None, 0, 0, 0))(space, *rays, pixel)
+    return replace(ray, length=jnp.where(wanted, ray.length, 0))
 
 
 def _march(
-    volume: Volume,
-    transfer: Transfer,
-    rays: tuple[Points, Points],
-    pixel: Pixels,
-    wanted: Bool[Array, " rays"],
-    march: March,
-    loop: _Loop,
+    volume: Volume, transfer: Transfer, ray: Ray, march: March, how: _How, survey: Survey | None
 ) -> Rendering:
-    """One batch of rays, from entry to end. Rays that are not wanted fill up the batch and cost nothing."""
-    ray = jax.vmap(enter, in_axes=(None, 0, 0, 0))(march.locate(volume), *rays, pixel)
-    ray = eqx.tree_at(lambda r: r.length, ray, jnp.where(wanted, ray.length, 0))
-    classify = transfer.over(volume)
-
-    def advance(at: Progress) -> Progress:
-        once = _computed_once(classify, jnp.any(~at.finished))
-        return jax.vmap(lambda ray, at: step(march, ray, volume, once, at))(ray, at)
-
-    start = jax.vmap(begin, in_axes=(None, 0))(march, ray)
-    return jax.vmap(end)(ray, loop.run(advance, start))
-
-
-def _computed_once(classify: Classify, live: Bool[Array, ""]) -> Classify:
-    """The same classification, its result put in memory for all that use it.
-
-    On CPU XLA fuses what a gather feeds into each of its consumers, and would fetch the voxels again for
-    every channel and for each transform that asks for the extinction. It does not fuse across a branch.
-    """
-
-    def nothing(coordinate: Triple) -> tuple[Triple, Scalar]:
-        zero = jnp.zeros_like(coordinate[0])
-        return (zero, zero, zero), zero
-
-    return lambda coordinate: jax.lax.cond(live, classify, nothing, coordinate)
+    """A wave of rays (beams, rays in a beam), from entry to end."""
+    each = lambda f, *axes: jax.vmap(jax.vmap(f, in_axes=axes), in_axes=axes)
+    seen = transfer.over(volume)
+    start = each(begin, None, 0)(march, ray)
+    if how.plain:
+        one = each(lambda ray, at: step(march, ray, volume, seen, at), 0, 0)
+        at = how.run(lambda at: one(ray, at), start)
+    else:
+        at = march_beams(march, volume, seen, survey, ray, start)
+    return each(end, 0, 0)(ray, at)
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

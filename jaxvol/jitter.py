@@ -120,3 +120,6 @@ class EmptySpaceJitter(Transform):
         self, steps: Scalar, memory: Scalar, ray: Ray, transparent: Bool[Array, ""]
     ) -> tuple[Scalar, Scalar]:
         return jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)
+
+    def settled(self, memory: Scalar) -> Bool[Array, ""]:
+        return memory == 1

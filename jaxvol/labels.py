@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
-from .transfer import Classify, Transfer, TransferFunction, interpolated, points_below
+from .occupancy import Blocks
+from .transfer import Classify, Measured, Transfer, TransferFunction, interpolated, points_below, row_of, seen_between
 from .triple import Scalar, Triple
 from .volume import Volume
 
@@ -39,18 +41,31 @@ class LabelTransferFunction(Transfer):
         given = [hidden if function is None else function for function in [*functions, None]]
         self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
 
-    def over(self, volume: Volume) -> Classify:
-        """Classification of grid coordinates of this volume."""
+    def measured(self, volume: Volume, coordinate: Triple) -> Measured:
+        """Value and label at a grid coordinate."""
+        return volume.value(coordinate), volume.label(coordinate)
+
+    def classifier(self) -> Classify:
+        """Look-up of colour and extinction, by label and value."""
         tables = jax.vmap(TransferFunction.rows)(self.stacked)
         unseen, intervals = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
-        def classify(coordinate: Triple) -> tuple[Triple, Scalar]:
-            value, label = volume.value(coordinate), volume.label(coordinate)
+        def classify(measured: Measured) -> tuple[Triple, Scalar]:
+            value, label = measured
             label = jnp.where((label < 0) | (label > unseen), unseen, label)
-            values = self.stacked.values.at[label].get(mode="promise_in_bounds")
+            values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)
             interval = jnp.clip(points_below(values, value) - 1, 0, intervals - 1)
-            row = rows.at[label * intervals + interval].get(mode="promise_in_bounds")
-            return interpolated(row, value)
+            return interpolated(row_of(rows, label * intervals + interval), value)
 
         return classify
+
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """Which blocks of a volume hold a label, and a value, of which something is seen."""
+        functions = jax.lax.stop_gradient(self.stacked)
+        seen = jnp.zeros(blocks.low.shape, bool)
+        for label in range(functions.values.shape[0] - 1):
+            values, extinction = functions.values[label], functions.extinction[label]
+            inside = seen_between(values, extinction, blocks.low, blocks.high)
+            seen |= inside & blocks.may_hold(label)
+        return seen

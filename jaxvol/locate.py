@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from .occupancy import BLOCK, Occupancy
 from .triple import Scalar, Triple, along, apart
 from .volume import Volume
 
@@ -47,6 +48,10 @@ class Space(eqx.Module):
     @abstractmethod
     def coordinate(self, point: Triple) -> Triple:
         """The grid coordinate of a world point."""
+
+    @abstractmethod
+    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
+        """The blocks of the grid in which anything may be seen, as cells of the world."""
 
     @abstractmethod
     def path(self, entry: Triple, direction: Triple) -> Path:
@@ -122,6 +127,10 @@ class Affine(Space):
     def coordinate(self, point: Triple) -> Triple:
         x, y, z = ((p - low) / step for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
+
+    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
+        x, y, z = (BLOCK * step for step in self.spacing)
+        return Occupancy(visible, self.low, (x, y, z))
 
     def path(self, entry: Triple, direction: Triple) -> Straight:
         dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))

@@ -14,15 +14,18 @@ others as they are; every seam passes through all transforms in turn, so that an
 | `stop` | is this ray finished? | not before the exit |
 """
 
-from typing import Any, Literal
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .checks import number
 from .locate import Affine, Ray, Space
-from .triple import Scalar
+from .occupancy import Occupancy
+from .triple import Scalar, Triple
 from .volume import Volume
 
 
@@ -35,6 +38,34 @@ class Cell(eqx.Module):
     front: Scalar
     width: Scalar
     cut: Bool[Array, ""]
+
+
+class View(NamedTuple):
+    """The image that is rendered.
+
+    - `ray`: origin and unit direction of the ray through a column and a row.
+    - `size`: (width, height).
+    - `first_hit`: distances along the rays of columns and rows to the first sample that is seen, infinite
+      where there is none; found with the help of what is known already.
+    """
+
+    ray: Callable[[Scalar, Scalar], tuple[Triple, Triple]]
+    size: tuple[int, int]
+    first_hit: Callable[["Survey", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
+
+
+class Survey(eqx.Module):
+    """What is known about empty space. Rays come in beams: arrays of shape (beams, rays in a beam)."""
+
+    @abstractmethod
+    def notes(self, rays: Ray, stretch: Scalar) -> Any:
+        """What the rays need to know, made once: arrays whose leading axis is that of the beams.
+
+        `stretch`: the length over which samples are taken at once. It is of no use to know of less."""
+
+    @abstractmethod
+    def clear(self, notes: Any, rays: Ray, depth: Float[Array, "beams rays"]) -> Float[Array, "beams rays"]:
+        """A depth, no less than `depth`, up to which nothing is seen."""
 
 
 class Transform(eqx.Module):
@@ -64,6 +95,16 @@ class Transform(eqx.Module):
         `transparent` tells that the extinction at this sample was 0.
         """
         return steps, memory
+
+    def settled(self, memory: Any) -> Bool[Array, ""]:
+        """Whether `advance` answers with whole steps from here on, whatever the samples are like. Two
+        transparent samples in a row must settle a ray: over empty space a march leaps in whole steps."""
+        return jnp.asarray(type(self).advance is Transform.advance)
+
+    def survey(self, occupancy: Occupancy, view: View | None) -> Survey | None:
+        """What is known about empty space ahead of rays; None if nothing is. Asked once for each image.
+        `view` tells of the image that the rays belong to; None for rays of one's own."""
+        return None
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, that the cell falls into; each is sampled on its own. How many is
@@ -128,6 +169,26 @@ class March(eqx.Module):
     def most_samples(self) -> int:
         """`max_samples`, or its default."""
         return 2**17 if self.max_samples is None else self.max_samples
+
+    def survey(self, occupancy: Occupancy, view: View | None) -> Survey | None:
+        """What is known about empty space, by the one transform that knows."""
+        surveys = [transform.survey(occupancy, view) for transform in self.transforms]
+        return next((survey for survey in surveys if survey is not None), None)
+
+    def settled(self, memory: tuple[Any, ...]) -> Bool[Array, ""]:
+        """Whether a ray will take whole steps from here on."""
+        answers = [t.settled(remembered) for t, remembered in zip(self.transforms, memory, strict=True)]
+        return jnp.all(jnp.stack(answers), axis=0) if answers else jnp.ones((), bool)
+
+    @property
+    def leaps(self) -> bool:
+        """Whether any transform knows of empty space."""
+        return any(type(transform).survey is not Transform.survey for transform in self.transforms)
+
+    @property
+    def moves(self) -> bool:
+        """Whether any transform may answer with other than whole steps."""
+        return any(type(transform).advance is not Transform.advance for transform in self.transforms)
 
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""

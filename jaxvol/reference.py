@@ -9,6 +9,7 @@ so that the weights of a ray and the transmittance T = 1 - A that is left sum to
 in float32, taking thousands of small equal weights from a T near 1 would round the same way each time.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from .checks import is_traced
 from .locate import Ray, enter
 from .march import Cell, March
 from .rendering import Rendering
-from .transfer import Classify, Transfer
+from .transfer import Classification, Measured, Transfer
 from .triple import Scalar, Triple, apart
 from .volume import Volume
 
@@ -62,39 +63,78 @@ def begin(march: March, ray: Ray) -> Progress:
     )
 
 
-def step(march: March, ray: Ray, volume: Volume, classify: Classify, at: Progress) -> Progress:
-    """Sample one cell, blend it, and move on. Changes nothing once the ray is finished."""
-    front = at.offset + at.index.astype(ray.length.dtype) * march.step
-    cell = Cell(front, march.step, jnp.zeros_like(at.finished))
-    (r, g, b), opacity, moment = at.color, at.opacity, at.moment
+def pieces(march: March, ray: Ray, volume: Volume, front: Scalar) -> tuple[Cell, ...]:
+    """The pieces of the cell that begins at depth `front`."""
+    return march.cut(Cell(front, march.step, jnp.zeros(front.shape, bool)), ray, volume)
+
+
+def measure(march: March, ray: Ray, seen: Classification, piece: Cell) -> Measured:
+    """What is read from the volume at the piece's sample."""
+    return seen.measure(ray.path(march.sample(piece)))
+
+
+def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured) -> Scalar:
+    """Opacity of a piece; 0 past the exit, and in gaps."""
+    depth = march.sample(piece)
+    _, extinction = seen.classify(measured)
+    inside = depth < ray.length
+    if ray.path.gaps:
+        inside &= ray.path.contains(ray.path(depth))
+    # expm1: thin cells keep their digits
+    return -jnp.expm1(-jnp.where(inside, extinction, 0) * piece.width)
+
+
+def blend(
+    march: March, ray: Ray, seen: Classification, at: Progress, cell: tuple[tuple[Cell, Measured, Scalar], ...]
+) -> Progress:
+    """What has been accumulated behind a cell, of whose pieces one knows what was measured and the opacity."""
+    (r, g, b), total, moment = at.color, at.opacity, at.moment
     samples, aligned = at.samples, at.aligned
-    inside, transparent = jnp.zeros_like(at.finished), jnp.ones_like(at.finished)
-
-    for piece in march.cut(cell, ray, volume):
+    for piece, measured, alpha in cell:
         depth = march.sample(piece)
-        live = ~at.finished & (depth < ray.length)
-        coordinate = ray.path(depth)
-        (red, green, blue), extinction = classify(coordinate)
-        extinction = jnp.where(live & ray.path.contains(coordinate), extinction, 0)
-        weight = (1 - opacity) * -jnp.expm1(-extinction * piece.width)  # expm1: thin cells keep their digits
+        (red, green, blue), _ = seen.classify(measured)
+        weight = jnp.where(at.finished, 0, (1 - total) * alpha)
         r, g, b = r + weight * red, g + weight * green, b + weight * blue
-        opacity, moment = opacity + weight, moment + weight * depth
-        samples, inside = samples + live.astype(samples.dtype), inside | live
-        transparent &= extinction == 0
-        aligned |= piece.cut & (extinction > 0)
-
-    steps, memory = march.advance(at.memory, ray, transparent)
-    return Progress(
-        index=at.index + 1,
-        offset=at.offset + (steps - 1) * march.step,
+        total, moment = total + weight, moment + weight * depth
+        samples = samples + (~at.finished & (depth < ray.length)).astype(samples.dtype)
+        aligned |= piece.cut & (weight > 0)
+    return replace(
+        at,
         color=(r, g, b),
-        opacity=opacity,
+        opacity=total,
         moment=moment,
         samples=samples,
         aligned=aligned,
-        finished=at.finished | ~inside | march.stop(1 - opacity),
-        memory=memory,
+        finished=at.finished | march.stop(1 - total),
     )
+
+
+def leave(march: March, ray: Ray, at: Progress, last: tuple[Cell, ...]) -> Progress:
+    """Whether the ray has left the volume: no piece of its last cell was sampled inside."""
+    inside = jnp.any(jnp.stack([march.sample(piece) < ray.length for piece in last]), axis=0)
+    return replace(at, finished=at.finished | ~inside)
+
+
+def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""], cells: Any = 1) -> Progress:
+    """On over this many cells, all of them transparent or just one."""
+    steps, memory = march.advance(at.memory, ray, transparent)
+    offset = at.offset + (steps - 1) * march.step
+    return replace(at, index=at.index + cells, offset=offset, memory=memory)
+
+
+def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
+    """Depth at which the next cell begins, or one so many cells ahead."""
+    return at.offset + (at.index + ahead).astype(at.offset.dtype) * march.step
+
+
+def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progress) -> Progress:
+    """Sample one cell, blend it, and move on. Changes nothing once the ray is finished."""
+    cut = pieces(march, ray, volume, front(march, at))
+    measured = [measure(march, ray, seen, piece) for piece in cut]
+    alphas = [opacity(march, ray, seen, piece, read) for piece, read in zip(cut, measured, strict=True)]
+    transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
+    after = blend(march, ray, seen, at, tuple(zip(cut, measured, alphas, strict=True)))
+    return move(march, ray, leave(march, ray, after, cut), transparent)
 
 
 def end(ray: Ray, at: Progress) -> Rendering:
@@ -137,10 +177,10 @@ def render_ray_reference(
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     ray = enter(march.locate(volume), apart(origin), apart(direction), pixel)
-    classify = transfer.over(volume)
+    seen = transfer.over(volume)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
-        return step(march, ray, volume, classify, at), None
+        return step(march, ray, volume, seen, at), None
 
     at, _ = jax.lax.scan(one, begin(march, ray), None, length=samples_across(volume, march))
     return end(ray, at)

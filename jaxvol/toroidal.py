@@ -21,12 +21,16 @@ from jaxtyping import Array, Bool, Float
 from .checks import Arrayable, finite_array, number, require
 from .locate import Path, Space, slab_interval
 from .march import Transform
+from .occupancy import BLOCK, Occupancy, Sums
 from .triple import Scalar, Triple, along, apart
 from .volume import Volume
 
 
 STEPS = 64
 """Steps towards a face, at most. Those that need more graze it, and pass by it or along it."""
+
+CUBES = 48
+"""Cells along a side of the box around the sector, for what is known of empty space."""
 
 BACK = 0.01
 """How far behind the origin an entry is looked for, in sizes of the probe. A ray begins anew near its entry
@@ -151,6 +155,36 @@ class _Sector(Space):
             for value, ends, n in zip(self.probe._forward(point), ranges, self.shape, strict=True)
         )
         return beta, sigma, gamma
+
+    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
+        """Cubes of the world around the sector. Each asks for the blocks that the sphere around it reaches:
+        no angle changes faster along a path than by the path's length over the distance to its axis."""
+        low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
+        x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
+        middle = jnp.arange(CUBES) + 0.5
+        point = jnp.meshgrid(*(a + middle * step for a, step in zip(low, size, strict=True)), indexing="ij")
+        radius = jnp.sqrt(x * x + y * y + z * z) / 2 + 16 * float(jnp.finfo(x.dtype).eps) * self._size
+        rho = _hypot(point[1], point[2])
+        off = _hypot(point[0], rho - self.probe.a)
+
+        def angle(axis_distance: Scalar) -> Scalar:
+            """The most that an angle about an axis changes within the sphere."""
+            away = axis_distance > radius
+            return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
+
+        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        changes = angle(rho), angle(off), radius
+        first, last, reached = [], [], jnp.ones(rho.shape, bool)
+        coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
+        for c, change, ends, n, blocks in zip(
+            coordinate, changes, ranges, self.shape, visible.shape, strict=True
+        ):
+            nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
+            reached &= (c + nodes >= 0) & (c - nodes <= n - 1)
+            first.append(jnp.clip(jnp.floor((c - nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
+            last.append(jnp.clip(jnp.floor((c + nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
+        seen = Sums.of(visible).any_between((first[0], first[1], first[2]), (last[0], last[1], last[2]))
+        return Occupancy(reached & seen, low, (x, y, z))
 
     def path(self, entry: Triple, direction: Triple) -> "_Curved":
         return _Curved(self, entry, direction)

@@ -2,29 +2,64 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .checks import Arrayable, finite_array, number, require, unit_interval
+from .occupancy import Blocks
 from .triple import Scalar, Triple
 from .volume import Volume
 
 
-Classify: TypeAlias = Callable[[Triple], tuple[Triple, Scalar]]
-"""From a grid coordinate to colour (r, g, b) and extinction (1/length)."""
+FEW = 16
+"""Up to so many control points, a sample's interval is chosen by comparing with each of them, which costs less
+than looking its entries up."""
+
+Row: TypeAlias = tuple[Scalar, ...]
+"""What a sample in one interval between control points needs: see `TransferFunction.rows`."""
+
+Measured: TypeAlias = tuple[Array, ...]
+"""What a transfer function wants to know of a place: the value, and whatever else it goes by."""
+
+Classify: TypeAlias = Callable[[Measured], tuple[Triple, Scalar]]
+"""From what was measured to colour (r, g, b) and extinction (1/length)."""
+
+
+class Classification(NamedTuple):
+    """What a transfer function makes of the places of one volume: measured first, then classified.
+
+    The two are apart for engines to stand between them: what is measured is fetched from memory, and used
+    many times over.
+    """
+
+    measure: Callable[[Triple], Measured]
+    classify: Classify
 
 
 class Transfer(eqx.Module):
     """What a renderer asks of a transfer function, of whatever kind."""
 
+    def measured(self, volume: Volume, coordinate: Triple) -> Measured:
+        """What is read from the volume at a grid coordinate: by default, its value."""
+        return (volume.value(coordinate),)
+
     @abstractmethod
-    def over(self, volume: Volume) -> Classify:
-        """Classification of grid coordinates of this volume. What does not depend on the coordinate is
-        computed here, once, outside the march's loop."""
+    def classifier(self) -> Classify:
+        """From what was measured to colour and extinction. What does not depend on it is computed here, once,
+        outside the march's loop."""
+
+    def over(self, volume: Volume) -> Classification:
+        """Measuring and classifying the grid coordinates of this volume."""
+        return Classification(lambda coordinate: self.measured(volume, coordinate), self.classifier())
+
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """In which blocks of a volume anything may be seen: False is a proof that the extinction is 0
+        wherever the value lies in the block's range. It carries no gradient. By default nothing is proven."""
+        return jnp.ones(blocks.low.shape, bool)
 
 
 class TransferFunction(Transfer):
@@ -89,31 +124,35 @@ class TransferFunction(Transfer):
 
     def __call__(self, value: Scalar) -> tuple[Triple, Scalar]:
         """Colour (r, g, b) and extinction of a value."""
-        return self._look_up()(value)
-
-    def over(self, volume: Volume) -> Classify:
-        """Classification of grid coordinates of this volume."""
-        look_up = self._look_up()
-        return lambda coordinate: look_up(volume.value(coordinate))
+        return self.classifier()((value,))
 
     def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
         """Opacity at the control points of a layer of thickness `unit_distance`."""
         return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
 
-    def _look_up(self) -> Callable[[Scalar], tuple[Triple, Scalar]]:
-        rows, last = self.rows(), self.values.shape[0] - 2
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """Which blocks of a volume hold a value of which something is seen."""
+        values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
+        return seen_between(values, extinction, blocks.low, blocks.high)
 
-        def look_up(value: Scalar) -> tuple[Triple, Scalar]:
-            row = rows.at[jnp.clip(points_below(self.values, value) - 1, 0, last)].get(
-                mode="promise_in_bounds"
-            )
+    def classifier(self) -> Classify:
+        """Look-up of colour and extinction."""
+        rows, values = self.rows(), self.values
+        if values.shape[0] > FEW:
+            return lambda measured: interpolated(row_of(rows, points_below(values, *measured) - 1), *measured)
+
+        def chosen(measured: Measured) -> tuple[Triple, Scalar]:
+            (value,) = measured
+            row = tuple(rows[0])
+            for start, following in zip(values[1:-1], rows[1:], strict=True):
+                row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
             return interpolated(row, value)
 
-        return look_up
+        return chosen
 
     def rows(self) -> Float[Array, "intervals 10"]:
         """A table with one row for each interval between points: all that a sample there needs, so that it
-        costs one gather. Start, inverse width, channels at the start, and how much they rise."""
+        finds them side by side. Start, inverse width, channels at the start, and how much they rise."""
         values = jax.lax.stop_gradient(self.values)
         channels = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         inverse = 1 / (values[1:] - values[:-1])
@@ -121,18 +160,42 @@ class TransferFunction(Transfer):
         return jnp.concatenate(columns, axis=1)
 
 
-def points_below(values: Float[Array, " n"], value: Scalar) -> Int[Array, ""]:
-    """How many control points lie at or below a value."""
+def points_below(
+    values: Float[Array, " n"], value: Float[Array, "*batch"], *, strictly: bool = False
+) -> Int[Array, "*batch"]:
+    """How many control points lie at or below a value, or strictly below it."""
     # Comparing with every point is one fused kernel, the faster one while there are few points.
     search = "compare_all" if values.shape[0] <= 32 else "scan_unrolled"
     values = jax.lax.stop_gradient(values)
-    return jnp.searchsorted(values, value, side="right", method=search).astype(jnp.int32)
+    side = "left" if strictly else "right"
+    return jnp.searchsorted(values, value, side=side, method=search).astype(jnp.int32)
 
 
-def interpolated(row: Float[Array, "10"], value: Scalar) -> tuple[Triple, Scalar]:
+def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, ""]) -> Row:
+    """One row, by a look-up for each of its entries: batched, they are whole arrays from the start."""
+    interval = jnp.clip(interval, 0, rows.shape[0] - 1)
+    return tuple(rows[:, i].at[interval].get(mode="promise_in_bounds", wrap_negative_indices=False) for i in range(rows.shape[1]))
+
+
+def interpolated(row: Row, value: Scalar) -> tuple[Triple, Scalar]:
     """Colour and extinction of a value, from the row of its interval."""
     f = jnp.clip((value - row[0]) * row[1], 0, 1)
     return (row[2] + f * row[6], row[3] + f * row[7], row[4] + f * row[8]), row[5] + f * row[9]
+
+
+def seen_between(
+    values: Float[Array, " n"],
+    extinction: Float[Array, " n"],
+    low: Float[Array, "*blocks"],
+    high: Float[Array, "*blocks"],
+) -> Bool[Array, "*blocks"]:
+    """Whether the extinction is positive anywhere from `low` to `high`."""
+    last = values.shape[0] - 1
+    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(extinction > 0, dtype=jnp.int32)])
+    # Between two points there is something to see wherever one of the two has extinction.
+    from_point = jnp.maximum(points_below(values, low) - 1, 0)
+    to_point = jnp.minimum(points_below(values, high, strictly=True), last)
+    return before[to_point + 1] > before[from_point]
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:

@@ -5,7 +5,7 @@ grid of n nodes spans n - 1 steps along an axis. Between nodes the value is tril
 the grid it is that of the nearest point of the grid.
 """
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +17,10 @@ from .triple import Scalar, Triple
 
 
 DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
+
+
+Cube: TypeAlias = list[list[list[Scalar]]]
+"""Eight voxels, [x][y][z]."""
 
 
 class Volume(eqx.Module):
@@ -118,12 +122,12 @@ class Volume(eqx.Module):
         _, ny, nz = self.shape
         return _fetch(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
 
-    def _cube(self, coordinate: Triple):
+    def _cube(self, coordinate: Triple) -> tuple[Cube, Triple]:
         """The eight voxels around a coordinate, [x][y][z], and the fractions between them."""
         dtype = coordinate[0].dtype
-        low, fraction = zip(*(_split(c, n) for c, n in zip(coordinate, self.shape, strict=True)), strict=True)
+        (i, j, k), fraction = split(coordinate, self.shape)
         _, ny, nz = self.shape
-        base = (low[0] * ny + low[1]) * nz + low[2]
+        base = (i * ny + j) * nz + k
         cube = [
             [[_fetch(self.data, base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)]
             for x in (0, 1)
@@ -181,11 +185,14 @@ def _labels(labels: Arrayable, shape: tuple[int, ...]) -> Array:
     return jnp.asarray(labels)
 
 
-def _split(c: Scalar, n: int) -> tuple[Int[Array, ""], Scalar]:
-    """The node below a coordinate and the fraction past it; the last node belongs to the cell below."""
-    c = jnp.clip(c, 0, n - 1)
-    low = jnp.clip(c.astype(jnp.int32), 0, n - 2)  # also keeps NaN inside the array
-    return low, c - low.astype(c.dtype)
+def split(
+    coordinate: Triple, shape: tuple[int, int, int]
+) -> tuple[tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]], Triple]:
+    """The node below a coordinate and the fractions past it; the last node belongs to the cell below."""
+    x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
+    # the second limit also keeps NaN inside the array
+    i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
+    return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
 
 
 def _with(coordinate: Triple, axis: int, component: Scalar) -> Triple:
@@ -194,7 +201,7 @@ def _with(coordinate: Triple, axis: int, component: Scalar) -> Triple:
 
 
 def _fetch(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
-    return array.reshape(-1).at[flat].get(mode="promise_in_bounds")
+    return array.reshape(-1).at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:

@@ -8,50 +8,26 @@ and with the rounding of values, the stop and the near plane imitated less than 
 """
 
 import functools
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments import peer_vtk
 
 
 BACKGROUND = (0.2, 0.4, 0.6)  # 51, 102 and 153 of 255: exact, and no two channels alike
 AGREED = 2 / 255
 STEP = 0.5  # voxels
 
-PROBE = """
-import vtk
-window, renderer, reader = vtk.vtkRenderWindow(), vtk.vtkRenderer(), vtk.vtkWindowToImageFilter()
-window.SetOffScreenRendering(1)
-window.SetSize(64, 64)
-window.AddRenderer(renderer)
-renderer.SetBackground(0, 1, 0)
-window.Render()
-reader.SetInput(window)
-reader.ReadFrontBufferOff()
-reader.Update()
-raise SystemExit(reader.GetOutput().GetPointData().GetScalars().GetTuple3(0) != (0, 255, 0))
-"""
 
-
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def vtk():
-    """The module, where it is installed and can draw without a screen."""
-    with pytest.MonkeyPatch.context() as patch:
-        if "VTK_DEFAULT_OPENGL_WINDOW" not in os.environ:
-            patch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")
-        module = pytest.importorskip("vtk", reason="vtk is not installed: pip install jaxvol[peers]")
-        # in a process of its own: where a library is missing, VTK may crash
-        if subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120).returncode != 0:
-            pytest.skip("VTK cannot draw off screen here: apt-get install libosmesa6")
-        yield module
+    """These tests run where VTK is installed and can draw without a screen."""
+    if lacking := peer_vtk.missing():
+        pytest.skip(lacking)
 
 
 class Scene(NamedTuple):
@@ -62,13 +38,6 @@ class Scene(NamedTuple):
     @property
     def voxel(self) -> float:
         return float(self.volume.spacing[0])
-
-
-def dense(transfer: jv.TransferFunction) -> jv.TransferFunction:
-    """The same, with a point at every 8-bit value: between points VTK interpolates opacity, we extinction."""
-    values = jnp.arange(256.0)
-    colors, extinction = jax.vmap(transfer)(values)
-    return jv.TransferFunction(values, jnp.stack(colors, axis=-1), extinction)
 
 
 HEAD = [
@@ -94,19 +63,19 @@ def head_volume() -> jv.Volume:
 
 def head(**view: Any) -> Scene:
     transfer = jv.TransferFunction.from_points(HEAD, unit_distance=0.02)
-    return Scene(head_volume(), dense(transfer), jv.Camera(**(HEAD_VIEW | view)))
+    return Scene(head_volume(), transfer, jv.Camera(**(HEAD_VIEW | view)))
 
 
 def engine(real_volume: Callable) -> Scene:
     volume = jv.load(real_volume("engine_256x256x128_uint8.raw.gz"))
-    return Scene(volume, dense(jv.preset("engine")), jv.Camera.looking_at(volume, size=(256, 256)))
+    return Scene(volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=(256, 256)))
 
 
 def bonsai(real_volume: Callable) -> Scene:
     """Looking past the faces of the volume that cut it: VTK skips rays along their edges."""
     volume = jv.load(real_volume("bonsai_256x256x256_uint8.raw.gz"))
     camera = jv.Camera((835, 385, 553), (128, 173, 128), (0, 1, 0), 16, size=(256, 256))
-    return Scene(volume, dense(jv.preset("bonsai")), camera)
+    return Scene(volume, jv.preset("bonsai"), camera)
 
 
 SCENES: dict[str, Callable[[Callable], Scene]] = {
@@ -117,93 +86,19 @@ SCENES: dict[str, Callable[[Callable], Scene]] = {
 }
 
 
-def drawn_by_vtk(vtk: Any, scene: Scene) -> tuple[np.ndarray, Any]:
+def drawn_by_vtk(scene: Scene) -> tuple[np.ndarray, Any]:
     """VTK's image over the background, (height, width, 3) in [0, 1], top row first; and its mapper."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-
-    volume, transfer, camera = scene
-    grid = vtk.vtkImageData()
-    grid.SetDimensions(*volume.shape)
-    grid.SetSpacing(*volume.spacing.tolist())
-    grid.SetOrigin(*volume.origin.tolist())
-    grid.GetPointData().SetScalars(numpy_to_vtk(np.asarray(volume.data).ravel(order="F"), deep=True))
-
-    colors, opacities = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
-    values, opacity = transfer.values.tolist(), transfer.opacity(scene.voxel).tolist()
-    for value, color, alpha in zip(values, transfer.colors.tolist(), opacity, strict=True):
-        colors.AddRGBPoint(value, *color)
-        opacities.AddPoint(value, alpha)
-    look = vtk.vtkVolumeProperty()
-    look.SetColor(colors)
-    look.SetScalarOpacity(opacities)
-    look.SetScalarOpacityUnitDistance(scene.voxel)
-    look.SetInterpolationTypeToLinear()
-    look.ShadeOff()
-    look.DisableGradientOpacityOn()
-
-    mapper = vtk.vtkFixedPointVolumeRayCastMapper()
-    mapper.SetInputData(grid)
-    mapper.SetBlendModeToComposite()
-    mapper.AutoAdjustSampleDistancesOff()
-    mapper.LockSampleDistanceToInputSpacingOff()
-    mapper.SetSampleDistance(STEP * scene.voxel)
-    mapper.SetImageSampleDistance(1)
-    prop = vtk.vtkVolume()
-    prop.SetMapper(mapper)
-    prop.SetProperty(look)
-
-    renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
-    renderer.AddVolume(prop)
-    renderer.SetBackground(*BACKGROUND)
-    window.SetOffScreenRendering(1)
-    window.SetMultiSamples(0)
-    window.SetSize(*camera.size)
-    window.AddRenderer(renderer)
-    view = renderer.GetActiveCamera()
-    view.SetPosition(*camera.position.tolist())
-    view.SetFocalPoint(*camera.focal_point.tolist())
-    view.SetViewUp(*camera.view_up.tolist())
-    view.SetViewAngle(float(camera.view_angle))
-    if camera.parallel_scale is not None:
-        view.ParallelProjectionOn()
-        view.SetParallelScale(float(camera.parallel_scale))
-    renderer.ResetCameraClippingRange()
-    window.Render()
-
-    reader = vtk.vtkWindowToImageFilter()
-    reader.SetInput(window)
-    reader.ReadFrontBufferOff()
-    reader.Update()
-    width, height = camera.size
-    pixels = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
-    return pixels.reshape(height, width, 3)[::-1] / 255, mapper
-
-
-def as_displayed(image: np.ndarray, mapper: Any) -> np.ndarray:
-    """An image as VTK's display would show it: drawn slightly too large, by a texture's linear interpolation.
-
-    VTK casts one ray through the middle of every pixel, as we do, for the n x m pixels that the volume
-    may cover. It then stretches them from the first texel's middle to the last one's over the n x m
-    pixels, so that pixel i shows the texel coordinate (i + 1/2) (n - 1)/n - 1/2 past the first middle:
-    half a pixel off at the borders, which is more than all other differences together.
-    """
-    cast = mapper.GetRayCastImage()
-    blends = []
-    spans = zip(image.shape[1::-1], cast.GetImageOrigin(), cast.GetImageInUseSize(), strict=True)
-    for length, first, n in spans:
-        pixel = np.arange(length)
-        at = pixel.astype(float)
-        at[first : first + n] = first + (np.arange(n) + 0.5) * (n - 1) / n
-        blends.append(np.maximum(0, 1 - abs(at[:, None] - pixel)))
-    across, up = blends
-    return np.einsum("ri,cj,ijk->rck", up, across, image[::-1], optimize=True)[::-1]
+    drawn = peer_vtk.prepare(
+        scene.volume, scene.transfer, scene.camera, STEP * scene.voxel, background=BACKGROUND
+    )
+    return drawn.image(), drawn.mapper
 
 
 def drawn_by_us(scene: Scene, mapper: Any) -> tuple[np.ndarray, np.ndarray]:
     """Our image over the background as VTK would display it, and which pixels are inside the object."""
     rendering = jv.render(scene.volume, scene.transfer, scene.camera, jv.March(STEP * scene.voxel))
     image, opacity = rendering.image(BACKGROUND), rendering.rgba[..., 3]
-    return as_displayed(np.asarray(image), mapper), np.asarray(opacity) > 0.01
+    return peer_vtk.as_displayed(np.asarray(image), mapper), np.asarray(opacity) > 0.01
 
 
 def difference(image: np.ndarray, other: np.ndarray, inside: np.ndarray) -> float:
@@ -211,9 +106,9 @@ def difference(image: np.ndarray, other: np.ndarray, inside: np.ndarray) -> floa
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_vtk_draws_the_same_picture_to_the_pixel(vtk, real_volume, name):
+def test_vtk_draws_the_same_picture_to_the_pixel(real_volume, name):
     scene = SCENES[name](real_volume)
-    theirs, mapper = drawn_by_vtk(vtk, scene)
+    theirs, mapper = drawn_by_vtk(scene)
     ours, inside = drawn_by_us(scene, mapper)
     assert inside.mean() > 0.1
     right = difference(ours, theirs, inside)
@@ -242,19 +137,19 @@ MISREAD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("what", MISREAD)
-def test_a_camera_read_in_another_way_draws_another_picture(vtk, what):
+def test_a_camera_read_in_another_way_draws_another_picture(what):
     view, change = MISREAD[what]
     meant, misread = head(**view), head(**(view | change))
-    theirs, mapper = drawn_by_vtk(vtk, meant)
+    theirs, mapper = drawn_by_vtk(meant)
     ours, inside = drawn_by_us(meant, mapper)
     right = difference(ours, theirs, inside)
     assert right < AGREED
     assert difference(drawn_by_us(misread, mapper)[0], theirs, inside) > 10 * right
 
 
-def test_the_voxels_stand_where_vtk_has_them(vtk):
+def test_the_voxels_stand_where_vtk_has_them():
     scene = head(**PERSPECTIVE)
-    theirs, mapper = drawn_by_vtk(vtk, scene)
+    theirs, mapper = drawn_by_vtk(scene)
     ours, inside = drawn_by_us(scene, mapper)
     n = scene.volume.shape[0]
     in_cells = jv.Volume(scene.volume.data, spacing=(2 / n,) * 3, origin=(1 / n - 1,) * 3)

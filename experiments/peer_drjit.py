@@ -1,0 +1,181 @@
+"""How does Dr.Jit march a scene? The same rays and the same samples, compiled by LLVM.
+
+A compiler's best without skipping: it visits every sample between a ray's entry and its exit or early
+termination. Its gradient is the replay adjoint of Mitsuba's own integrators (Vicini, Speierer, Jakob 2021):
+once the image is there, a second march computes every sample again and sends the gradient back from where
+it stands, so that memory does not grow with the number of samples.
+
+Importing this file raises ImportError, with the reason, where Dr.Jit cannot run.
+"""
+
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+import jaxvol as jv
+
+from .peer_vtk import dense
+
+
+try:
+    import drjit as dr
+    import mitsuba as mi
+except ImportError as fault:
+    raise ImportError("mitsuba is not installed: pip install jaxvol[peers]") from fault
+if not dr.has_backend(dr.JitBackend.LLVM):
+    raise ImportError(
+        "Dr.Jit finds no LLVM: apt-get install libllvm19, and name its .so in DRJIT_LIBLLVM_PATH"
+    )
+mi.set_variant("llvm_ad_rgb")
+
+Drjit: TypeAlias = Any
+"""One of Dr.Jit's arrays: a lane for each ray."""
+
+
+class Marcher:
+    """A scene on Dr.Jit's side. `prepare` makes it."""
+
+    def __init__(
+        self,
+        volume: jv.Volume,
+        transfer: jv.TransferFunction,
+        camera: jv.Camera,
+        step: float,
+        quadrature: Literal["left", "midpoint"],
+        opacity_left: float,
+    ):
+        origins, directions = (np.asarray(points).reshape(-1, 3).T for points in camera.rays())
+        self.rays: Any = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions))
+        self.size = camera.size
+
+        # voxels as float32: 8-bit and half-precision textures are slower, by half and by four fifths
+        data = np.asarray(volume.data, np.float32).transpose(2, 1, 0)[..., None]
+        self.voxels = mi.Texture3f(mi.TensorXf(np.ascontiguousarray(data)))
+        self.box: Any = mi.BoundingBox3f(*(corner.tolist() for corner in volume.corners))
+        self.origin, self.spacing, self.shape = (
+            mi.Vector3f(*axes) for axes in (volume.origin.tolist(), volume.spacing.tolist(), volume.shape)
+        )
+
+        transfer = dense(transfer, volume)
+        self.first, self.last = float(transfer.values[0]), float(transfer.values[-1])
+        self.table = mi.TensorXf(np.column_stack([transfer.colors, transfer.extinction]))
+        self.transfer = mi.Texture1f(self.table)
+
+        # variables, not constants: no step and no threshold compiles the program again
+        self.step, self.opacity_left = dr.opaque(mi.Float, step), dr.opaque(mi.Float, opacity_left)
+        self.sampled = dr.opaque(mi.Float, step / 2 if quadrature == "midpoint" else 0.0)
+        dr.eval(self.rays, self.voxels, self.transfer)
+
+    def draw(self) -> None:
+        """Marches all rays, and waits for the image."""
+        self.color, self.left = self._march()
+        dr.eval(self.color, self.left)
+        dr.sync_thread()
+
+    def rgba(self) -> Float[np.ndarray, "height width 4"]:
+        """The image that was drawn last, premultiplied."""
+        width, height = self.size
+        channels = [*np.array(self.color), 1 - np.array(self.left)]
+        return np.stack(channels, axis=-1).reshape(height, width, 4)
+
+    def planes(self, image: Float[np.ndarray, "height width 4"]) -> Drjit:
+        """An image as Dr.Jit keeps it, a target for `gradient`."""
+        return mi.Vector4f(np.asarray(image, np.float32).reshape(-1, 4).T)
+
+    def gradient(self, target: Drjit | float = 0.0) -> Float[np.ndarray, "n 4"]:
+        """Marches all rays, and gives the gradient of `mean((rgba - target)²)` with respect to (r, g, b,
+        extinction) of each of the n points of the transfer function, dense as it is here."""
+        dr.enable_grad(self.table)
+        dr.clear_grad(self.table)
+        self.transfer.set_tensor(self.table)
+        self.color, self.left = self._march()
+        image = mi.Vector4f(*self.color, 1 - self.left)
+        cotangent = 2 * (image - target) / (4 * dr.width(self.rays))
+        dr.eval(self.color, self.left, cotangent)
+        self._march_again(cotangent)
+        gradient = dr.grad(self.table)
+        dr.eval(gradient)
+        dr.sync_thread()
+        dr.disable_grad(self.table)
+        self.transfer.set_tensor(self.table)
+        return np.array(gradient)
+
+    @dr.syntax
+    def _march(self) -> tuple[Drjit, Drjit]:
+        """Colour, and the transmittance left behind it."""
+        with dr.suspend_grad():
+            start, rate, length = self._enter()
+            index, depth = mi.UInt32(0), mi.Float(self.sampled)
+            color, transmittance = mi.Color3f(0), mi.Float(1)
+            live = depth < length
+            while live:
+                emitted, extinction = self._classify(start + depth * rate)
+                passed = dr.exp(-extinction * self.step)
+                color += transmittance * (1 - passed) * emitted
+                transmittance *= passed
+                index += 1
+                depth = dr.fma(mi.Float(index), self.step, self.sampled)
+                live &= (depth < length) & (transmittance > self.opacity_left)
+        return color, transmittance
+
+    @dr.syntax
+    def _march_again(self, cotangent: Drjit) -> None:
+        """The same loop, from which every sample sends its gradient to the table."""
+        with dr.suspend_grad():
+            start, rate, length = self._enter()
+            index, depth = mi.UInt32(0), mi.Float(self.sampled)
+            behind, transmittance = mi.Color3f(self.color), mi.Float(1)
+            to_color, to_opacity = mi.Color3f(cotangent.x, cotangent.y, cotangent.z), cotangent.w
+            live = depth < length
+            while live:
+                with dr.resume_grad():
+                    emitted, extinction = self._classify(start + depth * rate)
+                    passed = dr.exp(-extinction * self.step)
+                    added = transmittance * (1 - passed) * emitted
+                    behind -= dr.detach(added)
+                    # a cell's extinction also dims all that is behind it, in proportion
+                    dimmed = dr.dot(to_color, behind) - to_opacity * self.left
+                    dr.backward_from(dr.dot(to_color, added) - dimmed * extinction * self.step)
+                transmittance *= dr.detach(passed)
+                index += 1
+                depth = dr.fma(mi.Float(index), self.step, self.sampled)
+                live &= (depth < length) & (transmittance > self.opacity_left)
+
+    def _enter(self) -> tuple[Drjit, Drjit, Drjit]:
+        """Where a ray enters the volume, its rate per depth, both in texture coordinates, and its length."""
+        hit, near, far = self.box.ray_intersect(self.rays)
+        near = dr.maximum(near, 0)
+        # a texture's texels are cells, n to a length of 1; our nodes are their middles
+        start = ((self.rays(near) - self.origin) / self.spacing + 0.5) / self.shape
+        return start, self.rays.d / self.spacing / self.shape, dr.select(hit, far - near, 0)
+
+    def _classify(self, place: Drjit) -> tuple[Drjit, Drjit]:
+        """Colour and extinction at a texture coordinate."""
+        (value,) = self.voxels.eval(place)
+        n = self.table.shape[0]
+        fraction = (value - self.first) / (self.last - self.first)
+        r, g, b, extinction = self.transfer.eval(mi.Float((fraction * (n - 1) + 0.5) / n))
+        return mi.Color3f(r, g, b), extinction
+
+
+def prepare(
+    volume: jv.Volume,
+    transfer: jv.TransferFunction,
+    camera: jv.Camera,
+    step: float,
+    quadrature: Literal["left", "midpoint"] = "left",
+    opacity_left: float = 0.0,
+    threads: int | None = None,
+) -> Marcher:
+    """The scene on Dr.Jit's side, drawn once.
+
+    - `step`, `quadrature`: as those of `jaxvol.March`.
+    - `opacity_left`: as that of `jaxvol.EarlyTermination`; 0 ends rays at their exit alone.
+    - `threads`: of Dr.Jit in this process; as they are, by default.
+    """
+    if threads is not None:
+        dr.set_thread_count(threads)
+    marcher = Marcher(volume, transfer, camera, step, quadrature, opacity_left)
+    marcher.draw()
+    return marcher

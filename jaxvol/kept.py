@@ -1,0 +1,32 @@
+"""What has been computed from this array before? Kept for as long as the array lives.
+
+Arrays do not change: whoever updates a volume puts another array into it, and what was computed from the old
+one is never asked for again. So nothing kept here goes stale, and nothing outlives its array.
+"""
+
+import weakref
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+from jaxtyping import Array
+
+from .checks import is_traced
+
+
+T = TypeVar("T")
+
+
+def kept(array: Array, compute: Callable[[Array], T]) -> T:
+    """`compute(array)`, computed once in the lifetime of a concrete array. It carries no gradient."""
+    if is_traced(array) or not isinstance(array, jax.Array):  # a NumPy array may change
+        return compute(jax.lax.stop_gradient(array))
+    key = id(array), compute
+    if key not in _MEMORY:
+        with jax.ensure_compile_time_eval():
+            _MEMORY[key] = compute(array)
+        weakref.finalize(array, _MEMORY.pop, key, None)
+    return _MEMORY[key]
+
+
+_MEMORY: dict = {}

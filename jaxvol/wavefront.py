@@ -1,0 +1,187 @@
+"""Which samples are taken together? Those of many rays, several cells at a time, of rays that are still alive.
+
+What makes this fast was measured (on CPU, by XLA's rules), and is what this file is about:
+
+- A *segment* is CELLS cells of a ray. All samples of a segment are taken before any is blended, since only
+  then XLA fetches each voxel once: it repeats a fetch for every use that it makes of it, unless a branch
+  stands between, behind which values lie in memory. So the samples are taken in a `lax.cond`.
+- Rays come in *beams* of neighbours. Some of them are marched at a time, a *batch* that fits into the cache,
+  segment after segment, until a quarter of its beams is finished; then batches are made up anew from the beams
+  that are left. Lanes that idle cost as much as those that work.
+- Where empty space is known (`Survey`), rays leap over it between two segments, each as far as it can.
+
+None of it shows in the result: cells, transforms and the blending are those of `reference`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .locate import Ray
+from .march import Cell, March, Survey
+from .reference import Progress, blend, front, leave, measure, move, opacity, pieces
+from .transfer import Classification, Measured
+from .triple import Scalar, Triple
+from .volume import Volume
+
+
+CELLS = 8
+"""Cells of a segment."""
+
+BATCH = 64
+"""Beams marched at a time."""
+
+KEPT = 0.75
+"""The share of a batch's beams that must be alive for it to go on."""
+
+
+def march_beams(
+    march: March, volume: Volume, seen: Classification, survey: Survey | None, rays: Ray, at: Progress
+) -> Progress:
+    """All rays to their ends. `rays` and `at` have shape (beams, rays in a beam)."""
+    beams, lanes = at.finished.shape
+    size = min(BATCH, beams)
+    notes = None if survey is None else survey.notes(rays, CELLS * march.step)
+
+    def run(rows: Int[Array, " batch"], at: Progress, keep: Scalar) -> Progress:
+        """March the beams in these rows for a while; a row past the last one stands for none."""
+
+        def take(leaf: Array) -> Array:
+            return leaf.at[rows].get(mode="fill", fill_value=0)
+
+        here, some, known = jax.tree.map(take, (at, rays, notes))
+        here = replace(here, finished=here.finished | (rows >= beams)[:, None])
+
+        def go_on(here: Progress) -> Bool[Array, ""]:
+            alive = jnp.any(_alive(march, here), axis=-1)
+            return jnp.sum(alive) > keep
+
+        def go(here: Progress) -> Progress:
+            if survey is not None:
+                here = _leap(march, survey, known, some, here)
+            flat = lambda tree: jax.tree.map(lambda leaf: leaf.reshape(-1), tree)
+            after = _segment(march, volume, seen, flat(some), flat(here))
+            return jax.tree.map(lambda leaf: leaf.reshape(size, lanes), after)
+
+        here = jax.lax.while_loop(go_on, go, here)
+        return jax.tree.map(lambda all_, part: all_.at[rows].set(part, mode="drop"), at, here)
+
+    def alive_rows(at: Progress) -> tuple[Int[Array, " padded"], Int[Array, ""]]:
+        alive = jnp.any(_alive(march, at), axis=-1)
+        rows = jnp.nonzero(alive, size=-(-beams // size) * size, fill_value=beams)[0]
+        return rows.astype(jnp.int32), jnp.sum(alive, dtype=jnp.int32)
+
+    def round_(state: tuple[Progress, Array, Array]) -> tuple[Progress, Array, Array]:
+        at, rows, count = state
+        # only full batches, as long as there are any: what remains joins those of the next round
+        batches = jnp.maximum(count // size, 1)
+        keep = jnp.where(count > size, int(KEPT * size), 0)
+
+        def one(i: Int[Array, ""], at: Progress) -> Progress:
+            return run(jax.lax.dynamic_slice_in_dim(rows, i * size, size), at, keep)
+
+        at = jax.lax.fori_loop(0, batches, one, at)
+        return at, *alive_rows(at)
+
+    return jax.lax.while_loop(lambda state: state[2] > 0, round_, (at, *alive_rows(at)))[0]
+
+
+def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
+    return ~at.finished & (at.index < march.most_samples)
+
+
+def _each(f: Any) -> Any:
+    """A function of one ray, and of what each of its cells has, over rays (n,) and cells (CELLS, n)."""
+    return jax.vmap(jax.vmap(f), in_axes=(None, 0))
+
+
+def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
+    """The next cells of each ray, on to where it is finished, or has moved off the places sampled here."""
+    ahead = jnp.arange(CELLS, dtype=at.index.dtype)[:, None]
+    live = _alive(march, at)
+
+    def whole(at: Progress) -> tuple[Cell, ...]:
+        return _each(lambda ray, front: pieces(march, ray, volume, front))(ray, front(march, at, ahead))
+
+    cut = whole(at)
+    divided = len(cut) > 1
+    # To find where a cell is divided is work not to be done twice; a whole cell costs less than memory does.
+    given = cut if divided else None
+
+    def cells(at: Progress, given: Any) -> tuple[Cell, ...]:
+        return given if divided else whole(at)
+
+    def measured(at: Progress, given: Any) -> list[Measured]:
+        each = _each(lambda ray, piece: measure(march, ray, seen, piece))
+        return [each(ray, piece) for piece in cells(at, given)]
+
+    def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
+        each = jax.vmap(
+            jax.vmap(lambda ray, piece, read: opacity(march, ray, seen, piece, read)), in_axes=(None, 0, 0)
+        )
+        return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
+
+    def blended(at: Progress, cell: Any) -> Progress:
+        return jax.vmap(lambda ray, at, cell: blend(march, ray, seen, at, cell))(ray, at, cell)
+
+    def together(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
+        """All cells at once, where nothing moves a ray off them."""
+        samples = tuple(zip(cells(at, given), values, alphas, strict=True))
+        after = at
+        for k in range(CELLS):
+            after = blended(after, jax.tree.map(lambda leaf, k=k: leaf[k], samples))
+        last = tuple(jax.tree.map(lambda leaf: leaf[-1], piece) for piece, _, _ in samples)
+        after = jax.vmap(lambda ray, at, last: leave(march, ray, at, last))(ray, after, last)
+        return replace(after, index=at.index + CELLS)
+
+    def singly(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
+        """Cell by cell, as long as the ray is where its samples were taken."""
+        samples = tuple(zip(cells(at, given), values, alphas, strict=True))
+
+        def one(ray: Ray, at: Progress, cell: Any) -> Progress:
+            after = leave(march, ray, blend(march, ray, seen, at, cell), tuple(piece for piece, _, _ in cell))
+            transparent = jnp.all(jnp.stack([alpha for _, _, alpha in cell]) == 0, axis=0)
+            return move(march, ray, after, transparent)
+
+        after = at
+        for k in range(CELLS):
+            holds = (after.offset == at.offset) & _alive(march, after)
+            new = jax.vmap(one)(ray, after, jax.tree.map(lambda leaf, k=k: leaf[k], samples))
+            after = jax.tree.map(lambda a, b, holds=holds: jnp.where(holds, a, b), new, after)
+        return after
+
+    any_live = jnp.any(live)
+    values = _in_memory(any_live, measured, at, given)
+    alphas = _in_memory(any_live, opacities, at, given, values)
+    if march.moves or march.max_samples is not None:
+        settled = jax.vmap(lambda at: march.settled(at.memory))(at) & (at.index + CELLS <= march.most_samples)
+        return jax.lax.cond(jnp.all(settled | ~live), together, singly, at, given, values, alphas)
+    return together(at, given, values, alphas)
+
+
+def _in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
+    """`f(*arguments)`, computed once and put in memory for all who use it; or anything where none is live."""
+
+    def nothing(*arguments: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(f, *arguments))
+
+    return jax.lax.cond(live, f, nothing, *arguments)
+
+
+def _leap(march: March, survey: Survey, notes: PyTree, rays: Ray, at: Progress) -> Progress:
+    """On to the first cell that reaches into what is not known to be empty. A ray that has nothing ahead of
+    it is finished."""
+    here = front(march, at)
+    there = survey.clear(notes, rays, here)
+    whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
+    cells = jnp.clip(whole.astype(at.index.dtype), 0, march.most_samples - at.index)
+    leaps = (cells > 0) & ~at.finished
+    each = jax.vmap(jax.vmap(lambda ray, at, cells: move(march, ray, at, jnp.ones((), bool), cells)))
+    gone = each(rays, at, cells)
+    at = jax.tree.map(lambda a, b: jnp.where(leaps, a, b), gone, at)
+    return replace(at, finished=at.finished | (_alive(march, at) & (front(march, at) >= rays.length)))
