@@ -7,7 +7,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .occupancy import Blocks
-from .transfer import Classify, Measured, Transfer, TransferFunction, interpolated, points_below, row_of, seen_between
+from .transfer import (
+    Classify,
+    Measured,
+    Transfer,
+    TransferFunction,
+    interpolated,
+    points_below,
+    row_of,
+    seen_between,
+)
 from .triple import Scalar, Triple
 from .volume import Volume
 

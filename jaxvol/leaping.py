@@ -8,6 +8,7 @@ differ in what they ask, and for whom:
 - the latter, from a distance on that cells of R x R pixels share (`"min_distance"`, `"beam"`).
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -16,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from .beams import Box, Stretches, stretches
 from .checks import integer
 from .locate import Ray
 from .march import Survey, Transform, View
@@ -25,14 +27,8 @@ from .triple import Scalar, Triple, along
 
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
 
-STRETCHES = 128
-"""Pieces, at most, into which a beam is divided. In a volume that it crosses with more samples than these
-hold, each stands for a multiple of the samples that are taken at once."""
-
 LEAPS = 4
 """Leaps from cell to cell before the next samples: rays that have arrived wait for those that have not."""
-
-ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
 
 
 class SpaceLeaping(Transform):
@@ -110,14 +106,16 @@ class SpaceLeaping(Transform):
         column = jnp.stack([columns[:-1], columns[:-1] + last])[None, :, None, :]
         row = jnp.stack([rows[:-1], rows[:-1] + last])[:, None, :, None]
         # (rows, cols, 4): the rays in the corners of each cell
-        column, row = (jnp.moveaxis(i.reshape(4, *i.shape[2:]), 0, -1) for i in jnp.broadcast_arrays(column, row))
+        column, row = (
+            jnp.moveaxis(i.reshape(4, *i.shape[2:]), 0, -1) for i in jnp.broadcast_arrays(column, row)
+        )
         cast = jnp.vectorize(lambda x, y: tuple(part for end in view.ray(x, y) for part in end))
         x, y, z, *direction = cast(column, row)
-        box = _Box.within(occupancy, (x, y, z), tuple(direction))
+        box = Box.within(occupancy, (x, y, z), tuple(direction))
         box = jax.tree.map(jnp.ravel, box)
-        found = _stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
-        first = found.following[:, 0].astype(found.near.dtype)
-        start = jnp.where(first < found.following.shape[1], found.near + first * found.length, jnp.inf)
+        found = stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
+        first = found.following[0].astype(found.near.dtype)
+        start = jnp.where(first < found.following.shape[0], found.near + first * found.length, jnp.inf)
         return start.reshape(column.shape[:-1])
 
 
@@ -134,151 +132,29 @@ class _Beams(Survey):
     occupancy: Occupancy
     sums: Sums
 
-    def notes(self, rays: Ray, stretch: Scalar) -> "_Stretches":
-        return _stretches(self.occupancy, self.sums, _Box.around(self.occupancy, rays), stretch)
+    def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
+        return stretches(self.occupancy, self.sums, box(self.occupancy), stretch)
+
+    def seen(self, notes: Stretches) -> Bool[Array, " beams"]:
+        return notes.following[0] < notes.following.shape[0]
 
     def clear(
-        self, notes: "_Stretches", rays: Ray, depth: Float[Array, "beams rays"]
-    ) -> Float[Array, "beams rays"]:
-        beams, count = notes.following.shape
-        place = (rays.t_in + depth - notes.near[:, None]) / notes.length[:, None]
+        self,
+        notes: Stretches,
+        beam: Int[Array, " groups"],
+        rays: Ray,
+        depth: Float[Array, "groups rays"],
+    ) -> Float[Array, "groups rays"]:
+        count, beams = notes.following.shape
+        near = notes.near.at[beam].get(mode="promise_in_bounds")[:, None]
+        place = (rays.t_in + depth - near) / notes.length
         stretch = jnp.clip(place.astype(jnp.int32), 0, count - 1)
-        entry = jnp.arange(beams, dtype=jnp.int32)[:, None] * count + stretch
-        following = notes.following.reshape(-1).at[entry].get(mode="promise_in_bounds", wrap_negative_indices=False)
-        begin = notes.near[:, None] + following.astype(depth.dtype) * notes.length[:, None] - rays.t_in
+        entry = stretch * beams + beam[:, None]
+        following = (
+            notes.following.reshape(-1).at[entry].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        )
+        begin = near + following.astype(depth.dtype) * notes.length - rays.t_in
         return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
-
-
-class _Stretches(eqx.Module):
-    """Which stretches of beams are empty.
-
-    - `near`: distance from the origins at which the first stretch begins; `length`: of each.
-    - `following`: for each stretch the first one, itself or behind it, that is not empty.
-    """
-
-    near: Float[Array, " beams"]
-    length: Float[Array, " beams"]
-    following: Int[Array, "beams stretches"]
-
-
-class _Box(eqx.Module):
-    """The box in which the rays of a beam are, at each distance from their origins: counted in cells of the
-    occupancy, from `low + u low_rate` to `high + u high_rate` at the distance `near + u`."""
-
-    near: Float[Array, " beams"]
-    far: Float[Array, " beams"]
-    low: Triple
-    high: Triple
-    low_rate: Triple
-    high_rate: Triple
-
-    @classmethod
-    def around(cls, occupancy: Occupancy, rays: Ray) -> "_Box":
-        """The box of rays whose last axis is that of a beam's rays; those that miss the volume do not count."""
-        rays = jax.lax.stop_gradient(rays)
-        hit = rays.length > 0
-        near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
-        near = jnp.where(jnp.isfinite(near), near, 0)
-        far = jnp.max(jnp.where(hit, rays.t_in + rays.length, -jnp.inf), axis=-1)
-        start = along(rays.entry, rays.direction, near[..., None] - rays.t_in)
-        return cls._of(occupancy, start, rays.direction, near, far, hit, jnp.zeros_like(near))
-
-    @classmethod
-    def within(cls, occupancy: Occupancy, origin: Triple, direction: Triple) -> "_Box":
-        """The box of all rays of a camera between those given, whose last axis is that of a cell's corners."""
-        origin, direction = jax.lax.stop_gradient((origin, direction))
-        x, y, z = (
-            low + size * n / 2 - jnp.mean(o, axis=-1)
-            for o, low, size, n in zip(
-                origin, occupancy.origin, occupancy.size, occupancy.occupied.shape, strict=True
-            )
-        )
-        middle = jnp.sqrt(x * x + y * y + z * z)
-        around = jnp.sqrt(
-            sum((size * n) ** 2 for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True))
-        )
-        # Directions between those of the corners are their averages, made unit vectors: longer by 1 minus the
-        # cosine at most of the widest angle to the middle one.
-        axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
-        cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
-        bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
-        near, far = jnp.maximum(middle - around, 0), middle + around
-        start = along(origin, direction, near[..., None])
-        return cls._of(occupancy, start, direction, near, far, jnp.ones(start[0].shape, bool), bulge)
-
-    @classmethod
-    def _of(
-        cls,
-        occupancy: Occupancy,
-        start: Triple,
-        direction: Triple,
-        near: Scalar,
-        far: Scalar,
-        counts: Bool[Array, "*beams rays"],
-        bulge: Scalar,
-    ) -> "_Box":
-        def least(values: Array, sign: int) -> Array:
-            return sign * jnp.min(jnp.where(counts, sign * values, jnp.inf), axis=-1)
-
-        sides = []
-        for s, d, size, corner in zip(
-            start, direction, occupancy.size, occupancy.origin, strict=True
-        ):
-            # what float32 makes of the start of a ray whose camera is far away
-            slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
-            s, d = (s - corner) / size, d / size
-            sides.append(
-                (least(s, 1) - slack, least(s, -1) + slack, least(d, 1) - bulge / size, least(d, -1) + bulge / size)
-            )
-        low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
-        return cls(near, far, low, high, low_rate, high_rate)
-
-    def between(self, first: Scalar, last: Scalar) -> tuple[Triple, Triple]:
-        """The box of everything from `near + first` to `near + last`, both ≥ 0."""
-        low = tuple(
-            start + jnp.minimum(first * rate, last * rate)
-            for start, rate in zip(self.low, self.low_rate, strict=True)
-        )
-        high = tuple(
-            start + jnp.maximum(first * rate, last * rate)
-            for start, rate in zip(self.high, self.high_rate, strict=True)
-        )
-        return low, high
-
-
-def _stretches(occupancy: Occupancy, sums: Sums, box: _Box, stretch: Scalar) -> _Stretches:
-    """Ask for each stretch of each beam, from the last one to the first, which one is the next occupied."""
-    across = jnp.maximum(box.far - box.near, 0)
-    # whole multiples of what is sampled at once, the same for all beams, so that none is cut in two
-    multiple = jnp.ceil(jnp.max(across) / (stretch * STRETCHES))
-    length = jnp.maximum(multiple, 1) * stretch
-    number = jnp.minimum(jnp.ceil(jnp.max(across) / length).astype(jnp.int32), STRETCHES)
-
-    def ask(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        at, next_one, table = state
-        at = at - 1
-        first = at.astype(length.dtype) * length
-        low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
-        shape, inside = occupancy.occupied.shape, first < across
-        for a, b, n in zip(low, high, shape, strict=True):
-            inside &= (b >= 0) & (a <= n)
-
-        def cells(corner: Triple) -> Index:
-            """The cells of a corner, in the grid; some cell for boxes that are not."""
-            x, y, z = (
-                jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
-                for c, n in zip(corner, shape, strict=True)
-            )
-            return x, y, z
-
-        occupied = inside & sums.any_between(cells(low), cells(high))
-        next_one = jnp.where(occupied, at, next_one)
-        return at, next_one, jax.lax.dynamic_update_slice_in_dim(table, next_one[None].astype(table.dtype), at, 0)
-
-    none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
-    table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int16)
-    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, ask, (number, none, table))
-    return _Stretches(box.near, jnp.full(box.near.shape, 1.0) * length, table.T)
 
 
 class _Distances(Survey):
@@ -290,21 +166,22 @@ class _Distances(Survey):
     """Distance from the origin before which nothing is to be seen, for each cell of pixels."""
     cell: int = eqx.field(static=True)
 
-    def notes(self, rays: Ray, stretch: Scalar) -> Float[Array, "beams rays"] | None:
-        if self.starts is None:
-            return None
-        column, row = rays.pixel
-        rows, columns = self.starts.shape
-        x, y = jnp.minimum(column // self.cell, columns - 1), jnp.minimum(row // self.cell, rows - 1)
-        return self.starts[y, x] - rays.t_in
+    def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
+        return None
+
+    def seen(self, notes: None) -> Bool[Array, ""]:
+        return jnp.ones((), bool)
 
     def clear(
-        self, notes: Float[Array, "beams rays"] | None, rays: Ray, depth: Float[Array, "beams rays"]
-    ) -> Float[Array, "beams rays"]:
+        self, notes: None, beam: Int[Array, " groups"], rays: Ray, depth: Float[Array, "groups rays"]
+    ) -> Float[Array, "groups rays"]:
         start = self.occupancy.cell(rays.entry)
         rate = [r / size for r, size in zip(rays.direction, self.occupancy.size, strict=True)]
-        if notes is not None:
-            depth = jnp.maximum(depth, notes)
+        if self.starts is not None:
+            column, row = rays.pixel
+            rows, columns = self.starts.shape
+            x, y = jnp.minimum(column // self.cell, columns - 1), jnp.minimum(row // self.cell, rows - 1)
+            depth = jnp.maximum(depth, self.starts[y, x] - rays.t_in)
         for _ in range(LEAPS):
             depth = self._leap(start, rate, rays.length, depth)
         return depth
@@ -314,7 +191,11 @@ class _Distances(Survey):
         point = [s + depth * r for s, r in zip(start, rate, strict=True)]
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
         flat = ((x * ny + y) * nz + z).astype(jnp.int32)
-        away = self.distance.at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False).astype(depth.dtype)
+        away = (
+            self.distance.at[flat]
+            .get(mode="promise_in_bounds", wrap_negative_indices=False)
+            .astype(depth.dtype)
+        )
         # all cells nearer than that are empty: on to where the ray leaves their cube
         ahead = jnp.inf
         for p, r, corner in zip(point, rate, (x, y, z), strict=True):

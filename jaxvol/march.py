@@ -22,6 +22,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .beams import Box
 from .checks import number
 from .locate import Affine, Ray, Space
 from .occupancy import Occupancy
@@ -58,14 +59,21 @@ class Survey(eqx.Module):
     """What is known about empty space. Rays come in beams: arrays of shape (beams, rays in a beam)."""
 
     @abstractmethod
-    def notes(self, rays: Ray, stretch: Scalar) -> Any:
-        """What the rays need to know, made once: arrays whose leading axis is that of the beams.
+    def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
+        """What is worth finding out once about these beams, from the boxes around them.
 
         `stretch`: the length over which samples are taken at once. It is of no use to know of less."""
 
     @abstractmethod
-    def clear(self, notes: Any, rays: Ray, depth: Float[Array, "beams rays"]) -> Float[Array, "beams rays"]:
-        """A depth, no less than `depth`, up to which nothing is seen."""
+    def seen(self, notes: Any) -> Bool[Array, "*beams"]:
+        """Whether anything may be seen along each beam."""
+
+    @abstractmethod
+    def clear(
+        self, notes: Any, beam: Int[Array, " groups"], rays: Ray, depth: Float[Array, "groups rays"]
+    ) -> Float[Array, "groups rays"]:
+        """For some of the rays, each group from one beam: a depth, no less than `depth`, up to which nothing
+        is seen."""
 
 
 class Transform(eqx.Module):

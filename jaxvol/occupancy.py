@@ -73,7 +73,9 @@ class Sums(eqx.Module):
         for i, sign_i in x:
             for j, sign_j in y:
                 for k, sign_k in z:
-                    entry = self.table.at[(i * ny + j) * nz + k].get(mode="promise_in_bounds", wrap_negative_indices=False)
+                    entry = self.table.at[(i * ny + j) * nz + k].get(
+                        mode="promise_in_bounds", wrap_negative_indices=False
+                    )
                     count = count + sign_i * sign_j * sign_k * entry
         return count > 0
 
@@ -121,9 +123,7 @@ class Occupancy(eqx.Module):
 
     def cell(self, point: Triple) -> Triple:
         """Where a world point lies, counted in cells."""
-        x, y, z = (
-            (p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True)
-        )
+        x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
 
 

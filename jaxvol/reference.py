@@ -85,7 +85,11 @@ def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured:
 
 
 def blend(
-    march: March, ray: Ray, seen: Classification, at: Progress, cell: tuple[tuple[Cell, Measured, Scalar], ...]
+    march: March,
+    ray: Ray,
+    seen: Classification,
+    at: Progress,
+    cell: tuple[tuple[Cell, Measured, Scalar], ...],
 ) -> Progress:
     """What has been accumulated behind a cell, of whose pieces one knows what was measured and the opacity."""
     (r, g, b), total, moment = at.color, at.opacity, at.moment

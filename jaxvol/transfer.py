@@ -174,7 +174,10 @@ def points_below(
 def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, ""]) -> Row:
     """One row, by a look-up for each of its entries: batched, they are whole arrays from the start."""
     interval = jnp.clip(interval, 0, rows.shape[0] - 1)
-    return tuple(rows[:, i].at[interval].get(mode="promise_in_bounds", wrap_negative_indices=False) for i in range(rows.shape[1]))
+    return tuple(
+        rows[:, i].at[interval].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        for i in range(rows.shape[1])
+    )
 
 
 def interpolated(row: Row, value: Scalar) -> tuple[Triple, Scalar]:

@@ -15,16 +15,18 @@ None of it shows in the result: cells, transforms and the blending are those of 
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .beams import Box
 from .locate import Ray
 from .march import Cell, March, Survey
-from .reference import Progress, blend, front, leave, measure, move, opacity, pieces
+from .occupancy import Occupancy
+from .reference import Progress, begin, blend, front, leave, measure, move, opacity, pieces
 from .transfer import Classification, Measured
 from .triple import Scalar, Triple
 from .volume import Volume
@@ -33,47 +35,68 @@ from .volume import Volume
 CELLS = 8
 """Cells of a segment."""
 
-BATCH = 64
-"""Beams marched at a time."""
+GROUP = 16
+"""Rays that live and die together as far as batches go: a quarter of a beam."""
+
+BATCH = 512
+"""Groups marched at a time."""
 
 KEPT = 0.75
-"""The share of a batch's beams that must be alive for it to go on."""
+"""The share of a batch's groups that must be alive for it to go on."""
+
+
+class Beams(NamedTuple):
+    """Rays that are marched together, in groups of which some make up a beam.
+
+    - `rays`: of shape (groups, GROUP).
+    - `count`: how many beams. As many groups after each other make up each of them.
+    - `box`: the boxes around the beams.
+    """
+
+    rays: Ray
+    count: int
+    box: Callable[[Occupancy], Box]
 
 
 def march_beams(
-    march: March, volume: Volume, seen: Classification, survey: Survey | None, rays: Ray, at: Progress
-) -> Progress:
-    """All rays to their ends. `rays` and `at` have shape (beams, rays in a beam)."""
-    beams, lanes = at.finished.shape
-    size = min(BATCH, beams)
-    notes = None if survey is None else survey.notes(rays, CELLS * march.step)
+    march: March, volume: Volume, seen: Classification, survey: Survey | None, beams: Beams
+) -> tuple[Ray, Progress]:
+    """All rays, and where their marches ended. Of shape (groups, GROUP)."""
+    rays, groups = beams.rays, beams.rays.length.shape[0]
+    size = min(BATCH, groups)
+    at = jax.vmap(jax.vmap(begin, in_axes=(None, 0)), in_axes=(None, 0))(march, rays)
+    finished = rays.length <= 0
+    notes = None
+    if survey is not None:
+        notes = survey.notes(beams.box, CELLS * march.step)
+        hopeful = jnp.broadcast_to(survey.seen(notes), (beams.count,))
+        finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
+    at = replace(at, finished=finished)
 
     def run(rows: Int[Array, " batch"], at: Progress, keep: Scalar) -> Progress:
-        """March the beams in these rows for a while; a row past the last one stands for none."""
-
-        def take(leaf: Array) -> Array:
-            return leaf.at[rows].get(mode="fill", fill_value=0)
-
-        here, some, known = jax.tree.map(take, (at, rays, notes))
-        here = replace(here, finished=here.finished | (rows >= beams)[:, None])
+        """March the groups in these rows for a while; a row past the last one stands for none."""
+        known = jnp.minimum(rows, groups - 1)
+        beam = known // (groups // beams.count)
+        take = lambda leaf: leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        here, some = jax.tree.map(take, (at, rays))
+        here = replace(here, finished=here.finished | (rows >= groups)[:, None])
 
         def go_on(here: Progress) -> Bool[Array, ""]:
-            alive = jnp.any(_alive(march, here), axis=-1)
-            return jnp.sum(alive) > keep
+            return jnp.sum(jnp.any(_alive(march, here), axis=-1)) > keep
 
         def go(here: Progress) -> Progress:
             if survey is not None:
-                here = _leap(march, survey, known, some, here)
+                here = _leap(march, survey, notes, beam, some, here)
             flat = lambda tree: jax.tree.map(lambda leaf: leaf.reshape(-1), tree)
             after = _segment(march, volume, seen, flat(some), flat(here))
-            return jax.tree.map(lambda leaf: leaf.reshape(size, lanes), after)
+            return jax.tree.map(lambda leaf: leaf.reshape(size, GROUP), after)
 
         here = jax.lax.while_loop(go_on, go, here)
         return jax.tree.map(lambda all_, part: all_.at[rows].set(part, mode="drop"), at, here)
 
     def alive_rows(at: Progress) -> tuple[Int[Array, " padded"], Int[Array, ""]]:
         alive = jnp.any(_alive(march, at), axis=-1)
-        rows = jnp.nonzero(alive, size=-(-beams // size) * size, fill_value=beams)[0]
+        rows = jnp.nonzero(alive, size=-(-groups // size) * size, fill_value=groups)[0]
         return rows.astype(jnp.int32), jnp.sum(alive, dtype=jnp.int32)
 
     def round_(state: tuple[Progress, Array, Array]) -> tuple[Progress, Array, Array]:
@@ -88,7 +111,8 @@ def march_beams(
         at = jax.lax.fori_loop(0, batches, one, at)
         return at, *alive_rows(at)
 
-    return jax.lax.while_loop(lambda state: state[2] > 0, round_, (at, *alive_rows(at)))[0]
+    at, _, _ = jax.lax.while_loop(lambda state: state[2] > 0, round_, (at, *alive_rows(at)))
+    return at
 
 
 def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
@@ -173,11 +197,13 @@ def _in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) ->
     return jax.lax.cond(live, f, nothing, *arguments)
 
 
-def _leap(march: March, survey: Survey, notes: PyTree, rays: Ray, at: Progress) -> Progress:
+def _leap(
+    march: March, survey: Survey, notes: PyTree, beam: Int[Array, " batch"], rays: Ray, at: Progress
+) -> Progress:
     """On to the first cell that reaches into what is not known to be empty. A ray that has nothing ahead of
     it is finished."""
     here = front(march, at)
-    there = survey.clear(notes, rays, here)
+    there = survey.clear(notes, beam, rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     cells = jnp.clip(whole.astype(at.index.dtype), 0, march.most_samples - at.index)
     leaps = (cells > 0) & ~at.finished

@@ -1,0 +1,162 @@
+"""Where do neighbouring rays run, and where is nothing along them? Boxes around beams, stretch by stretch.
+
+A beam is a handful of rays that are asked about together. At each distance from their origins they lie in a
+box, whose faces move along straight lines.
+"""
+
+from typing import cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .locate import Ray
+from .occupancy import Index, Occupancy, Sums
+from .triple import Scalar, Triple, along
+
+
+STRETCHES = 128
+"""Pieces, at most, into which a beam is divided. In a volume that it crosses with more samples than these
+hold, each stands for a multiple of the samples that are taken at once."""
+
+ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
+
+
+class Box(eqx.Module):
+    """The box in which the rays of a beam are, at each distance from their origins: counted in cells of the
+    occupancy, from `low + u low_rate` to `high + u high_rate` at the distance `near + u`."""
+
+    near: Float[Array, " beams"]
+    far: Float[Array, " beams"]
+    low: Triple
+    high: Triple
+    low_rate: Triple
+    high_rate: Triple
+
+    @classmethod
+    def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
+        """The box of rays whose last axis is that of a beam's rays; those that miss the volume do not count."""
+        rays = jax.lax.stop_gradient(rays)
+        hit = rays.length > 0
+        near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
+        near = jnp.where(jnp.isfinite(near), near, 0)
+        far = jnp.max(jnp.where(hit, rays.t_in + rays.length, -jnp.inf), axis=-1)
+        start = along(rays.entry, rays.direction, near[..., None] - rays.t_in)
+        return cls._of(occupancy, start, rays.direction, near, far, hit, jnp.zeros_like(near))
+
+    @classmethod
+    def within(cls, occupancy: Occupancy, origin: Triple, direction: Triple) -> "Box":
+        """The box of all rays of a camera between those given, whose last axis is that of a cell's corners."""
+        origin, direction = jax.lax.stop_gradient((origin, direction))
+        x, y, z = (
+            low + size * n / 2 - jnp.mean(o, axis=-1)
+            for o, low, size, n in zip(
+                origin, occupancy.origin, occupancy.size, occupancy.occupied.shape, strict=True
+            )
+        )
+        middle = jnp.sqrt(x * x + y * y + z * z)
+        around = jnp.sqrt(
+            sum((size * n) ** 2 for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True))
+        )
+        # Directions between those of the corners are their averages, made unit vectors: longer by 1 minus the
+        # cosine at most of the widest angle to the middle one.
+        axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
+        cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
+        bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
+        near, far = jnp.maximum(middle - around, 0), middle + around
+        start = along(origin, direction, near[..., None])
+        return cls._of(occupancy, start, direction, near, far, jnp.ones(start[0].shape, bool), bulge)
+
+    @classmethod
+    def _of(
+        cls,
+        occupancy: Occupancy,
+        start: Triple,
+        direction: Triple,
+        near: Scalar,
+        far: Scalar,
+        counts: Bool[Array, "*beams rays"],
+        bulge: Scalar,
+    ) -> "Box":
+        def least(values: Array, sign: int) -> Array:
+            return sign * jnp.min(jnp.where(counts, sign * values, jnp.inf), axis=-1)
+
+        sides = []
+        for s, d, size, corner in zip(start, direction, occupancy.size, occupancy.origin, strict=True):
+            # what float32 makes of the start of a ray whose camera is far away
+            slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
+            s, d = (s - corner) / size, d / size
+            sides.append(
+                (
+                    least(s, 1) - slack,
+                    least(s, -1) + slack,
+                    least(d, 1) - bulge / size,
+                    least(d, -1) + bulge / size,
+                )
+            )
+        low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
+        return cls(near, far, low, high, low_rate, high_rate)
+
+    def between(self, first: Scalar, last: Scalar) -> tuple[Triple, Triple]:
+        """The box of everything from `near + first` to `near + last`, both ≥ 0."""
+        low = tuple(
+            start + jnp.minimum(first * rate, last * rate)
+            for start, rate in zip(self.low, self.low_rate, strict=True)
+        )
+        high = tuple(
+            start + jnp.maximum(first * rate, last * rate)
+            for start, rate in zip(self.high, self.high_rate, strict=True)
+        )
+        return low, high
+
+
+class Stretches(eqx.Module):
+    """Which stretches of beams are empty.
+
+    - `near`: distance from the origins at which the first stretch begins; `length`: of each.
+    - `following`: for each stretch the first one, itself or behind it, that is not empty.
+    """
+
+    near: Float[Array, " beams"]
+    length: Scalar
+    following: Int[Array, "stretches beams"]
+
+
+def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
+    """Ask for each stretch of each beam, from the last one to the first, which one is the next occupied."""
+    across = jnp.maximum(box.far - box.near, 0)
+    # whole multiples of what is sampled at once, the same for all beams, so that none is cut in two
+    multiple = jnp.ceil(jnp.max(across) / (stretch * STRETCHES))
+    length = jnp.maximum(multiple, 1) * stretch
+    number = jnp.minimum(jnp.ceil(jnp.max(across) / length).astype(jnp.int32), STRETCHES)
+
+    def ask(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        at, next_one, table = state
+        at = at - 1
+        first = at.astype(length.dtype) * length
+        low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
+        shape, inside = occupancy.occupied.shape, first < across
+        for a, b, n in zip(low, high, shape, strict=True):
+            inside &= (b >= 0) & (a <= n)
+
+        def cells(corner: Triple) -> Index:
+            """The cells of a corner, in the grid; some cell for boxes that are not."""
+            x, y, z = (
+                jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
+                for c, n in zip(corner, shape, strict=True)
+            )
+            return x, y, z
+
+        occupied = inside & sums.any_between(cells(low), cells(high))
+        next_one = jnp.where(occupied, at, next_one)
+        return (
+            at,
+            next_one,
+            jax.lax.dynamic_update_slice_in_dim(table, next_one[None].astype(table.dtype), at, 0),
+        )
+
+    none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
+    table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int16)
+    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, ask, (number, none, table))
+    return Stretches(box.near, length, table)
