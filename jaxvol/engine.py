@@ -238,7 +238,7 @@ def _image(scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Know
         def pixel(part_y: Array, part_x: Array) -> Pixels:
             """Columns and rows of these places in each beam."""
             beam = (number * count + jnp.arange(count))[:, None]
-            return (beam % across) * BEAM + part_x, (beam // across) * BEAM + part_y
+            return (beam % across) * BEAM + part_x[None], (beam // across) * BEAM + part_y[None]
 
         def box(occupancy: Occupancy) -> Box:
             y, x = jnp.divmod(jnp.arange(4), 2)

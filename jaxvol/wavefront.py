@@ -126,11 +126,12 @@ def _each(f: Any) -> Any:
 
 def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
     """The next cells of each ray, on to where it is finished, or has moved off the places sampled here."""
-    ahead = jnp.arange(CELLS, dtype=at.index.dtype)[:, None]
+    ahead = jnp.arange(CELLS, dtype=at.index.dtype)
     live = _alive(march, at)
 
     def whole(at: Progress) -> tuple[Cell, ...]:
-        return _each(lambda ray, front: pieces(march, ray, volume, front))(ray, front(march, at, ahead))
+        one = lambda ray, at, k: pieces(march, ray, volume, front(march, at, k))
+        return jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))(ray, at, ahead)
 
     cut = whole(at)
     divided = len(cut) > 1
