@@ -10,22 +10,17 @@ that of ray casting. On the face, where ray casting's first sample lies at the e
 jitter can be nearer to the truth in the mean, or farther; it is noisier in any case.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
-from . import marches, record, timing
-
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from . import common, marches, record, timing
+from .common import plt
 
 
 METHODS = (marches.PLAIN, marches.JITTER, marches.EMPTY, marches.ALIGNED, marches.BOTH)
@@ -153,20 +148,13 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
         line[0].set_ylabel(scene, fontsize=9)
     figure.suptitle(f"{NOTE} {compared(result)}", fontsize=9)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    figure.savefig(path, dpi=90, metadata={"Software": None})
-    plt.close(figure)
+    common.save(figure, path)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=record.RESULTS, metavar="FOLDER")
+    parser = common.options(__doc__, repetitions=5)
     parser.add_argument("--size", type=int, default=192, help="pixels along a side")
     parser.add_argument("--resolution", type=int, default=128, help="voxels along an axis")
-    parser.add_argument("--repetitions", type=int, default=5)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that the script runs")
     given = record.arguments(argv)
     chosen = parser.parse_args(given)
     steps = STEPS

@@ -8,54 +8,30 @@ converged one. The goal is a ratio of at most 1.02 for both proposed methods.
 Real volumes are read from the folder that JAXVOL_DATA names; without one, the phantom is measured alone.
 """
 
-import argparse
-import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.metrics import rmse
 
-from . import marches, record, timing
+from . import common, marches, record
+from .common import plt
 from .scenes import PHANTOM, SCENES, Scene
-
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 
 METHODS = (marches.PLAIN, marches.JITTER, marches.EMPTY, marches.BOTH)
 GOAL = 1.02
-FINER = 8  # the converged image's step; in the middle of cells, its error is some hundred times as small
 
 
 def measure(scene: Scene, repetitions: int, seed: int, termination: float | None) -> dict[str, Any]:
     """Time and error of a scene's frame under every march."""
     ends = () if termination is None else (jv.EarlyTermination(termination),)
-
-    def frame(march: jv.March) -> jv.Rendering:
-        return jv.render(scene.volume, scene.transfer, scene.camera, march)
-
     under = {name: jv.March(scene.step, (*marches.transforms(name, seed), *ends)) for name in METHODS}
-    seconds = timing.interleaved({n: lambda m=m: frame(m) for n, m in under.items()}, repetitions)
-    truth = frame(marches.converged(scene.step, FINER)).rgba
-    rows = {}
+    rows = common.compare(scene, under, repetitions)
     for name, march in under.items():
-        rendering = frame(march)
-        assert not np.any(rendering.exhausted)
-        rows[name] = {
-            "seconds": round(float(np.median(seconds[name])), 5),
-            "ratio": timing.ratio(seconds[name], seconds[marches.PLAIN]),
-            "rmse": rmse(rendering.rgba, truth),
-            "samples": int(np.sum(rendering.samples)),
-            "aligned": float(np.mean(rendering.aligned)),
-            "all seconds": [round(s, 5) for s in seconds[name]],
-        }
+        rows[name]["aligned"] = float(np.mean(common.frame(scene, march).aligned))
     return rows
 
 
@@ -72,28 +48,19 @@ def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel(f"time of a frame / ray casting: median of paired ratios, 95 % interval; dotted: {GOAL}")
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    figure.savefig(path, dpi=90, metadata={"Software": None})
-    plt.close(figure)
+    common.save(figure, path)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=record.RESULTS, metavar="FOLDER")
+    parser = common.options(__doc__, repetitions=15)
     parser.add_argument("--size", type=int, default=256, help="pixels along a side; the paper's are 1024")
-    parser.add_argument("--repetitions", type=int, default=15)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--early-termination", type=float, metavar="LEFT", help="in all marches, as the paper"
     )
     parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="VOLUME")
-    parser.add_argument("--quick", action="store_true", help="tiny phantom, to see that the script runs")
     given = record.arguments(argv)
     chosen = parser.parse_args(given)
-    data = os.environ.get("JAXVOL_DATA")
-    folder = Path(data) if data else None
-    names, more = chosen.only, {}
+    folder, names, more = common.data(), chosen.only, {}
     if folder is None or chosen.quick:
         names = [PHANTOM]
     if chosen.quick:
@@ -110,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f" [{ratio['low']:.3f}, {ratio['high']:.3f}]  RMSE {row['rmse']:.5f}",
                 flush=True,
             )
-    mean = math.exp(np.mean([np.log(rows[marches.BOTH]["ratio"]["median"]) for rows in result.values()]))
+    mean = common.geometric_mean(rows[marches.BOTH]["ratio"]["median"] for rows in result.values())
     print(f"both proposed methods over ray casting, geometric mean: {mean:.3f}; the goal is {GOAL}")
     path = record.write(
         chosen.output / "overhead.json",
@@ -120,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             "repetitions": chosen.repetitions,
             "early termination": chosen.early_termination,
             "goal": GOAL,
-            "both, geometric mean": round(mean, 4),
+            "both, geometric mean": mean,
             "volumes": result,
         },
         seed=chosen.seed,

@@ -25,7 +25,11 @@ VESSELS = [
 
 
 def head(folder: Path | None, size: int, resolution: int = 192) -> Scene:
-    volume = jv.phantom("head", resolution)
+    return seen_head(jv.phantom("head", resolution), size)
+
+
+def seen_head(volume: jv.Volume, size: int) -> Scene:
+    """The head phantom, however it was made."""
     camera = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.45)
     return Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
 

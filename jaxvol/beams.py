@@ -56,9 +56,8 @@ class Box(eqx.Module):
             )
         )
         middle = jnp.sqrt(x * x + y * y + z * z)
-        around = jnp.sqrt(
-            sum((size * n) ** 2 for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True))
-        )
+        spans = (size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True))
+        around = jnp.sqrt(sum(span**2 for span in spans)) / 2
         # Directions between those of the corners are their averages, made unit vectors: longer by 1 minus the
         # cosine at most of the widest angle to the middle one.
         axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]

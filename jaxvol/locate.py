@@ -41,6 +41,11 @@ class Space(eqx.Module):
     def diagonal(self) -> Scalar:
         """Length that no ray through the grid exceeds."""
 
+    @property
+    @abstractmethod
+    def middle(self) -> Triple:
+        """The world point from which no point of the grid is farther than half of `diagonal`."""
+
     @abstractmethod
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
         """Distances at which the line enters and leaves the grid; the first exceeds the second on a miss."""
@@ -81,10 +86,10 @@ def enter(
     space: Space, origin: Triple, direction: Triple, pixel: tuple[Int[Array, ""], Int[Array, ""]]
 ) -> Ray:
     """The part of a ray inside the volume and not behind its origin, which may lie inside."""
-    near, far = space.interval(origin, direction)
     # Float32 rounds the distance of a far camera by more than the volume can stand. So the ray begins
-    # anew near the entry, where distances are short, and the interval is measured again from there.
-    base = jax.lax.stop_gradient(jnp.where(far > near, jnp.maximum(near, 0), 0))
+    # anew near the volume, from where distances are short.
+    toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
+    base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
     close = along(origin, direction, base)
     near, far = space.interval(close, direction)
     start = jnp.maximum(near, -base)
@@ -120,6 +125,11 @@ class Affine(Space):
     @property
     def diagonal(self) -> Scalar:
         return jnp.sqrt(sum((high - low) ** 2 for low, high in zip(self.low, self.high, strict=True)))
+
+    @property
+    def middle(self) -> Triple:
+        x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
+        return x, y, z
 
     def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
         return slab_interval(origin, direction, self.low, self.high)

@@ -61,8 +61,10 @@ class Sums(eqx.Module):
     @classmethod
     def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
-        for axis in range(3):
-            table = jnp.cumsum(table, axis)
+        for _ in range(3):
+            # sum along the first axis, and put it last; a scan, since on CPU XLA's own cumsum is a slow window
+            sums = jax.lax.scan(lambda total, layer: (total + layer,) * 2, jnp.zeros_like(table[0]), table)[1]
+            table = jnp.moveaxis(sums, 0, 2)
         return cls(table.reshape(-1), occupied.shape)
 
     def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:

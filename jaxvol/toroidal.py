@@ -148,6 +148,10 @@ class _Sector(Space):
         low, high = self.probe.corners
         return jnp.linalg.norm(high - low)
 
+    @property
+    def middle(self) -> Triple:
+        return apart(self.probe.center)
+
     def coordinate(self, point: Triple) -> Triple:
         ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
         beta, sigma, gamma = (

@@ -137,27 +137,28 @@ class TransferFunction(Transfer):
 
     def classifier(self) -> Classify:
         """Look-up of colour and extinction."""
-        rows, values = self.rows(), self.values
-        if values.shape[0] > FEW:
-            return lambda measured: interpolated(row_of(rows, points_below(values, *measured) - 1), *measured)
+        rows, values = self.rows(), jax.lax.stop_gradient(self.values)
+
+        def looked_up(measured: Measured) -> tuple[Triple, Scalar]:
+            value = jnp.clip(*measured, values[0], values[-1])
+            return interpolated(row_of(rows, points_below(values, value) - 1), value)
 
         def chosen(measured: Measured) -> tuple[Triple, Scalar]:
-            (value,) = measured
+            value = jnp.clip(*measured, values[0], values[-1])
             row = tuple(rows[0])
             for start, following in zip(values[1:-1], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
             return interpolated(row, value)
 
-        return chosen
+        return chosen if values.shape[0] <= FEW else looked_up
 
-    def rows(self) -> Float[Array, "intervals 10"]:
+    def rows(self) -> Float[Array, "intervals 9"]:
         """A table with one row for each interval between points: all that a sample there needs, so that it
-        finds them side by side. Start, inverse width, channels at the start, and how much they rise."""
-        values = jax.lax.stop_gradient(self.values)
+        finds them side by side. Start, channels at the start, and their slopes."""
+        values = jax.lax.stop_gradient(self.values)[:, None]
         channels = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
-        inverse = 1 / (values[1:] - values[:-1])
-        columns = [values[:-1, None], inverse[:, None], channels[:-1], channels[1:] - channels[:-1]]
-        return jnp.concatenate(columns, axis=1)
+        slopes = (channels[1:] - channels[:-1]) / (values[1:] - values[:-1])
+        return jnp.concatenate([values[:-1], channels[:-1], slopes], axis=1)
 
 
 def points_below(
@@ -171,7 +172,7 @@ def points_below(
     return jnp.searchsorted(values, value, side=side, method=search).astype(jnp.int32)
 
 
-def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, ""]) -> Row:
+def row_of(rows: Float[Array, "intervals 9"], interval: Int[Array, ""]) -> Row:
     """One row, by a look-up for each of its entries: batched, they are whole arrays from the start."""
     interval = jnp.clip(interval, 0, rows.shape[0] - 1)
     return tuple(
@@ -181,9 +182,9 @@ def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, ""]) -> Row:
 
 
 def interpolated(row: Row, value: Scalar) -> tuple[Triple, Scalar]:
-    """Colour and extinction of a value, from the row of its interval."""
-    f = jnp.clip((value - row[0]) * row[1], 0, 1)
-    return (row[2] + f * row[6], row[3] + f * row[7], row[4] + f * row[8]), row[5] + f * row[9]
+    """Colour and extinction of a value within the table's range, from the row of its interval."""
+    past = value - row[0]
+    return (row[1] + past * row[5], row[2] + past * row[6], row[3] + past * row[7]), row[4] + past * row[8]
 
 
 def seen_between(
@@ -193,12 +194,23 @@ def seen_between(
     high: Float[Array, "*blocks"],
 ) -> Bool[Array, "*blocks"]:
     """Whether the extinction is positive anywhere from `low` to `high`."""
-    last = values.shape[0] - 1
-    before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(extinction > 0, dtype=jnp.int32)])
-    # Between two points there is something to see wherever one of the two has extinction.
-    from_point = jnp.maximum(points_below(values, low) - 1, 0)
-    to_point = jnp.minimum(points_below(values, high, strictly=True), last)
-    return before[to_point + 1] > before[from_point]
+    positive, n = extinction > 0, values.shape[0]
+    if n > FEW:
+        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
+        # between two points there is something to see wherever one of the two has extinction
+        from_point = jnp.maximum(points_below(values, low) - 1, 0)
+        to_point = jnp.minimum(points_below(values, high, strictly=True), n - 1)
+        return before[to_point + 1] > before[from_point]
+    seen = jnp.zeros(low.shape, bool)
+    for point in range(n):
+        # a point's extinction is seen from the point before it to the one behind it
+        reached = jnp.full(low.shape, positive[point])
+        if point > 0:
+            reached &= high > values[point - 1]
+        if point < n - 1:
+            reached &= low < values[point + 1]
+        seen |= reached
+    return seen
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:

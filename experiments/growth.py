@@ -1,0 +1,145 @@
+"""How does the time of a frame grow: with pixels, with voxels, with samples a ray? Leaping on and off.
+
+The head phantom, 8 bit, from 128² to 2048² pixels, 64³ to 512³ voxels, and 64 to 4096 samples across the
+volume; what is not varied stays at 512², 256³ and 256. All frames of a sweep run in turn, and the slope of
+log time over log size is fitted to the upper three sizes, where what every frame costs no longer counts. No
+ray ends early. Beside each time, the image's RMSE against a converged one.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.metrics import rmse
+
+from . import common, record, timing
+from .common import plt
+from .scenes import Scene, seen_head
+
+
+OFF, ON = "no leaping", "leaping"
+METHODS: dict[str, tuple[jv.Transform, ...]] = {OFF: (), ON: (jv.SpaceLeaping(),)}
+USUAL = {"pixels": 512, "voxels": 256, "samples": 256}
+SWEEPS = {
+    "pixels": (128, 256, 512, 1024, 2048),
+    "voxels": (64, 128, 256, 512),
+    "samples": (64, 256, 1024, 4096),
+}
+LABELS = {
+    "pixels": "pixels along a side of the image",
+    "voxels": "voxels along a side of the volume",
+    "samples": "samples across the volume",
+}
+TINY = {"pixels": (16, 32, 64), "voxels": (16, 32, 48), "samples": (16, 32, 64)}
+SIDE = 2.0  # of the phantom's cube, world length
+
+
+def scenes(along: str, sizes: Sequence[int], usual: dict[str, int]) -> dict[int, Scene]:
+    """The scene at each size along one axis, the others as usual."""
+    made: dict[int, Scene] = {}
+    volume: jv.Volume | None = None
+    for size in sizes:
+        at = usual | {along: size}
+        if volume is None or along == "voxels":
+            volume = jv.phantom("head", at["voxels"])
+        made[size] = seen_head(volume, at["pixels"])._replace(step=SIDE / at["samples"])
+    return made
+
+
+def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions: int) -> dict[str, Any]:
+    """Times, errors and slopes along one axis."""
+    at = scenes(along, sizes, usual)
+    marches = {
+        (size, method): (scene, jv.March(scene.step, transforms))
+        for size, scene in at.items()
+        for method, transforms in METHODS.items()
+    }
+    programs = {str(key): lambda of=of: common.frame(*of) for key, of in marches.items()}
+    seconds = timing.interleaved(programs, repetitions)
+    finest = min(min(scene.step for scene in at.values()) / 2, SIDE / usual["samples"] / common.FINER)
+    # It leaps: over nothing that is seen, or the errors with and without leaping would differ.
+    converged = jv.March(finest, (jv.SpaceLeaping(), jv.AlphaCorrection()), "midpoint")
+    found: dict[str, Any] = {method: {} for method in METHODS}
+    for size, scene in at.items():
+        truth = common.frame(scene, converged).rgba
+        for method in METHODS:
+            rendering = common.frame(*marches[size, method])
+            assert not np.any(rendering.exhausted)
+            mine, base = (seconds[str((size, name))] for name in (method, OFF))
+            row = common.row(mine, base, rmse(rendering.rgba, truth))
+            found[method][str(size)] = row | {"samples a ray": float(np.mean(rendering.samples))}
+    for method, rows in found.items():
+        found[method] = {"slope": slope(sizes, rows), "sizes": rows}
+    return found
+
+
+def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
+    """By which power of a side the time grows, among the three largest."""
+    times = [rows[str(size)]["seconds"] for size in sizes]
+    return round(float(np.polyfit(np.log(sizes[-3:]), np.log(times[-3:]), 1)[0]), 3)
+
+
+def draw(sweeps: dict[str, Any], path: Path) -> None:
+    size = (3.7 * len(sweeps), 3.6)
+    figure, (axes,) = plt.subplots(
+        1, len(sweeps), figsize=size, sharey=True, squeeze=False, layout="constrained"
+    )
+    for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
+        for (method, found), style in zip(methods.items(), ("C7o-", "C0s-"), strict=True):
+            sizes = [int(size) for size in found["sizes"]]
+            times = np.array([row["seconds"] for row in found["sizes"].values()])
+            spread = np.array([np.quantile(row["all seconds"], (0, 1)) for row in found["sizes"].values()])
+            bars = np.abs(spread.T - times)
+            label = f"{method}: size^{found['slope']:.2f}"
+            panel.errorbar(sizes, times, bars, fmt=style, markersize=4, capsize=2, label=label)
+            upper = np.array(sizes[-3:], float)
+            middle = np.exp(np.mean(np.log(times[-3:])) - found["slope"] * np.mean(np.log(upper)))
+            panel.plot(upper, middle * upper ** found["slope"], "k:", linewidth=1)
+        panel.set_xscale("log", base=2)
+        panel.set_yscale("log")
+        panel.set_xticks(sizes, sizes)
+        panel.minorticks_off()
+        panel.set_xlabel(LABELS[along], fontsize=9)
+        panel.tick_params(labelsize=8)
+        panel.legend(fontsize=8)
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel("seconds a frame (median; least to most)", fontsize=9)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=5)
+    parser.add_argument("--only", nargs="+", choices=SWEEPS, default=list(SWEEPS), metavar="AXIS")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    sweeps, usual = SWEEPS, USUAL
+    if chosen.quick:
+        chosen.repetitions, sweeps, usual = 1, TINY, {"pixels": 32, "voxels": 32, "samples": 32}
+
+    found: dict[str, Any] = {}
+    for along in chosen.only:
+        found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
+        for method, told in found[along].items():
+            for size, row in told["sizes"].items():
+                print(
+                    f"{along:8} {size:>5}  {method:10} {row['seconds'] * 1e3:9.1f} ms"
+                    f"  {row['ratio']['median']:.3f} x no leaping  {row['samples a ray']:7.1f} samples a ray"
+                    f"  RMSE {row['rmse']:.5f}",
+                    flush=True,
+                )
+            print(f"{along:8} {method:10} grows as size^{told['slope']:.2f}", flush=True)
+    path = record.write(
+        chosen.output / "growth.json",
+        "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",
+        {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found},
+        seed=chosen.seed,
+        command=["experiments.growth", *given],
+    )
+    draw(found, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

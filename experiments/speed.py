@@ -1,0 +1,245 @@
+"""How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?
+
+Five scenes at steps of one voxel, two sizes. Ours leaps over empty space and ends rays early; "plain" does
+neither. VTK's fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All
+use as many threads as there are cores, and their frames are drawn in turn: a ratio is the median over rounds
+of a program's time over ours. Beside each time stands the RMSE of its image, over white, against one
+converged image of ours; VTK's is compared with that image as its display would show it.
+
+Also: which part of a frame goes into finding out where anything can be seen; the time from the start of a
+fresh process to its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient of
+every entry of a transfer function (256 of 8-bit data), over the image alone and over Dr.Jit's replay adjoint,
+with the relative difference of the two gradients.
+
+Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
+JAXVOL_DATA names; without one, the head phantom is measured alone.
+"""
+
+import os
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.metrics import rmse
+from jaxvol.occupancy import Blocks, Sums
+
+from . import common, fresh, marches, peer_vtk, record, timing
+from .common import plt
+from .scenes import PHANTOM, SCENES, Scene
+
+
+try:
+    from . import peer_drjit
+except ImportError as fault:
+    peer_drjit, NO_DRJIT = None, str(fault)
+
+OURS, PLAIN, VTK, VTK_RAYS, DRJIT = "jaxvol", "jaxvol, plain", "VTK", "VTK, its rays alone", "Dr.Jit"
+PEERS = (PLAIN, VTK, VTK_RAYS, DRJIT)
+GOAL = 3.0
+LEFT = 1 / 255
+SIZES = (512, 1024)
+RESOLUTION = 256  # of the head phantom
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def fast(scene: Scene) -> jv.March:
+    return jv.March(scene.step, (jv.SpaceLeaping(), jv.EarlyTermination(LEFT)))
+
+
+def peers() -> dict[str, str]:
+    """The version of each peer, or why it is left out."""
+    lacking = peer_vtk.missing()
+    return {
+        VTK: f"not here: {lacking}" if lacking else version("vtk"),
+        DRJIT: f"mitsuba {version('mitsuba')}, drjit {version('drjit')}"
+        if peer_drjit
+        else f"not here: {NO_DRJIT}",
+    }
+
+
+def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, dict[str, Any]]:
+    """Time and error of every program's frame, and the part of ours that is spent on the occupancy."""
+    truth = np.asarray(common.frame(scene, marches.converged(scene.step, common.FINER)).image())
+    under = {OURS: fast(scene), PLAIN: jv.March(scene.step)}
+    programs: dict[str, Any] = {n: lambda m=m: common.frame(scene, m) for n, m in under.items()}
+    errors = {n: rmse(common.frame(scene, m).image(), truth) for n, m in under.items()}
+    if there[VTK][0].isdigit():
+        drawn = peer_vtk.prepare(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
+        programs |= {VTK: drawn.draw, VTK_RAYS: drawn.cast}
+        errors[VTK] = errors[VTK_RAYS] = rmse(drawn.image(), peer_vtk.as_displayed(truth, drawn.mapper))
+    if peer_drjit:
+        marcher = drjit(scene)
+        programs[DRJIT] = marcher.draw
+        rgba = marcher.rgba()
+        errors[DRJIT] = rmse(rgba[..., :3] + 1 - rgba[..., 3:], truth)
+    programs["occupancy"] = occupancy(scene)
+    seconds = timing.interleaved(programs, repetitions)
+    rows = {name: common.row(seconds[name], seconds[OURS], error) for name, error in errors.items()}
+    rows[OURS]["occupancy"] = timing.ratio(seconds["occupancy"], seconds[OURS])
+    return rows
+
+
+def occupancy(scene: Scene) -> Any:
+    """The program that finds where anything can be seen: the first thing in every frame of ours."""
+
+    @eqx.filter_jit
+    def found(scene: Scene, march: jv.March, blocks: Blocks) -> Sums:
+        return march.locate(scene.volume).occupancy(scene.transfer.visible(blocks)).sums()
+
+    return lambda: found(scene, fast(scene), Blocks.of(scene.volume))
+
+
+def drjit(scene: Scene) -> Any:
+    scene = scene._replace(transfer=peer_vtk.dense(scene.transfer, scene.volume))
+    return peer_drjit.prepare(*scene, opacity_left=LEFT, threads=THREADS)
+
+
+def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
+    """Time of an image with the gradient of mean(rgba²) to all entries of the transfer function."""
+    scene = scene._replace(transfer=peer_vtk.dense(scene.transfer, scene.volume))
+    march = fast(scene)
+
+    def loss(transfer: jv.TransferFunction) -> jax.Array:
+        return jnp.mean(jv.render(scene.volume, transfer, scene.camera, march).rgba ** 2)
+
+    programs: dict[str, Any] = {
+        "image": lambda: common.frame(scene, march),
+        "image and gradient": lambda: jax.value_and_grad(loss)(scene.transfer),
+    }
+    gradient = jax.grad(loss)(scene.transfer)
+    ours = np.column_stack([gradient.colors, gradient.extinction])
+    found: dict[str, Any] = {"entries": len(ours), "pixels": scene.camera.size[0]}
+    if peer_drjit:
+        marcher = drjit(scene)
+        programs[DRJIT] = marcher.gradient
+        theirs = marcher.gradient()
+        found["difference"] = float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
+    seconds = timing.interleaved(programs, repetitions)
+    both = seconds["image and gradient"]
+    found["seconds"] = {name: round(float(np.median(times)), 5) for name, times in seconds.items()}
+    found["over image"] = timing.ratio(both, seconds["image"])
+    if peer_drjit:
+        found["Dr.Jit over ours"] = timing.ratio(seconds[DRJIT], both)
+    return found
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    """How many times our time a program takes, scene by scene."""
+    sizes, volumes = result["sizes"], result["volumes"]
+    size = (5.5 * len(sizes), 0.75 * len(volumes) + 1.5)
+    figure, (axes,) = plt.subplots(1, len(sizes), figsize=size, squeeze=False, layout="constrained")
+    for panel, pixels in zip(axes, sizes, strict=True):
+        for number, rows in enumerate(of_size[str(pixels)] for of_size in volumes.values()):
+            for shift, (name, color) in enumerate(zip(PEERS, ("C7", "C0", "C9", "C3"), strict=True)):
+                if name in rows:
+                    ratio, y = rows[name]["ratio"], number + 0.2 * (shift - 1.5)
+                    panel.plot((ratio["low"], ratio["high"]), (y, y), color=color, linewidth=2, alpha=0.5)
+                    panel.plot(ratio["median"], y, "o", color=color, markersize=5)
+            ours = rows[OURS]
+            panel.text(
+                0.01,
+                number - 0.36,
+                f"ours {ours['seconds'] * 1e3:.0f} ms, RMSE {ours['rmse']:.4f}",
+                transform=panel.get_yaxis_transform(),
+                fontsize=7,
+            )
+        panel.axvline(1, color="k", linewidth=0.8)
+        panel.axvline(GOAL, color="k", linewidth=0.8, linestyle=":")
+        panel.set_xscale("log")
+        panel.set_xticks((0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
+        panel.minorticks_off()
+        panel.set_yticks(range(len(volumes)), list(volumes), fontsize=8)
+        panel.set_ylim(len(volumes) - 0.5, -0.6)
+        panel.set_xlabel(f"time / ours, {pixels} x {pixels} pixels; dotted: {GOAL:.0f}", fontsize=9)
+    shown = [name for name in PEERS if any(name in r for v in volumes.values() for r in v.values())]
+    colors = dict(zip(PEERS, ("C7", "C0", "C9", "C3"), strict=True))
+    marks = [plt.Line2D([], [], color=colors[name], marker="o", linestyle="") for name in shown]
+    figure.legend(marks, shown, loc="outside upper center", ncols=4, fontsize=8)
+    common.save(figure, path)
+
+
+def means(volumes: dict[str, Any], sizes: Sequence[int]) -> dict[str, float]:
+    """Over all scenes and sizes, the geometric mean of each program's time over ours."""
+    rows = [of_size[str(size)] for of_size in volumes.values() for size in sizes]
+    there = [name for name in PEERS if all(name in row for row in rows)]
+    return {
+        name: common.geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in there
+    }
+
+
+def tell(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:
+    for program, row in rows.items():
+        ratio = row["ratio"]
+        print(
+            f"{name:16} {size:4}  {program:20} {row['seconds'] * 1e3:8.1f} ms  {ratio['median']:6.3f} x ours"
+            f" [{ratio['low']:.3f}, {ratio['high']:.3f}]  RMSE {row['rmse']:.5f}",
+            flush=True,
+        )
+    print(f"{name:16} {size:4}  occupancy: {rows[OURS]['occupancy']['median']:.1%} of our frame", flush=True)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=15)
+    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES, help="pixels along a side")
+    parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="VOLUME")
+    parser.add_argument("--gradients", action="store_true", help="at the first size")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    folder, names, resolution = common.data(), chosen.only, RESOLUTION
+    if folder is None or chosen.quick:
+        names = [PHANTOM]
+    if chosen.quick:
+        chosen.sizes, chosen.repetitions, resolution = (32, 48), 2, 32
+
+    there = peers()
+    print(there, flush=True)
+    volumes: dict[str, dict[str, Any]] = {}
+    slopes: dict[str, Any] = {}
+    for name in names:
+        more = {"resolution": resolution} if name == PHANTOM else {}
+        volumes[name] = {}
+        for size in chosen.sizes:
+            scene = SCENES[name](folder, size, **more)
+            rows = volumes[name][str(size)] = images(scene, there, chosen.repetitions)
+            tell(name, size, rows)
+            if chosen.gradients and size == chosen.sizes[0]:
+                slopes[name] = gradients(scene, chosen.repetitions)
+                print(f"{name:16} {size:4}  {slopes[name]}", flush=True)
+    result = {
+        "sizes": chosen.sizes,
+        "repetitions": chosen.repetitions,
+        "opacity left": LEFT,
+        "threads": THREADS,
+        "goal": GOAL,
+        "peers": there,
+        "geometric means": means(volumes, chosen.sizes),
+        "first image": fresh.measure(chosen.sizes[0], resolution, LEFT, 1 if chosen.quick else 5),
+        "volumes": volumes,
+        "gradients": slopes,
+    }
+    if slopes:
+        for key in {"over image", "Dr.Jit over ours"} & set(next(iter(slopes.values()))):
+            result["geometric means"][key] = common.geometric_mean(
+                found[key]["median"] for found in slopes.values()
+            )
+    print("first image:", result["first image"])
+    print(f"times over ours, geometric means: {result['geometric means']}; the goal is {GOAL}")
+    path = record.write(
+        chosen.output / "speed.json",
+        "How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?",
+        result,
+        seed=chosen.seed,
+        command=["experiments.speed", *given],
+    )
+    draw(result, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()
