@@ -53,7 +53,7 @@ def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[
         rendering = frame(scene, march)
         assert not np.any(rendering.exhausted)
         rows[name] = row(seconds[name], seconds[next(iter(under))], rmse(rendering.rgba, truth))
-        rows[name]["samples"] = int(np.sum(rendering.samples, dtype=np.int64))
+        rows[name]["samples"] = int(np.sum(np.asarray(rendering.samples), dtype=np.int64))
     return rows
 
 

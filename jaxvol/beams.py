@@ -4,8 +4,6 @@ A beam is a handful of rays that are asked about together. At each distance from
 box, whose faces move along straight lines.
 """
 
-from typing import cast
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,7 +34,7 @@ class Box(eqx.Module):
 
     @classmethod
     def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
-        """The box of rays whose last axis is that of a beam's rays; those that miss the volume do not count."""
+        """The box of rays whose last axis is that of a beam's rays. Those that miss the volume do not count."""
         rays = jax.lax.stop_gradient(rays)
         hit = rays.length > 0
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
@@ -47,23 +45,21 @@ class Box(eqx.Module):
 
     @classmethod
     def within(cls, occupancy: Occupancy, origin: Triple, direction: Triple) -> "Box":
-        """The box of all rays of a camera between those given, whose last axis is that of a cell's corners."""
+        """The box of all rays of a camera between those given, whose last axis is that of a beam's corners."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
-        x, y, z = (
-            low + size * n / 2 - jnp.mean(o, axis=-1)
-            for o, low, size, n in zip(
-                origin, occupancy.origin, occupancy.size, occupancy.occupied.shape, strict=True
-            )
-        )
+        spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
+        x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
-        spans = (size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True))
         around = jnp.sqrt(sum(span**2 for span in spans)) / 2
         # Directions between those of the corners are their averages, made unit vectors: longer by 1 minus the
         # cosine at most of the widest angle to the middle one.
         axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
         cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
         bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
-        near, far = jnp.maximum(middle - around, 0), middle + around
+        # of all rays: at parallel ones' origins, the grid is as far away as at the nearest and farthest corner
+        nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
+        spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
+        near, far = jnp.maximum(nearest - around - spread, 0), farthest + around + spread
         start = along(origin, direction, near[..., None])
         return cls._of(occupancy, start, direction, near, far, jnp.ones(start[0].shape, bool), bulge)
 
@@ -99,14 +95,8 @@ class Box(eqx.Module):
 
     def between(self, first: Scalar, last: Scalar) -> tuple[Triple, Triple]:
         """The box of everything from `near + first` to `near + last`, both ≥ 0."""
-        low = tuple(
-            start + jnp.minimum(first * rate, last * rate)
-            for start, rate in zip(self.low, self.low_rate, strict=True)
-        )
-        high = tuple(
-            start + jnp.maximum(first * rate, last * rate)
-            for start, rate in zip(self.high, self.high_rate, strict=True)
-        )
+        low = jax.tree.map(lambda s, r: s + jnp.minimum(first * r, last * r), self.low, self.low_rate)
+        high = jax.tree.map(lambda s, r: s + jnp.maximum(first * r, last * r), self.high, self.high_rate)
         return low, high
 
 
@@ -152,10 +142,10 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
         return (
             at,
             next_one,
-            jax.lax.dynamic_update_slice_in_dim(table, next_one[None].astype(table.dtype), at, 0),
+            jax.lax.dynamic_update_slice_in_dim(table, next_one[None], at, 0),
         )
 
     none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
-    table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int16)
+    table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int32)
     _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, ask, (number, none, table))
     return Stretches(box.near, length, table)

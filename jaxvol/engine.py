@@ -27,6 +27,7 @@ from .packed import with_words, words_of
 from .reference import Progress, begin, end, samples_across, step
 from .rendering import Rendering
 from .transfer import Transfer
+from .triple import apart
 from .volume import Volume
 from .wavefront import GROUP, Beams, march_beams
 
@@ -202,7 +203,8 @@ def _replayed(image: Callable[..., Rendering], scene: Any, how: _How, known: Kno
 
 def _compiled(function: Callable[..., Rendering]) -> Callable[..., Rendering]:
     """The function under jit, compiled with `OPTIONS` where it is a program of its own."""
-    inner, alone = eqx.filter_jit(function), eqx.filter_jit(function, compiler_options=OPTIONS)
+    options: Any = {"compiler_options": OPTIONS}
+    inner, alone = eqx.filter_jit(function), eqx.filter_jit(function, **options)
     # a program within another one, or within a transformation, cannot have options of its own
     return lambda *args: (inner if is_traced(args, jnp.zeros(())) else alone)(*args)
 
@@ -307,7 +309,7 @@ def _own_beams(
     beams = max(-(-length // (BEAM * BEAM)), 1)
     place = jnp.arange(beams * BEAM * BEAM).reshape(-1, GROUP)
     at = jnp.minimum(place, max(length - 1, 0))
-    origin, direction = (tuple(part[:, i][at] for i in range(3)) for part in (origins, directions))
+    origin, direction = (apart(jnp.moveaxis(part[at], -1, 0)) for part in (origins, directions))
     wanted = (place < length) & (first + place < count)
     rays = _enter(space, (origin, direction), (first + place, jnp.zeros_like(place)), wanted)
 

@@ -21,8 +21,8 @@ from .beams import Box, Stretches, stretches
 from .checks import integer
 from .locate import Ray
 from .march import Survey, Transform, View
-from .occupancy import FARTHEST, Index, Occupancy, Sums
-from .triple import Scalar, Triple, along
+from .occupancy import FARTHEST, Occupancy, Sums
+from .triple import Scalar, Triple
 
 
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
@@ -81,8 +81,8 @@ class SpaceLeaping(Transform):
             return distances
         if view is None:
             raise ValueError(
-                f'SpaceLeaping("{self.method}") needs the neighbouring pixels of a camera; for rays of your own '
-                'use "hierarchy" or "distance".'
+                f'SpaceLeaping("{self.method}") needs the neighbouring pixels of a camera; for rays of your '
+                'own use "hierarchy" or "distance".'
             )
         published = self.method == "min_distance"
         starts = self._published(distances, view) if published else self._proven(occupancy, view)
@@ -90,7 +90,8 @@ class SpaceLeaping(Transform):
 
     def _corners(self, view: View) -> tuple[Int[Array, "cols"], Int[Array, "rows"]]:
         width, height = view.size
-        return tuple(jnp.arange(-(-n // self.cell) + 1) * self.cell for n in (width, height))
+        columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in (width, height))
+        return columns, rows
 
     def _published(self, distances: Survey, view: View) -> Float[Array, "rows cols"]:
         """The nearest first hit of each cell's four corner rays."""
@@ -190,7 +191,8 @@ class _Distances(Survey):
         _, ny, nz = shape = self.occupancy.occupied.shape
         point = [s + depth * r for s, r in zip(start, rate, strict=True)]
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
-        flat = ((x * ny + y) * nz + z).astype(jnp.int32)
+        i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))
+        flat = (i * ny + j) * nz + k
         away = (
             self.distance.at[flat]
             .get(mode="promise_in_bounds", wrap_negative_indices=False)

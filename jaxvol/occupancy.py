@@ -43,7 +43,8 @@ class Blocks(eqx.Module):
     def of(cls, volume: Volume) -> "Blocks":
         """The blocks of a volume, from memory where its voxels and labels have been seen before."""
         labels = None if volume.labels is None else kept(volume.labels, _label_bits)
-        return cls(*kept(volume.data, _ranges), labels)
+        low, high = kept(volume.data, _ranges)
+        return cls(low, high, labels)
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
         """Which blocks may hold this label."""
@@ -62,10 +63,11 @@ class Sums(eqx.Module):
     def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
         for _ in range(3):
-            # sum along the first axis, and put it last; a scan, since on CPU XLA's own cumsum is a slow window
-            sums = jax.lax.scan(lambda total, layer: (total + layer,) * 2, jnp.zeros_like(table[0]), table)[1]
+            # Sum along the first axis, and put it last. XLA's own cumulative sums are slow windows on CPU.
+            _, sums = jax.lax.scan(_add, jnp.zeros_like(table[0]), table)
             table = jnp.moveaxis(sums, 0, 2)
-        return cls(table.reshape(-1), occupied.shape)
+        nx, ny, nz = occupied.shape
+        return cls(table.reshape(-1), (nx, ny, nz))
 
     def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:
         """Whether any cell from `first` to `last`, both included and inside the grid, is occupied."""
@@ -116,17 +118,21 @@ class Occupancy(eqx.Module):
 
         def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             reached, distance, rounds = state
-            return spread(reached), distance + ~reached, rounds + 1
+            return spread(reached), distance + (~reached).astype(distance.dtype), rounds + 1
 
         anything = jnp.any(self.occupied)
-        start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), 0
+        start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
         _, distance, _ = jax.lax.while_loop(go_on, grow, start)
-        return jnp.where(anything, distance, FARTHEST).reshape(-1)
+        return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Triple) -> Triple:
         """Where a world point lies, counted in cells."""
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
+
+
+def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:
+    return total + layer, total + layer
 
 
 @jax.jit

@@ -5,7 +5,6 @@ and its neighbours along z, and for 8-bit voxels along y too, saves three fetche
 one. It takes four, or two, times the memory of the voxels, and is made once for an array of them.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Shaped, UInt32

@@ -16,8 +16,8 @@ from .volume import Volume
 
 
 FEW = 16
-"""Up to so many control points, a sample's interval is chosen by comparing with each of them, which costs less
-than looking its entries up."""
+"""Up to so many control points, a sample's interval is chosen by comparing with each of them, which costs
+less than looking its entries up."""
 
 Row: TypeAlias = tuple[Scalar, ...]
 """What a sample in one interval between control points needs: see `TransferFunction.rows`."""
@@ -140,11 +140,13 @@ class TransferFunction(Transfer):
         rows, values = self.rows(), jax.lax.stop_gradient(self.values)
 
         def looked_up(measured: Measured) -> tuple[Triple, Scalar]:
-            value = jnp.clip(*measured, values[0], values[-1])
+            (value,) = measured
+            value = jnp.clip(value, values[0], values[-1])
             return interpolated(row_of(rows, points_below(values, value) - 1), value)
 
         def chosen(measured: Measured) -> tuple[Triple, Scalar]:
-            value = jnp.clip(*measured, values[0], values[-1])
+            (value,) = measured
+            value = jnp.clip(value, values[0], values[-1])
             row = tuple(rows[0])
             for start, following in zip(values[1:-1], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))

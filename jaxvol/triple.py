@@ -15,7 +15,7 @@ Scalar: TypeAlias = Float[Array, ""]
 Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]
 
 
-def apart(vector: Float[Array, "3"]) -> Triple:
+def apart(vector: Float[Array, "3 *batch"]) -> Triple:
     """The components of a stacked vector."""
     return vector[0], vector[1], vector[2]
 

@@ -1,13 +1,13 @@
-"""Which samples are taken together? Those of many rays, several cells at a time, of rays that are still alive.
+"""Which samples are taken together? Several cells of each of many rays that are still alive.
 
 What makes this fast was measured (on CPU, by XLA's rules), and is what this file is about:
 
-- A *segment* is CELLS cells of a ray. All samples of a segment are taken before any is blended, since only
-  then XLA fetches each voxel once: it repeats a fetch for every use that it makes of it, unless a branch
-  stands between, behind which values lie in memory. So the samples are taken in a `lax.cond`.
-- Rays come in *beams* of neighbours. Some of them are marched at a time, a *batch* that fits into the cache,
-  segment after segment, until a quarter of its beams is finished; then batches are made up anew from the beams
-  that are left. Lanes that idle cost as much as those that work.
+- A *segment* is CELLS cells of a ray. All its samples are taken before any is blended, since only then XLA
+  fetches each voxel once: it repeats a fetch for every use that it makes of it, unless a branch stands
+  between, behind which values lie in memory. So measuring is one `lax.cond`, and the opacities another.
+- Rays come in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is marched
+  segment after segment until a quarter of its groups is finished; then batches are made up anew from the
+  groups that are left. Lanes that idle cost as much as those that work.
 - Where empty space is known (`Survey`), rays leap over it between two segments, each as far as it can.
 
 None of it shows in the result: cells, transforms and the blending are those of `reference`.
@@ -15,12 +15,12 @@ None of it shows in the result: cells, transforms and the blending are those of 
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .beams import Box
 from .locate import Ray
@@ -28,7 +28,7 @@ from .march import Cell, March, Survey
 from .occupancy import Occupancy
 from .reference import Progress, begin, blend, front, leave, measure, move, opacity, pieces
 from .transfer import Classification, Measured
-from .triple import Scalar, Triple
+from .triple import Scalar
 from .volume import Volume
 
 
@@ -45,7 +45,7 @@ KEPT = 0.75
 """The share of a batch's groups that must be alive for it to go on."""
 
 
-class Beams(NamedTuple):
+class Beams(eqx.Module):
     """Rays that are marched together, in groups of which some make up a beam.
 
     - `rays`: of shape (groups, GROUP).
@@ -54,14 +54,14 @@ class Beams(NamedTuple):
     """
 
     rays: Ray
-    count: int
-    box: Callable[[Occupancy], Box]
+    count: int = eqx.field(static=True)
+    box: Callable[[Occupancy], Box] = eqx.field(static=True)
 
 
 def march_beams(
     march: March, volume: Volume, seen: Classification, survey: Survey | None, beams: Beams
-) -> tuple[Ray, Progress]:
-    """All rays, and where their marches ended. Of shape (groups, GROUP)."""
+) -> Progress:
+    """Where the marches of all rays end, of shape (groups, GROUP)."""
     rays, groups = beams.rays, beams.rays.length.shape[0]
     size = min(BATCH, groups)
     at = jax.vmap(jax.vmap(begin, in_axes=(None, 0)), in_axes=(None, 0))(march, rays)
@@ -77,7 +77,10 @@ def march_beams(
         """March the groups in these rows for a while; a row past the last one stands for none."""
         known = jnp.minimum(rows, groups - 1)
         beam = known // (groups // beams.count)
-        take = lambda leaf: leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+        def take(leaf: Array) -> Array:
+            return leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
         here, some = jax.tree.map(take, (at, rays))
         here = replace(here, finished=here.finished | (rows >= groups)[:, None])
 
@@ -87,8 +90,8 @@ def march_beams(
         def go(here: Progress) -> Progress:
             if survey is not None:
                 here = _leap(march, survey, notes, beam, some, here)
-            flat = lambda tree: jax.tree.map(lambda leaf: leaf.reshape(-1), tree)
-            after = _segment(march, volume, seen, flat(some), flat(here))
+            flat = jax.tree.map(lambda leaf: leaf.reshape(-1), (some, here))
+            after = _segment(march, volume, seen, *flat)
             return jax.tree.map(lambda leaf: leaf.reshape(size, GROUP), after)
 
         here = jax.lax.while_loop(go_on, go, here)
@@ -130,7 +133,9 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
     live = _alive(march, at)
 
     def whole(at: Progress) -> tuple[Cell, ...]:
-        one = lambda ray, at, k: pieces(march, ray, volume, front(march, at, k))
+        def one(ray: Ray, at: Progress, k: Scalar) -> tuple[Cell, ...]:
+            return pieces(march, ray, volume, front(march, at, k))
+
         return jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))(ray, at, ahead)
 
     cut = whole(at)

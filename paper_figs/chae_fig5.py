@@ -1,0 +1,68 @@
+"""Chae and Shin, Fig. 5: time against the grid's cells. `experiments/minimum_distance.py` measures it; here it
+is drawn, with the one number that the paper's text tells: at R = 8, 53 % less than the distance map alone."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import record
+from experiments.minimum_distance import HIERARCHY, MAP, PROVEN, PUBLISHED, named
+
+from .common import OUTPUT, plt
+
+
+PAPER = 8, 0.47  # R, time over that of the distance map
+
+
+def draw(measured: dict[str, Any], path: Path) -> None:
+    """A panel for each scene; above the published method's points, their wrong pixels."""
+    scenes, cells = measured["result"]["scenes"], measured["result"]["cells"]
+    size = (4.2 * len(scenes) + 0.4, 3.4)
+    figure, (axes,) = plt.subplots(1, len(scenes), figsize=size, squeeze=False, layout="constrained")
+    for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
+        for method, style in ((PUBLISHED, "C3o-"), (PROVEN, "C0s-")):
+            ratios = [rows[named(method, cell)]["ratio"] for cell in cells]
+            low, high = ([r[end] for r in ratios] for end in ("low", "high"))
+            panel.plot(cells, [r["median"] for r in ratios], style, markersize=5, label=method)
+            panel.fill_between(cells, low, high, color=style[:2], alpha=0.2, linewidth=0)
+        for cell in cells:
+            row = rows[named(PUBLISHED, cell)]
+            panel.annotate(
+                f"{row['wrong']:.2%}",
+                (cell, row["ratio"]["median"]),
+                (0, 7),
+                textcoords="offset points",
+                ha="center",
+                fontsize=7,
+                color="C3",
+            )
+        panel.axhline(1, color="k", linestyle="--", label=MAP)
+        panel.axhline(rows[HIERARCHY]["ratio"]["median"], color="C2", linestyle="-.", label=HIERARCHY)
+        panel.plot(*PAPER, "kx", markersize=8, label="the paper")
+        panel.set_xscale("log", base=2)
+        panel.set_xticks(cells, cells)
+        panel.set_ylim(bottom=0)
+        panel.set_xlabel("R, pixels", fontsize=9)
+        panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map", fontsize=9)
+        panel.tick_params(labelsize=8)
+    axes[0].set_ylabel("time / distance map; in red, wrong pixels", fontsize=9)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90, metadata={"Software": None})
+    plt.close(figure)
+    print(path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
+    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
+    chosen = parser.parse_args(argv)
+    draw(record.read(chosen.results / "minimum_distance.json"), chosen.output / "chae_fig5.png")
+
+
+if __name__ == "__main__":
+    main()
