@@ -47,7 +47,7 @@ print(json.dumps(dict(zip(("import", "scene", "image"), times))))
 
 
 def measure(size: int, resolution: int, left: float, repetitions: int) -> dict[str, Any]:
-    """Seconds from the start of a process until jaxvol is imported, the scene stands, and the image is there."""
+    """Seconds from the start of a process until jaxvol is imported, the scene stands, the image is there."""
     volume = jv.phantom("head", resolution)
     scene = seen_head(volume, size)
     truth = common.frame(scene, marches.converged(scene.step, common.FINER)).rgba

@@ -7,9 +7,9 @@ of a program's time over ours. Beside each time stands the RMSE of its image, ov
 converged image of ours; VTK's is compared with that image as its display would show it.
 
 Also: which part of a frame goes into finding out where anything can be seen; the time from the start of a
-fresh process to its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient of
-every entry of a transfer function (256 of 8-bit data), over the image alone and over Dr.Jit's replay adjoint,
-with the relative difference of the two gradients.
+fresh process to its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient
+of every entry of a transfer function (256 of 8-bit data), over the image alone and against Dr.Jit's replay
+adjoint, with the relative difference of the two gradients.
 
 Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
 JAXVOL_DATA names; without one, the head phantom is measured alone.
@@ -133,7 +133,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
 def draw(result: dict[str, Any], path: Path) -> None:
     """How many times our time a program takes, scene by scene."""
     sizes, volumes = result["sizes"], result["volumes"]
-    size = (5.5 * len(sizes), 0.75 * len(volumes) + 1.5)
+    size = (6 * len(sizes), 0.75 * len(volumes) + 1.5)
     figure, (axes,) = plt.subplots(1, len(sizes), figsize=size, squeeze=False, layout="constrained")
     for panel, pixels in zip(axes, sizes, strict=True):
         for number, rows in enumerate(of_size[str(pixels)] for of_size in volumes.values()):
@@ -142,20 +142,14 @@ def draw(result: dict[str, Any], path: Path) -> None:
                     ratio, y = rows[name]["ratio"], number + 0.2 * (shift - 1.5)
                     panel.plot((ratio["low"], ratio["high"]), (y, y), color=color, linewidth=2, alpha=0.5)
                     panel.plot(ratio["median"], y, "o", color=color, markersize=5)
-            ours = rows[OURS]
-            panel.text(
-                0.01,
-                number - 0.36,
-                f"ours {ours['seconds'] * 1e3:.0f} ms, RMSE {ours['rmse']:.4f}",
-                transform=panel.get_yaxis_transform(),
-                fontsize=7,
-            )
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(GOAL, color="k", linewidth=0.8, linestyle=":")
         panel.set_xscale("log")
         panel.set_xticks((0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
         panel.minorticks_off()
-        panel.set_yticks(range(len(volumes)), list(volumes), fontsize=8)
+        ours = [(name, of_size[str(pixels)][OURS]) for name, of_size in volumes.items()]
+        told = [f"{name}\n{row['seconds'] * 1e3:.0f} ms, RMSE {row['rmse']:.4f}" for name, row in ours]
+        panel.set_yticks(range(len(volumes)), told, fontsize=8)
         panel.set_ylim(len(volumes) - 0.5, -0.6)
         panel.set_xlabel(f"time / ours, {pixels} x {pixels} pixels; dotted: {GOAL:.0f}", fontsize=9)
     shown = [name for name in PEERS if any(name in r for v in volumes.values() for r in v.values())]
@@ -169,9 +163,7 @@ def means(volumes: dict[str, Any], sizes: Sequence[int]) -> dict[str, float]:
     """Over all scenes and sizes, the geometric mean of each program's time over ours."""
     rows = [of_size[str(size)] for of_size in volumes.values() for size in sizes]
     there = [name for name in PEERS if all(name in row for row in rows)]
-    return {
-        name: common.geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in there
-    }
+    return {name: common.geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in there}
 
 
 def tell(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:

@@ -25,8 +25,8 @@ class Box(eqx.Module):
     """The box in which the rays of a beam are, at each distance from their origins: counted in cells of the
     occupancy, from `low + u low_rate` to `high + u high_rate` at the distance `near + u`."""
 
-    near: Float[Array, " beams"]
-    far: Float[Array, " beams"]
+    near: Float[Array, "*beams"]
+    far: Float[Array, "*beams"]
     low: Triple
     high: Triple
     low_rate: Triple

@@ -27,7 +27,6 @@ from .packed import with_words, words_of
 from .reference import Progress, begin, end, samples_across, step
 from .rendering import Rendering
 from .transfer import Transfer
-from .triple import apart
 from .volume import Volume
 from .wavefront import GROUP, Beams, march_beams
 
@@ -45,6 +44,9 @@ BEAM = 2 * SIDE
 
 WAVE = 4096
 """Beams in a wave: 262 144 rays. A wave's memory is all that is held beside the finished pixels."""
+
+PLAIN_WAVE = 64
+"""Beams in a wave that is marched cell by cell, to be differentiated."""
 
 OPTIONS = {
     # 16 lanes at once where the processor has them: XLA prefers 8
@@ -159,6 +161,11 @@ class _How(eqx.Module):
         """Whether one cell is marched after the other, by a loop that reverse mode goes through."""
         return self.backward or self.adjoint == "direct"
 
+    @property
+    def most_beams(self) -> int:
+        """Beams in a wave. Where states are kept for a backward pass, fewer."""
+        return PLAIN_WAVE if self.plain else WAVE
+
     def in_turn(self, wave: Callable[[Any], Rendering], numbered: Any) -> Rendering:
         """Every wave's rendering, one after the other."""
         # a replay starts again from what a wave was given, so no wave keeps a state for the backward pass
@@ -195,8 +202,13 @@ def _replayed(image: Callable[..., Rendering], scene: Any, how: _How, known: Kno
     def _(residuals: None, gradient: Any, perturbed: Any, scene: Any, known: Known) -> Any:
         moving, still = eqx.partition(scene, perturbed)
         again = replace(how, backward=True)
-        _, pull = eqx.filter_vjp(lambda moving: image(eqx.combine(moving, still), again, known), moving)
-        return pull(gradient)[0]
+        out, pull = eqx.filter_vjp(lambda moving: image(eqx.combine(moving, still), again, known), moving)
+        whole = jax.tree.map(
+            lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
+            *(out, gradient),
+            is_leaf=lambda leaf: leaf is None,
+        )
+        return pull(whole)[0]
 
     return once(scene, jax.lax.stop_gradient(known))
 
@@ -219,7 +231,7 @@ def _image(scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Know
     volume = with_words(volume, known.words)
     width, height = camera.size
     across, down = -(-width // BEAM), -(-height // BEAM)
-    count = min(WAVE, across * down)
+    count = min(how.most_beams, across * down)
     waves = -(-across * down // count)
     space = march.locate(volume)
 
@@ -273,7 +285,7 @@ def _own_rays(scene: tuple[Volume, Transfer, Array, Array, March], how: _How, kn
     volume = with_words(volume, known.words)
     shape = origins.shape[:-1]
     count = math.prod(shape)
-    in_wave = min(WAVE * BEAM * BEAM, max(count, 1))
+    in_wave = min(how.most_beams * BEAM * BEAM, max(count, 1))
     waves = -(-count // in_wave)
     space = march.locate(volume)
     survey = _survey(space, transfer, march, known, how, None)
@@ -309,7 +321,7 @@ def _own_beams(
     beams = max(-(-length // (BEAM * BEAM)), 1)
     place = jnp.arange(beams * BEAM * BEAM).reshape(-1, GROUP)
     at = jnp.minimum(place, max(length - 1, 0))
-    origin, direction = (apart(jnp.moveaxis(part[at], -1, 0)) for part in (origins, directions))
+    origin, direction = ((part[at, 0], part[at, 1], part[at, 2]) for part in (origins, directions))
     wanted = (place < length) & (first + place < count)
     rays = _enter(space, (origin, direction), (first + place, jnp.zeros_like(place)), wanted)
 
@@ -337,7 +349,7 @@ def _enter(
 ) -> Ray:
     """Rays cut to the volume. Those that are not wanted fill up groups, and miss it."""
     ray = _each_ray(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(*rays, pixel)
-    return replace(ray, length=jnp.where(wanted, ray.length, 0))
+    return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))
 
 
 def _march(

@@ -165,7 +165,7 @@ class _Sector(Space):
         no angle changes faster along a path than by the path's length over the distance to its axis."""
         low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
         x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
-        middle = jnp.arange(CUBES) + 0.5
+        middle = jnp.arange(CUBES, dtype=x.dtype) + 0.5
         point = jnp.meshgrid(*(a + middle * step for a, step in zip(low, size, strict=True)), indexing="ij")
         radius = jnp.sqrt(x * x + y * y + z * z) / 2 + 16 * float(jnp.finfo(x.dtype).eps) * self._size
         rho = _hypot(point[1], point[2])

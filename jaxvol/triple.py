@@ -11,11 +11,13 @@ from typing import TypeAlias
 from jaxtyping import Array, Float
 
 
-Scalar: TypeAlias = Float[Array, ""]
+Scalar: TypeAlias = Float[Array, "..."]
+"""A number: one ray's, or each one's of a batch, for all that is done to it is done to each apart."""
+
 Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]
 
 
-def apart(vector: Float[Array, "3 *batch"]) -> Triple:
+def apart(vector: Float[Array, "3"]) -> Triple:
     """The components of a stacked vector."""
     return vector[0], vector[1], vector[2]
 

@@ -14,7 +14,6 @@ None of it shows in the result: cells, transforms and the blending are those of 
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -71,9 +70,9 @@ def march_beams(
         notes = survey.notes(beams.box, CELLS * march.step)
         hopeful = jnp.broadcast_to(survey.seen(notes), (beams.count,))
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
-    at = replace(at, finished=finished)
+    at = _with(at, finished=finished)
 
-    def run(rows: Int[Array, " batch"], at: Progress, keep: Scalar) -> Progress:
+    def run(rows: Int[Array, " batch"], at: Progress, keep: Int[Array, ""]) -> Progress:
         """March the groups in these rows for a while; a row past the last one stands for none."""
         known = jnp.minimum(rows, groups - 1)
         beam = known // (groups // beams.count)
@@ -82,7 +81,7 @@ def march_beams(
             return leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
         here, some = jax.tree.map(take, (at, rays))
-        here = replace(here, finished=here.finished | (rows >= groups)[:, None])
+        here = _with(here, finished=here.finished | (rows >= groups)[:, None])
 
         def go_on(here: Progress) -> Bool[Array, ""]:
             return jnp.sum(jnp.any(_alive(march, here), axis=-1)) > keep
@@ -90,9 +89,9 @@ def march_beams(
         def go(here: Progress) -> Progress:
             if survey is not None:
                 here = _leap(march, survey, notes, beam, some, here)
-            flat = jax.tree.map(lambda leaf: leaf.reshape(-1), (some, here))
+            flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (some, here))
             after = _segment(march, volume, seen, *flat)
-            return jax.tree.map(lambda leaf: leaf.reshape(size, GROUP), after)
+            return jax.tree.map(lambda leaf: leaf.reshape(size, GROUP, *leaf.shape[1:]), after)
 
         here = jax.lax.while_loop(go_on, go, here)
         return jax.tree.map(lambda all_, part: all_.at[rows].set(part, mode="drop"), at, here)
@@ -118,6 +117,11 @@ def march_beams(
     return at
 
 
+def _with(at: Progress, **changes: Array) -> Progress:
+    """Other values for some fields of many rays at once."""
+    return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
+
+
 def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
     return ~at.finished & (at.index < march.most_samples)
 
@@ -133,7 +137,7 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
     live = _alive(march, at)
 
     def whole(at: Progress) -> tuple[Cell, ...]:
-        def one(ray: Ray, at: Progress, k: Scalar) -> tuple[Cell, ...]:
+        def one(ray: Ray, at: Progress, k: Int[Array, ""]) -> tuple[Cell, ...]:
             return pieces(march, ray, volume, front(march, at, k))
 
         return jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))(ray, at, ahead)
@@ -161,13 +165,25 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
 
     def together(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
         """All cells at once, where nothing moves a ray off them."""
-        samples = tuple(zip(cells(at, given), values, alphas, strict=True))
-        after = at
-        for k in range(CELLS):
-            after = blended(after, jax.tree.map(lambda leaf, k=k: leaf[k], samples))
-        last = tuple(jax.tree.map(lambda leaf: leaf[-1], piece) for piece, _, _ in samples)
+
+        def through(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
+            samples = tuple(zip(cells(at, given), values, alphas, strict=True))
+            for k in range(CELLS):
+                at = blended(at, jax.tree.map(lambda leaf, k=k: leaf[k], samples))
+            return at
+
+        after, aligned = through(at, given, values, alphas), at.aligned
+        if march.cuts:  # few segments reach an exit: the others do not ask which of their cells was cut there
+            any_cut = jnp.any(jnp.stack([piece.cut for piece in cells(at, given)]))
+            aligned = jax.lax.cond(
+                any_cut,
+                lambda *arguments: through(*arguments).aligned,
+                lambda at, *_: at.aligned,
+                *(at, given, values, alphas),
+            )
+        last = tuple(jax.tree.map(lambda leaf: leaf[-1], piece) for piece in cells(at, given))
         after = jax.vmap(lambda ray, at, last: leave(march, ray, at, last))(ray, after, last)
-        return replace(after, index=at.index + CELLS)
+        return _with(after, index=at.index + CELLS, aligned=aligned)
 
     def singly(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
         """Cell by cell, as long as the ray is where its samples were taken."""
@@ -216,4 +232,4 @@ def _leap(
     each = jax.vmap(jax.vmap(lambda ray, at, cells: move(march, ray, at, jnp.ones((), bool), cells)))
     gone = each(rays, at, cells)
     at = jax.tree.map(lambda a, b: jnp.where(leaps, a, b), gone, at)
-    return replace(at, finished=at.finished | (_alive(march, at) & (front(march, at) >= rays.length)))
+    return _with(at, finished=at.finished | (_alive(march, at) & (front(march, at) >= rays.length)))

@@ -1,5 +1,5 @@
-"""Chae and Shin, Fig. 5: time against the grid's cells. `experiments/minimum_distance.py` measures it; here it
-is drawn, with the one number that the paper's text tells: at R = 8, 53 % less than the distance map alone."""
+"""Chae and Shin, Fig. 5: time against the grid's cells. `experiments/minimum_distance.py` measures it; here
+it is drawn, with the number in the paper's text: at R = 8, 53 % less than the distance map alone."""
 
 import argparse
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ PAPER = 8, 0.47  # R, time over that of the distance map
 def draw(measured: dict[str, Any], path: Path) -> None:
     """A panel for each scene; above the published method's points, their wrong pixels."""
     scenes, cells = measured["result"]["scenes"], measured["result"]["cells"]
-    size = (4.2 * len(scenes) + 0.4, 3.4)
+    size = (4.2 * len(scenes) + 0.4, 3.6)
     figure, (axes,) = plt.subplots(1, len(scenes), figsize=size, squeeze=False, layout="constrained")
     for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for method, style in ((PUBLISHED, "C3o-"), (PROVEN, "C0s-")):
@@ -47,7 +47,7 @@ def draw(measured: dict[str, Any], path: Path) -> None:
         panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map", fontsize=9)
         panel.tick_params(labelsize=8)
     axes[0].set_ylabel("time / distance map; in red, wrong pixels", fontsize=9)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90, metadata={"Software": None})
     plt.close(figure)

@@ -74,13 +74,15 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
     return jv.Volume(part, volume.spacing, origin)
 
 
-def options(argv: Sequence[str] | None, about: str) -> argparse.Namespace:
+def options(argv: Sequence[str] | None, about: str, resolution: int = 160) -> argparse.Namespace:
     """What every figure's script can be told."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="real volumes, in place of phantoms")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER", help="default: %(default)s")
     parser.add_argument("--size", type=int, default=184, help="pixels along a side of each image")
-    parser.add_argument("--resolution", type=int, default=160, help="voxels along an axis of a phantom")
+    parser.add_argument(
+        "--resolution", type=int, default=resolution, help="voxels along an axis of a phantom"
+    )
     parser.add_argument("--quick", action="store_true", help="tiny, to see that the script runs")
     chosen = parser.parse_args(argv)
     if chosen.quick:

@@ -7,22 +7,27 @@ from pathlib import Path
 import pytest
 from skimage.io import imread
 
-from experiments import jitter_accuracy, overhead, record
+from experiments import growth, jitter_accuracy, kisti, minimum_distance, overhead, record, speed
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.scenes import PHANTOM
-from paper_figs import common, table1
+from paper_figs import chae_fig5, common, kisti_table, table1
 
 
 ROOT = Path(__file__).parent.parent
-FIGURES = sorted(path.stem for path in (ROOT / "paper_figs").glob("fig*.py"))
+FIGURES = sorted(path.stem for path in (ROOT / "paper_figs").glob("*fig*.py") if path.stem != "chae_fig5")
+"""Figures that are drawn without recorded results."""
+MEASURES = {
+    module.__name__.rpartition(".")[2]: module
+    for module in (growth, jitter_accuracy, kisti, minimum_distance, overhead, speed)
+}
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A folder into which both experiments have written."""
+    """A folder into which all experiments have written."""
     folder = tmp_path_factory.mktemp("results")
-    for experiment in (jitter_accuracy, overhead):
+    for experiment in MEASURES.values():
         experiment.main(["--quick", "--output", str(folder)])
     return folder
 
@@ -40,14 +45,14 @@ def test_figure_is_drawn(name, tmp_path):
 
 def test_every_figure_that_is_told_of_is_there():
     told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
-    assert FIGURES == ["fig01", "fig09", "fig10", "fig11", "fig12", "fig13"]
+    assert FIGURES == ["chae_fig6", "fig01", "fig09", "fig10", "fig11", "fig12", "fig13"]
     for name in FIGURES:
         assert f"output/{name}.png" in told
         assert (common.OUTPUT / f"{name}.png").stat().st_size < 300_000
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["jitter_accuracy", "overhead"])
+@pytest.mark.parametrize("name", MEASURES)
 def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(measured, name):
     found = record.read(measured / f"{name}.json")
     assert found["command"].startswith(f"python -m experiments.{name} --quick")
@@ -78,6 +83,47 @@ def test_overhead_is_a_ratio_of_pairs_with_an_error_beside_each_time(measured):
     for row in rows.values():
         assert row["rmse"] > 0
         assert row["ratio"]["low"] <= row["ratio"]["median"] <= row["ratio"]["high"]
+
+
+@pytest.mark.slow
+def test_only_the_published_starts_can_spoil_a_pixel(measured):
+    scenes = record.read(measured / "minimum_distance.json")["result"]["scenes"]
+    for rows in scenes.values():
+        for method, row in rows.items():
+            assert row["rmse"] > 0
+            assert row["wrong"] == 0 or method.startswith(minimum_distance.PUBLISHED)
+
+
+@pytest.mark.slow
+def test_skipping_leaves_the_error_of_an_image_as_it_is(measured):
+    scenes = record.read(measured / "kisti.json")["result"]["scenes"]
+    assert list(scenes) == list(kisti.REPORT)
+    for rows in (rows for of_size in scenes.values() for rows in of_size.values()):
+        assert rows[kisti.ESS]["rmse"] == pytest.approx(rows[kisti.NEITHER]["rmse"], rel=1e-3)
+        assert rows[kisti.BOTH]["rmse"] < rows[kisti.NEITHER]["rmse"] + kisti.LEFT
+
+
+@pytest.mark.slow
+def test_speed_tells_which_peers_there_are_and_an_error_beside_each_time(measured):
+    result = record.read(measured / "speed.json")["result"]
+    assert set(result["peers"]) == {speed.VTK, speed.DRJIT}
+    for rows in result["volumes"][PHANTOM].values():
+        assert {speed.OURS, speed.PLAIN} <= set(rows)
+        assert all(row["rmse"] > 0 for row in rows.values())
+    assert result["first image"]["compiled before"]["import"] > 0
+
+
+@pytest.mark.slow
+def test_chae_and_shin_s_figure_5_is_drawn_from_the_record(measured, tmp_path):
+    chae_fig5.main(["--results", str(measured), "--output", str(tmp_path)])
+    assert imread(tmp_path / "chae_fig5.png").std() > 10
+
+
+@pytest.mark.slow
+def test_the_report_s_table_is_told_from_the_record(measured, tmp_path):
+    kisti_table.main(["--results", str(measured), "--output", str(tmp_path)])
+    told = (tmp_path / "kisti_table.md").read_text(encoding="utf-8")
+    assert "| *report: ERT + ESS* | 2.60 / 3.48 | 3.14 / 4.55 | 2.38 / 3.22 | 2.78 / 4.08 |" in told
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Is what is called empty empty? Ranges of blocks, what a transfer function shows of them, boxes, distances."""
+"""Is what is called empty empty? Ranges of blocks, what a transfer function shows, boxes, distances."""
 
 import gc
 import weakref
@@ -134,6 +134,20 @@ def test_ranges_next_to_what_is_seen_are_told_from_it():
     low, high = np.float32([ends for ends, _ in cases]).T
     seen = seen_between(values, extinction, jnp.asarray(low), jnp.asarray(high))
     np.testing.assert_array_equal(seen, [expected for _, expected in cases])
+
+
+@pytest.mark.parametrize("points", [2, 8, 40])
+def test_extinction_is_exactly_that_of_the_end_beyond_it_and_never_negative(points):
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        drawn = drawn_table(rng, points)
+        x, y = np.asarray(drawn.values), np.array(drawn.extinction)
+        y[rng.integers(2) - 1] = 0  # an end that is not seen must be transparent exactly
+        transfer = jv.TransferFunction(x, np.ones((points, 3)), y)
+        ends = np.array([x[0] - 9, x[0], x[-1], x[-1] + 9])
+        np.testing.assert_allclose(transfer(jnp.asarray(ends))[1], y[[0, 0, -1, -1]], rtol=1e-6, atol=0)
+        near = np.concatenate([x, np.nextafter(x, np.float32(-np.inf)), np.nextafter(x, np.float32(np.inf))])
+        assert float(transfer(jnp.asarray(near))[1].min()) >= 0
 
 
 def test_beyond_the_ends_the_end_is_seen():
