@@ -34,7 +34,7 @@ class Box(eqx.Module):
 
     @classmethod
     def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
-        """The box of rays whose last axis is that of a beam's rays. Those that miss the volume do not count."""
+        """The box of rays, the last axis being that of a beam's. Those that miss the volume do not count."""
         rays = jax.lax.stop_gradient(rays)
         hit = rays.length > 0
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
@@ -45,18 +45,18 @@ class Box(eqx.Module):
 
     @classmethod
     def within(cls, occupancy: Occupancy, origin: Triple, direction: Triple) -> "Box":
-        """The box of all rays of a camera between those given, whose last axis is that of a beam's corners."""
+        """The box of all rays of a camera between those of a beam's corners, which are the last axis."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
         spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
         x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
         around = jnp.sqrt(sum(span**2 for span in spans)) / 2
-        # Directions between those of the corners are their averages, made unit vectors: longer by 1 minus the
-        # cosine at most of the widest angle to the middle one.
+        # Directions between those of the corners are their averages, made unit vectors: longer by at most 1
+        # minus the cosine of the widest angle to the middle one.
         axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
         cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
         bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
-        # of all rays: at parallel ones' origins, the grid is as far away as at the nearest and farthest corner
+        # of all rays: from parallel ones the grid is as far away as from the nearest and farthest corner
         nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
         spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
         near, far = jnp.maximum(nearest - around - spread, 0), farthest + around + spread

@@ -100,7 +100,8 @@ class Transform(eqx.Module):
     ) -> tuple[Scalar, Any]:
         """Steps from this cell's front to the next one's, and the memory from there on.
 
-        `transparent` tells that the extinction at this sample was 0.
+        `transparent` tells that the cell's opacity was 0. Only then may the answer be another than a whole
+        step, or the memory change.
         """
         return steps, memory
 

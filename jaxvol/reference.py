@@ -91,7 +91,7 @@ def blend(
     at: Progress,
     cell: tuple[tuple[Cell, Measured, Scalar], ...],
 ) -> Progress:
-    """What has been accumulated behind a cell of whose pieces are known what was measured, and the opacity."""
+    """What has been accumulated behind a cell. Of its pieces are known what was measured, and the opacity."""
     (r, g, b), total, moment = at.color, at.opacity, at.moment
     samples, aligned = at.samples, at.aligned
     for piece, measured, alpha in cell:

@@ -174,7 +174,10 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
 
         after, aligned = through(at, given, values, alphas), at.aligned
         if march.cuts:  # few segments reach an exit: the others do not ask which of their cells was cut there
-            any_cut = jnp.any(jnp.stack([piece.cut for piece in cells(at, given)]))
+            # where the exit cuts any of the cells, the last one reaches past it
+            any_cut = jnp.any(
+                live & jnp.any(jnp.stack([piece.cut[-1] for piece in cells(at, given)]), axis=0)
+            )
             aligned = jax.lax.cond(
                 any_cut,
                 lambda *arguments: through(*arguments).aligned,
@@ -205,8 +208,18 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
     values = _in_memory(any_live, measured, at, given)
     alphas = _in_memory(any_live, opacities, at, given, values)
     if march.moves or march.max_samples is not None:
-        settled = jax.vmap(lambda at: march.settled(at.memory))(at) & (at.index + CELLS <= march.most_samples)
-        return jax.lax.cond(jnp.all(settled | ~live), together, singly, at, given, values, alphas)
+        settled = jax.vmap(lambda at: march.settled(at.memory))(at) | ~live
+        in_budget = (at.index + CELLS <= march.most_samples) | ~live
+
+        def stays(at: Progress, given: Any, alphas: list[Scalar]) -> Bool[Array, ""]:
+            """Whether no ray that is not settled meets a transparent sample."""
+            inside = jnp.stack([march.sample(piece) < ray.length[None] for piece in cells(at, given)])
+            transparent = jnp.all((jnp.stack(alphas) == 0) | ~inside, axis=0) & jnp.any(inside, axis=0)
+            return ~jnp.any(~settled & jnp.any(transparent, axis=0))
+
+        still = jax.lax.cond(jnp.all(settled), lambda *_: jnp.ones((), bool), stays, at, given, alphas)
+        at_once = still & jnp.all(in_budget)
+        return jax.lax.cond(at_once, together, singly, at, given, values, alphas)
     return together(at, given, values, alphas)
 
 

@@ -11,6 +11,12 @@ import jaxvol as jv
 from jaxvol.cli import main
 
 
+@pytest.fixture(autouse=True)
+def programs(tmp_path, monkeypatch):
+    """Compiled programs are kept in a folder of the test's own."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "programs"))
+
+
 @pytest.fixture
 def volume_file(tmp_path):
     volume = jv.phantom("engine", 24)

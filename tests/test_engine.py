@@ -1,4 +1,4 @@
-"""Tiles and batches do not show; nothing is compiled twice; memory does not grow with the image."""
+"""Waves and batches do not show; nothing is compiled twice; memory does not grow with the image."""
 
 import equinox as eqx
 import jax
@@ -23,13 +23,13 @@ def assert_same(a, b, tolerance=1e-6):
 
 
 @pytest.mark.parametrize("size", [(70, 3), (65, 65), (1, 1)])
-def test_tiles_do_not_show(size, monkeypatch):
+def test_waves_do_not_show(size, monkeypatch):
     volume = anisotropic_noise()
     camera = around(volume, size)
     whole = jv.render(volume, soft_transfer(), camera, MARCH)
     assert whole.rgba.shape == (size[1], size[0], 4)
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
-    monkeypatch.setattr(engine, "TILE", 16)
+    monkeypatch.setattr(engine, "WAVE", 4)
     jax.clear_caches()
     assert_same(whole, jv.render(volume, soft_transfer(), camera, MARCH))
     jax.clear_caches()
@@ -110,8 +110,8 @@ def test_memory_beside_the_image_does_not_grow_with_it():
             .temp_size_in_bytes
         )
 
-    small, large = workspace(256), workspace(1024)
-    pixels = 1024**2 - 256**2
+    small, large = workspace(512), workspace(1024)  # one wave, and four
+    pixels = 1024**2 - 512**2
     bytes_per_pixel = 4 * 4 + 4 + 4 + 1 + 1  # of a Rendering, in tiles before they are put together
     assert large - small <= 1.1 * bytes_per_pixel * pixels
 
@@ -132,7 +132,7 @@ def test_a_transform_that_is_not_asked_for_leaves_no_trace(transforms):
 def test_an_unknown_adjoint_is_named():
     # not through render, whose annotation the checker of the tests enforces first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
-        engine._Loop.of("reverse", anisotropic_noise(), MARCH)
+        engine._How.of("reverse", anisotropic_noise(), MARCH)
 
 
 def test_direct_under_jit_asks_for_the_number_of_samples():
