@@ -195,14 +195,16 @@ def _replayed(image: Callable[..., Rendering], scene: Any, how: _How, known: Kno
         return image(scene, how, known)
 
     @once.def_fwd
-    def _(perturbed: Any, scene: Any, known: Known) -> tuple[Rendering, None]:
-        return image(scene, how, known), None
-
-    @once.def_bwd
-    def _(residuals: None, gradient: Any, perturbed: Any, scene: Any, known: Known) -> Any:
+    def _(perturbed: Any, scene: Any, known: Known) -> tuple[Rendering, Any]:
         moving, still = eqx.partition(scene, perturbed)
         again = replace(how, backward=True)
         out, pull = eqx.filter_vjp(lambda moving: image(eqx.combine(moving, still), again, known), moving)
+        return out, (out, pull)
+
+    @once.def_bwd
+    def _(residuals: Any, gradient: Any, perturbed: Any, scene: Any, known: Known) -> Any:
+        out, pull = residuals
+        # None stands for what the loss does not use
         whole = jax.tree.map(
             lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
             *(out, gradient),
