@@ -194,18 +194,21 @@ def _timed(
     background: Sequence[float] = (1, 1, 1),
 ) -> None:
     """Render to a file, and tell where it is and what it took, compilation apart."""
-    seconds = []
-    for _ in range(2):  # compiled with the first image, and not again
+
+    def image() -> tuple[Rendering, float]:
         begun = time.perf_counter()
-        rendering: Rendering = jax.block_until_ready(render(volume, transfer, camera, march))
-        seconds.append(time.perf_counter() - begun)
+        rendering = jax.block_until_ready(render(volume, transfer, camera, march))
+        return rendering, time.perf_counter() - begun
+
+    _, first = image()  # compiled with the first image, and not again
+    rendering, again = image()
     path = save_png(output, rendering.image(background))
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     print(
         f"{path}: {' x '.join(map(str, camera.size))} pixels of {' x '.join(map(str, volume.shape))} voxels, "
-        f"{millions:.1f} million samples in {seconds[1]:.2f} s "
-        f"({seconds[0]:.2f} s with compilation), on {device.device_kind} ({device.platform})"
+        f"{millions:.1f} million samples in {again:.2f} s "
+        f"({first:.2f} s with compilation), on {device.device_kind} ({device.platform})"
     )
     if np.any(rendering.exhausted):
         print(f"{path}: incomplete: rays ran out of their {march.most_samples} samples; take a longer step")

@@ -6,9 +6,10 @@ one is never asked for again. So nothing kept here goes stale, and nothing outli
 
 import weakref
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
+import numpy as np
 from jaxtyping import Array
 
 from .checks import is_traced
@@ -17,7 +18,7 @@ from .checks import is_traced
 T = TypeVar("T")
 
 
-def kept(array: Array, compute: Callable[[Array], T]) -> T:
+def kept(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
     """`compute(array)`, computed once in the lifetime of a concrete array. It carries no gradient."""
     if is_traced(array) or not isinstance(array, jax.Array):  # a NumPy array may change
         return compute(jax.lax.stop_gradient(array))

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8, UInt32
+from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from .kept import kept
 from .triple import Triple
@@ -144,7 +144,7 @@ def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], 
 
 
 @jax.jit
-def _label_bits(labels: Int[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]:
+def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]:
     bits = jnp.uint32(1) << (labels.astype(jnp.int32) % 32).astype(jnp.uint32)
     return _over_blocks(bits, jnp.bitwise_or)
 

@@ -157,12 +157,14 @@ class TransferFunction(Transfer):
     def rows(self) -> Float[Array, "intervals 10"]:
         """A table with one row for each interval between points: all that a sample there needs, so that it
         finds them side by side. Start, inverse width, colour at the start and its slope, extinction at the
-        start and how much it rises."""
+        start and at the end."""
         values = jax.lax.stop_gradient(self.values)
         inverse = 1 / (values[1:] - values[:-1])[:, None]
         color, extinction = self.colors, self.extinction[:, None]
-        slopes, rise = (color[1:] - color[:-1]) * inverse, extinction[1:] - extinction[:-1]
-        columns = [values[:-1, None], inverse, color[:-1], slopes, extinction[:-1], rise]
+        slopes = (color[1:] - color[:-1]) * inverse
+        # a little more than the inverse, so that the end of an interval is never short of its end
+        more = inverse * (1 + 2 * float(jnp.finfo(inverse.dtype).eps))
+        columns = [values[:-1, None], more, color[:-1], slopes, extinction[:-1], extinction[1:]]
         return jnp.concatenate(columns, axis=1)
 
 
@@ -177,7 +179,7 @@ def points_below(
     return jnp.searchsorted(values, value, side=side, method=search).astype(jnp.int32)
 
 
-def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, ""]) -> Row:
+def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, "..."]) -> Row:
     """One row, by a look-up for each of its entries: batched, they are whole arrays from the start."""
     interval = jnp.clip(interval, 0, rows.shape[0] - 1)
     return tuple(
@@ -190,8 +192,9 @@ def interpolated(row: Row, value: Scalar) -> tuple[Triple, Scalar]:
     """Colour and extinction of a value within the table's range, from the row of its interval."""
     past = value - row[0]
     color = row[2] + past * row[5], row[3] + past * row[6], row[4] + past * row[7]
-    # by its part of the interval, which ends at 1: where extinction falls to 0, it must be 0 exactly
-    return color, row[8] + jnp.minimum(past * row[1], 1) * row[9]
+    # from end to end, and exact at both: where extinction falls to 0, it must be 0
+    part = jnp.minimum(past * row[1], 1)
+    return color, row[8] * (1 - part) + row[9] * part
 
 
 def seen_between(
