@@ -53,14 +53,15 @@ class SpaceLeaping(Transform):
     - `cell`: pixels along a cell of the last two methods; at least 2.
 
     Which blocks are visible is found again for every image, from the transfer function as it is then.
-    Gradients do not see the leaps, and lose nothing by it: what is leapt over has extinction 0. (An
-    extinction of 0 has a gradient nevertheless. In leapt-over regions it is taken as 0.)
+    What is leapt over has extinction 0, so the image loses nothing. An extinction of 0 has a gradient
+    nevertheless: `adjoint="replay"` and `"direct"`, which march without leaps, see it; `"forward"` takes it
+    as 0 wherever rays leap.
 
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
     rendering rays of one's own.
 
-    Source: `"distance"`, `"min_distance"`: Chae and Shin, as in METHODS 001; the octree is the KISTI
-    report's, section "octree skipping", which could not finish it.
+    Source: Chae and Shin, space leaping with a minimum-distance grid (`"distance"`, `"min_distance"`);
+    `"hierarchy"` stands for the octree of the KISTI report 2005.
     """
 
     method: Method = eqx.field(static=True)
