@@ -139,11 +139,7 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
 
         occupied = inside & sums.any_between(cells(low), cells(high))
         next_one = jnp.where(occupied, at, next_one)
-        return (
-            at,
-            next_one,
-            jax.lax.dynamic_update_slice_in_dim(table, next_one[None], at, 0),
-        )
+        return at, next_one, jax.lax.dynamic_update_slice_in_dim(table, next_one[None], at, 0)
 
     none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
     table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int32)

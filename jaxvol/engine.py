@@ -242,11 +242,8 @@ def _image(scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Know
         origin, direction = _each_ray(camera.ray)(columns.reshape(-1, 1), rows.reshape(-1, 1))
         rays = jnp.stack(origin, -1).reshape(-1, 3), jnp.stack(direction, -1).reshape(-1, 3)
         beams = _own_beams(space, *rays, columns.size)
-        return (
-            _march(volume, transfer, first, how, survey, beams)
-            .depth.reshape(-1)[: columns.size]
-            .reshape(columns.shape)
-        )
+        depth = _march(volume, transfer, first, how, survey, beams).depth
+        return depth.reshape(-1)[: columns.size].reshape(columns.shape)
 
     survey = _survey(space, transfer, march, known, how, View(camera.ray, camera.size, first_hit))
 

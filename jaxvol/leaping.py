@@ -42,7 +42,7 @@ class SpaceLeaping(Transform):
     - `method`:
         - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of the beam in whose
           box no block of 4³ voxels holds anything visible. Tables of sums answer for boxes of any size
-          at once, where an octree would be walked from coarse to fine. The fastest.
+          at once, where an octree would be walked from coarse to fine.
         - `"distance"`: each ray leaps as far as a map of (chessboard) distances to the nearest visible
           block proves. Short leaps where it runs along a surface.
         - `"min_distance"`: as `"distance"`, from a start that the corners of cells of `cell` x `cell`

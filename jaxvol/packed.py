@@ -24,6 +24,12 @@ class PackedVolume(Volume):
 
     words: UInt32[Array, " voxels"]
 
+    def __init__(self, volume: Volume, words: UInt32[Array, " voxels"]):
+        # as they are: they have been checked
+        self.data, self.labels = volume.data, volume.labels
+        self.spacing, self.origin = volume.spacing, volume.origin
+        self.words = words
+
     def _cube(self, coordinate: Triple) -> tuple[Cube, Triple]:
         dtype = coordinate[0].dtype
         (x, y, z), fraction = split(coordinate, self.shape)
@@ -63,13 +69,7 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
 
 def with_words(volume: Volume, words: UInt32[Array, " voxels"] | None) -> Volume:
     """The volume, with its packed copy where there is one."""
-    if words is None:
-        return volume
-    packed = object.__new__(PackedVolume)
-    for name in ("data", "spacing", "origin", "labels"):
-        object.__setattr__(packed, name, getattr(volume, name))
-    object.__setattr__(packed, "words", words)
-    return packed
+    return volume if words is None else PackedVolume(volume, words)
 
 
 @jax.jit

@@ -205,7 +205,7 @@ def seen_between(
 ) -> Bool[Array, "*blocks"]:
     """Whether the extinction is positive anywhere from `low` to `high`."""
     positive, n = extinction > 0, values.shape[0]
-    if n > FEW:
+    if n > FEW:  # comparing with each point would cost more than looking up how many lie below
         before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
         # between two points there is something to see wherever one of the two has extinction
         from_point = jnp.maximum(points_below(values, low) - 1, 0)

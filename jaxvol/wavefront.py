@@ -128,7 +128,7 @@ def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
 
 def _each(f: Any) -> Any:
     """A function of one ray, and of what each of its cells has, over rays (n,) and cells (CELLS, n)."""
-    return jax.vmap(jax.vmap(f), in_axes=(None, 0))
+    return lambda ray, *cells: jax.vmap(lambda *cells: jax.vmap(f)(ray, *cells))(*cells)
 
 
 def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
@@ -155,9 +155,7 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
-        each = jax.vmap(
-            jax.vmap(lambda ray, piece, read: opacity(march, ray, seen, piece, read)), in_axes=(None, 0, 0)
-        )
+        each = _each(lambda ray, piece, read: opacity(march, ray, seen, piece, read))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
     def blended(at: Progress, cell: Any) -> Progress:

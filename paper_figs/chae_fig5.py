@@ -1,15 +1,13 @@
 """Chae and Shin, Fig. 5: time against the grid's cells. `experiments/minimum_distance.py` measures it; here
 it is drawn, with the number in the paper's text: at R = 8, 53 % less than the distance map alone."""
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import record
 from experiments.minimum_distance import HIERARCHY, MAP, PROVEN, PUBLISHED, named
 
-from .common import OUTPUT, plt
+from .common import plt, recorded
 
 
 PAPER = 8, 0.47  # R, time over that of the distance map
@@ -48,20 +46,14 @@ def draw(measured: dict[str, Any], path: Path) -> None:
         panel.tick_params(labelsize=8)
     axes[0].set_ylabel("time / distance map; in red, wrong pixels", fontsize=9)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90, metadata={"Software": None})
     plt.close(figure)
     print(path)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
-    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
-    chosen = parser.parse_args(argv)
-    draw(record.read(chosen.results / "minimum_distance.json"), chosen.output / "chae_fig5.png")
+    measured, folder = recorded(argv, str(__doc__), "minimum_distance")
+    draw(measured, folder / "chae_fig5.png")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import matplotlib
 import numpy as np
 
 import jaxvol as jv
+from experiments import record
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
 from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
 
@@ -72,6 +73,22 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
     part = np.asarray(volume.data)[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
     origin = np.asarray(volume.origin) + np.array(first) * np.asarray(volume.spacing)
     return jv.Volume(part, volume.spacing, origin)
+
+
+def recorded(argv: Sequence[str] | None, about: str, name: str) -> tuple[dict[str, Any], Path]:
+    """For scripts that draw what an experiment measured: its record, and the folder to write into."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
+    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
+    chosen = parser.parse_args(argv)
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    return record.read(chosen.results / f"{name}.json"), chosen.output
+
+
+def write_table(told: str, path: Path) -> None:
+    """A table in Markdown, to a file and to the terminal."""
+    path.write_text(told, encoding="utf-8")
+    print(told)
 
 
 def options(argv: Sequence[str] | None, about: str, resolution: int = 160) -> argparse.Namespace:

@@ -2,15 +2,12 @@
 `experiments/kisti.py` measures it; here it is told in Markdown, beside the report's.
 """
 
-import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-from experiments import record
 from experiments.kisti import BOTH, ERT, ESS, NEITHER, REPORT
 
-from .common import OUTPUT
+from .common import recorded, write_table
 
 
 def table(measured: dict[str, Any]) -> str:
@@ -38,16 +35,8 @@ def table(measured: dict[str, Any]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
-    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
-    chosen = parser.parse_args(argv)
-    told = table(record.read(chosen.results / "kisti.json"))
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    (chosen.output / "kisti_table.md").write_text(told, encoding="utf-8")
-    print(told)
+    measured, folder = recorded(argv, str(__doc__), "kisti")
+    write_table(table(measured), folder / "kisti_table.md")
 
 
 if __name__ == "__main__":

@@ -2,15 +2,12 @@
 Markdown, as ratios to ray casting, beside those of the paper.
 """
 
-import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-from experiments import record
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 
-from .common import OUTPUT
+from .common import recorded, write_table
 
 
 COLUMNS = (JITTER, EMPTY, BOTH)
@@ -42,16 +39,8 @@ def table(measured: dict[str, Any]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
-    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
-    chosen = parser.parse_args(argv)
-    told = table(record.read(chosen.results / "overhead.json"))
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    (chosen.output / "table1.md").write_text(told, encoding="utf-8")
-    print(told)
+    measured, folder = recorded(argv, str(__doc__), "overhead")
+    write_table(table(measured), folder / "table1.md")
 
 
 if __name__ == "__main__":

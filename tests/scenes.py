@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import combinations
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -49,6 +50,19 @@ def anisotropic_noise(seed: int = 0) -> jv.Volume:
     """Independent values at every node, on a grid with three different spacings away from the origin."""
     data = np.random.default_rng(seed).random((RESOLUTION,) * 3, dtype=np.float32)
     return jv.Volume(data, spacing=(0.05, 0.08, 0.11), origin=(0.3, -1.2, 0.4))
+
+
+def counting() -> type[jv.TransferFunction]:
+    """A new class of transfer functions, which counts in `traces` the programs that classify by it."""
+
+    class Counting(jv.TransferFunction):
+        traces: ClassVar[int] = 0
+
+        def over(self, volume):
+            Counting.traces += 1
+            return super().over(volume)
+
+    return Counting
 
 
 VOLUMES: dict[str, Callable[[], jv.Volume]] = {

@@ -7,7 +7,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import anisotropic_noise, around, soft_transfer, uniform_transfer
+from .scenes import anisotropic_noise, around, counting, soft_transfer, uniform_transfer
 
 
 BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
@@ -139,14 +139,7 @@ def test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample():
 
 
 def test_seeds_do_not_compile_again_and_images_differ_by_noise_alone():
-    traces = 0
-
-    class Counting(jv.TransferFunction):
-        def over(self, volume):
-            nonlocal traces
-            traces += 1
-            return super().over(volume)
-
+    Counting = counting()
     volume = anisotropic_noise()
     transfer = Counting(*jax.tree.leaves(soft_transfer()))
     camera = around(volume, (24, 20))
@@ -154,7 +147,7 @@ def test_seeds_do_not_compile_again_and_images_differ_by_noise_alone():
         np.asarray(jv.render(volume, transfer, camera, jv.March(0.07, (jv.Jitter(seed),))).rgba)
         for seed in range(8)
     ]
-    assert traces == 1
+    assert Counting.traces == 1
     assert np.abs(images[0] - images[1]).max() > 1e-3
     exact = np.asarray(jv.render(volume, transfer, camera, jv.March(0.002)).rgba)
     single = np.sqrt(np.mean((images[0] - exact) ** 2))

@@ -16,7 +16,7 @@ from jaxvol import engine, packed, wavefront
 from jaxvol.phantoms import toroidal_phantom
 from jaxvol.triple import apart
 
-from .scenes import CAMERAS, around, doubled, in_float64, inside, orthographic, scaled_phantom
+from .scenes import CAMERAS, around, counting, doubled, in_float64, inside, orthographic, scaled_phantom
 
 
 SHAPE = (24, 20, 28)
@@ -31,16 +31,7 @@ RESIDUAL = (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())
 JITTERED = (jv.Jitter(3), jv.EmptySpaceJitter(4), jv.EarlyTermination(0.05))
 SETS = {"plain": PLAIN, "moving": MOVING, "residual": RESIDUAL, "jittered": JITTERED}
 
-traces = 0
-
-
-class Counting(jv.TransferFunction):
-    """Counts how often a program is made that classifies by it."""
-
-    def over(self, volume):
-        global traces
-        traces += 1
-        return super().over(volume)
+Counting = counting()
 
 
 def leaping(transforms, method, cell=4):
@@ -211,9 +202,9 @@ def test_sizes_of_tiles_do_not_show(cells, batch, wave, monkeypatch):
         """Another type, so another program."""
 
     transfer = Anew(*jax.tree.leaves(table(1, 1.0)))
-    before = traces
+    before = Counting.traces
     other = jv.render(volume, transfer, orthographic(volume, SIZE), march)
-    assert traces > before
+    assert Counting.traces > before
     assert_same(other, whole, fewer=False)
 
 
@@ -619,8 +610,8 @@ def test_one_program_serves_a_session():
         march = jv.March(0.02 + 0.003 * i, leaping(transforms, "hierarchy"))
         camera = drawn_camera(around if i % 2 else inside, volume, i)
         jax.block_until_ready(jv.render(volume, table(i, 255), camera, march))
-        before = traces if i == 0 else before
-    assert traces == before
+        before = Counting.traces if i == 0 else before
+    assert Counting.traces == before
 
 
 def stack(items):
