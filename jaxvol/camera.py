@@ -60,7 +60,7 @@ class Camera(eqx.Module):
         position = finite_array("position", position, (3,))
         self.position = require(
             position,
-            lambda here, there: jnp.any(here != there),
+            lambda here, there: (here != there).any(),
             "position must differ from focal_point; got {got} for both.",
             self.focal_point,
         )
@@ -94,14 +94,11 @@ class Camera(eqx.Module):
         As VTK's `ResetCamera`: the sphere around the volume's bounds just fits into the view.
         """
         direction = finite_array("direction", direction, (3,))
-        direction = require(direction, lambda d: jnp.any(d != 0), "direction must not be zero.")
+        direction = require(direction, lambda d: (d != 0).any(), "direction must not be zero.")
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
-        low, high = volume.corners
-        radius = jnp.linalg.norm(high - low) / 2
         width, height = _image_size(size)
-        half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * min(1, width / height))
-        position = volume.center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
-        return cls(position, volume.center, view_up, view_angle, size=size)
+        position, center = _seeing_all(volume, direction, view_angle, min(1, width / height))
+        return cls(position, center, view_up, view_angle, size=size)
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
         """The camera that renders just this rectangle of the image: the same pixels, in an image of
@@ -127,11 +124,7 @@ class Camera(eqx.Module):
         It magnifies the image plane, so perspective does not change.
         """
         factor = number("zoom factor", factor, above=0)
-        middle_x, middle_y = self._column(center[0] * self.size[0]), self._row(center[1] * self.size[1])
-        left, right, bottom, top = self.window
-        half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
-        window = [middle_x - half_x, middle_x + half_x, middle_y - half_y, middle_y + half_y]
-        return self._showing(jnp.stack(window), self.size)
+        return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
     def ray(self, column: Int[Array, ""], row: Int[Array, ""]) -> tuple[Triple, Triple]:
         """Origin and unit direction of one pixel's ray."""
@@ -183,10 +176,37 @@ class Camera(eqx.Module):
         return top - (top - bottom) * (row / self.size[1])
 
 
-def _sine(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
+# One program each, rather than one for every operation: the first image waits for them.
+
+
+@eqx.filter_jit
+def _seeing_all(
+    volume: Volume, direction: Float[Array, "3"], view_angle: Float[Array, ""], aspect: float
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """From where a view of this angle, times `aspect` across, holds the sphere around a volume, and its
+    middle."""
+    low, high = volume.corners
+    half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
+    away = jnp.linalg.norm(high - low) / 2 / jnp.sin(half)
+    return volume.center + direction / jnp.linalg.norm(direction) * away, volume.center
+
+
+@jax.jit
+def _zoomed(
+    window: Float[Array, "4"], factor: Float[Array, ""], center: Float[Array, "2"]
+) -> Float[Array, "4"]:
+    """1/`factor` of a window, around this part of it."""
+    left, right, bottom, top = window
+    x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
+    half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
+    return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
+
+
+def _sine(a: Any, b: Any) -> Any:
     """Sine of the angle between two vectors; 0 where one is zero."""
-    lengths = jnp.linalg.norm(a) * jnp.linalg.norm(b)
-    return jnp.linalg.norm(jnp.cross(a, b)) / jnp.where(lengths > 0, lengths, 1)
+    across = sum((a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2]) ** 2 for i in range(3))
+    lengths = (a * a).sum() * (b * b).sum()
+    return (across / (lengths + (lengths == 0).astype(lengths.dtype))) ** 0.5
 
 
 def _image_size(size: tuple[int, int] | Any) -> tuple[int, int]:

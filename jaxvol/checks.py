@@ -4,6 +4,7 @@ A fault that shapes or Python values show raises `ValueError` at once. A fault t
 traced values show is raised by `equinox.error_if` when the compiled program runs.
 """
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar
 
@@ -32,6 +33,8 @@ def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> 
 
     **Arguments:**
 
+    - `holds`: asked of NumPy arrays where values are concrete, else of traced ones; so it is made of what
+        both have, operators and methods.
     - `message`: the error; `{got}` in it becomes the value.
 
     **Returns:** the value. Use what is returned: a check on a traced value vanishes without it.
@@ -41,9 +44,9 @@ def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> 
     if is_traced(value, *others):
         message = message.format(got="a value known only when the program runs")
         return eqx.error_if(value, ~jnp.all(holds(value, *others)), message)
-    with jax.ensure_compile_time_eval():  # what is concrete can be asked at once inside jit, too
-        if not np.all(holds(value, *others)):
-            raise ValueError(message.format(got=np.asarray(value)))
+    # by NumPy, which compiles nothing
+    if not np.all(holds(*(np.asarray(given) for given in (value, *others)))):
+        raise ValueError(message.format(got=np.asarray(value)))
     return value
 
 
@@ -56,11 +59,13 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> 
     """`value` as an array of JAX's default float type, of this shape (None: any length)."""
     spelled = str(shape).replace("None", "n")
     try:
-        if is_traced(value):
+        if not is_traced(value) and not isinstance(value, jax.Array):
+            value = np.asarray(value)
+            if value.dtype.kind in "OSU":
+                raise TypeError
+            value = value.astype(jnp.result_type(float))
+        with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
             array = jnp.asarray(value, dtype=float)
-        else:
-            with jax.ensure_compile_time_eval():
-                array = jnp.asarray(value, dtype=float)
     except (TypeError, ValueError) as fault:
         raise ValueError(f"{name} must be numbers of shape {spelled}; got {value!r}.") from fault
     fits = array.ndim == len(shape) and all(

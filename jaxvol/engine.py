@@ -121,7 +121,7 @@ def render_rays(
             f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}."
         )
     message = "directions must not have length 0."
-    directions = require(directions, lambda d: jnp.any(d != 0, axis=-1), message)
+    directions = require(directions, lambda d: (d != 0).any(axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     how = _How.of(adjoint, volume, march)
     return _render_rays((volume, transfer, origins, directions, march), how, Known.of(volume, march))

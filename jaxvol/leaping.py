@@ -141,17 +141,13 @@ class _Beams(Survey):
         return notes.following[0] < notes.following.shape[0]
 
     def clear(
-        self,
-        notes: Stretches,
-        beam: Int[Array, " groups"],
-        rays: Ray,
-        depth: Float[Array, "groups rays"],
-    ) -> Float[Array, "groups rays"]:
+        self, notes: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
         count, beams = notes.following.shape
-        near = notes.near.at[beam].get(mode="promise_in_bounds")[:, None]
+        near = notes.near.at[beam].get(mode="promise_in_bounds")
         place = (rays.t_in + depth - near) / notes.length
         stretch = jnp.clip(place.astype(jnp.int32), 0, count - 1)
-        entry = stretch * beams + beam[:, None]
+        entry = stretch * beams + beam
         following = (
             notes.following.reshape(-1).at[entry].get(mode="promise_in_bounds", wrap_negative_indices=False)
         )
@@ -175,8 +171,8 @@ class _Distances(Survey):
         return jnp.ones((), bool)
 
     def clear(
-        self, notes: None, beam: Int[Array, " groups"], rays: Ray, depth: Float[Array, "groups rays"]
-    ) -> Float[Array, "groups rays"]:
+        self, notes: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
         start = self.occupancy.cell(rays.entry)
         rate = [r / size for r, size in zip(rays.direction, self.occupancy.size, strict=True)]
         if self.starts is not None:

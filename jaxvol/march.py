@@ -70,10 +70,10 @@ class Survey(eqx.Module):
 
     @abstractmethod
     def clear(
-        self, notes: Any, beam: Int[Array, " groups"], rays: Ray, depth: Float[Array, "groups rays"]
-    ) -> Float[Array, "groups rays"]:
-        """For some of the rays, each group from one beam: a depth, no less than `depth`, up to which nothing
-        is seen."""
+        self, notes: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        """For some of the rays, from these beams: a depth, no less than `depth`, up to which nothing is
+        seen."""
 
 
 class Transform(eqx.Module):

@@ -231,4 +231,9 @@ def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[A
     """
     unit_distance = number("unit_distance", unit_distance, above=0)
     opacity = unit_interval("opacity", opacity, (None,))
+    return _extinction(opacity, unit_distance)
+
+
+@jax.jit
+def _extinction(opacity: Float[Array, " n"], unit_distance: Float[Array, ""]) -> Float[Array, " n"]:
     return -jnp.log1p(-jnp.minimum(opacity, 1 - 2.0**-24)) / unit_distance

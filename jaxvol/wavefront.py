@@ -14,6 +14,7 @@ None of it shows in the result: cells, transforms and the blending are those of 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from .beams import Box
 from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
-from .reference import Progress, begin, blend, front, leave, measure, move, opacity, pieces
+from .reference import Progress, begin, blend, front, measure, move, opacity, pieces
 from .transfer import Classification, Measured
 from .triple import Scalar
 from .volume import Volume
@@ -75,26 +76,28 @@ def march_beams(
     def run(rows: Int[Array, " batch"], at: Progress, keep: Int[Array, ""]) -> Progress:
         """March the groups in these rows for a while; a row past the last one stands for none."""
         known = jnp.minimum(rows, groups - 1)
-        beam = known // (groups // beams.count)
 
         def take(leaf: Array) -> Array:
-            return leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            # side by side, so that each is changed where it lies: a reshape in the loop would copy it
+            taken = leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            return taken.reshape(-1, *leaf.shape[2:])
 
-        here, some = jax.tree.map(take, (at, rays))
-        here = _with(here, finished=here.finished | (rows >= groups)[:, None])
+        some, here = jax.tree.map(take, (rays, at))
+        here = _with(here, finished=here.finished | jnp.repeat(rows >= groups, GROUP))
+        beam = jnp.repeat(known // (groups // beams.count), GROUP)
 
         def go_on(here: Progress) -> Bool[Array, ""]:
-            return jnp.sum(jnp.any(_alive(march, here), axis=-1)) > keep
+            return jnp.sum(jnp.any(_alive(march, here).reshape(size, GROUP), axis=-1)) > keep
 
         def go(here: Progress) -> Progress:
             if survey is not None:
                 here = _leap(march, survey, notes, beam, some, here)
-            flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (some, here))
-            after = _segment(march, volume, seen, *flat)
-            return jax.tree.map(lambda leaf: leaf.reshape(size, GROUP, *leaf.shape[1:]), after)
+            return _segment(march, volume, seen, some, here)
 
-        here = jax.lax.while_loop(go_on, go, here)
-        return jax.tree.map(lambda all_, part: all_.at[rows].set(part, mode="drop"), at, here)
+        def put(leaf: Array, part: Array) -> Array:
+            return leaf.at[rows].set(part.reshape(size, GROUP, *part.shape[1:]), mode="drop")
+
+        return jax.tree.map(put, at, jax.lax.while_loop(go_on, go, here))
 
     def alive_rows(at: Progress) -> tuple[Int[Array, " padded"], Int[Array, ""]]:
         alive = jnp.any(_alive(march, at), axis=-1)
@@ -158,67 +161,51 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
         each = _each(lambda ray, piece, read: opacity(march, ray, seen, piece, read))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
-    def blended(at: Progress, cell: Any) -> Progress:
-        return jax.vmap(lambda ray, at, cell: blend(march, ray, seen, at, cell))(ray, at, cell)
-
-    def together(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
-        """All cells at once, where nothing moves a ray off them."""
-
-        def through(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
-            samples = tuple(zip(cells(at, given), values, alphas, strict=True))
-            for k in range(CELLS):
-                at = blended(at, jax.tree.map(lambda leaf, k=k: leaf[k], samples))
-            return at
-
-        after, aligned = through(at, given, values, alphas), at.aligned
-        if march.cuts:  # few segments reach an exit: the others do not ask which of their cells was cut there
-            # where the exit cuts any of the cells, the last one reaches past it
-            any_cut = jnp.any(
-                live & jnp.any(jnp.stack([piece.cut[-1] for piece in cells(at, given)]), axis=0)
-            )
-            aligned = jax.lax.cond(
-                any_cut,
-                lambda *arguments: through(*arguments).aligned,
-                lambda at, *_: at.aligned,
-                *(at, given, values, alphas),
-            )
-        last = tuple(jax.tree.map(lambda leaf: leaf[-1], piece) for piece in cells(at, given))
-        after = jax.vmap(lambda ray, at, last: leave(march, ray, at, last))(ray, after, last)
-        return _with(after, index=at.index + CELLS, aligned=aligned)
-
-    def singly(at: Progress, given: Any, values: list[Measured], alphas: list[Scalar]) -> Progress:
-        """Cell by cell, as long as the ray is where its samples were taken."""
-        samples = tuple(zip(cells(at, given), values, alphas, strict=True))
-
-        def one(ray: Ray, at: Progress, cell: Any) -> Progress:
-            after = leave(march, ray, blend(march, ray, seen, at, cell), tuple(piece for piece, _, _ in cell))
-            transparent = jnp.all(jnp.stack([alpha for _, _, alpha in cell]) == 0, axis=0)
-            return move(march, ray, after, transparent)
-
-        after = at
-        for k in range(CELLS):
-            holds = (after.offset == at.offset) & _alive(march, after)
-            new = jax.vmap(one)(ray, after, jax.tree.map(lambda leaf, k=k: leaf[k], samples))
-            after = jax.tree.map(lambda a, b, holds=holds: jnp.where(holds, a, b), new, after)
-        return after
-
     any_live = jnp.any(live)
     values = _in_memory(any_live, measured, at, given)
     alphas = _in_memory(any_live, opacities, at, given, values)
-    if march.moves or march.max_samples is not None:
-        settled = jax.vmap(lambda at: march.settled(at.memory))(at) | ~live
-        in_budget = (at.index + CELLS <= march.most_samples) | ~live
+    bounded = march.moves or march.max_samples is not None
+    taken, moved = _taken(march, at, live, alphas) if bounded else (CELLS, jnp.zeros(live.shape, bool))
 
-        def stays(at: Progress, given: Any, alphas: list[Scalar]) -> Bool[Array, ""]:
-            """Whether no ray that is not settled meets a transparent sample."""
-            inside = jnp.stack([march.sample(piece) < ray.length[None] for piece in cells(at, given)])
-            transparent = jnp.all((jnp.stack(alphas) == 0) | ~inside, axis=0) & jnp.any(inside, axis=0)
-            return ~jnp.any(~settled & jnp.any(transparent, axis=0))
+    def blended(ray: Ray, at: Progress, takes: Bool[Array, ""], cell: Any) -> Progress:
+        if bounded:  # what is not taken is blended as if it lay past the exit
+            cell = tuple(
+                (
+                    replace(piece, front=jnp.where(takes, piece.front, ray.length)),
+                    read,
+                    jnp.where(takes, alpha, 0),
+                )
+                for piece, read, alpha in cell
+            )
+        return blend(march, ray, seen, at, cell)
 
-        still = jax.lax.cond(jnp.all(settled), lambda *_: jnp.ones((), bool), stays, at, given, alphas)
-        at_once = still & jnp.all(in_budget)
-        return jax.lax.cond(at_once, together, singly, at, given, values, alphas)
-    return together(at, given, values, alphas)
+    after, taken = at, jnp.broadcast_to(taken, live.shape)
+    samples = tuple(zip(cells(at, given), values, alphas, strict=True))
+    for k in range(CELLS):
+        cell = jax.tree.map(lambda leaf, k=k: leaf[k], samples)
+        after = jax.vmap(blended)(ray, after, k < taken, cell)
+    return jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, moved, taken)
+
+
+def _taken(
+    march: March, at: Progress, live: Bool[Array, " rays"], alphas: list[Scalar]
+) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
+    """How many of a segment's cells a ray takes, and whether the last of them moves it. All, and no; but a
+    ray that is not settled goes no farther than its next transparent cell, where its samples move to
+    other places than these."""
+    settled = jax.vmap(lambda at: march.settled(at.memory))(at)
+    left = march.most_samples - at.index
+
+    def up_to(alphas: list[Scalar]) -> tuple[Array, Array]:
+        transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
+        first = 1 + jnp.argmax(transparent, axis=0).astype(left.dtype)
+        moved = ~settled & jnp.any(transparent, axis=0) & (first <= left)
+        return jnp.minimum(jnp.where(moved, first, CELLS), left), moved
+
+    def all_(alphas: list[Scalar]) -> tuple[Array, Array]:
+        return jnp.full_like(left, CELLS), jnp.zeros_like(settled)
+
+    return jax.lax.cond(jnp.all((settled & (left >= CELLS)) | ~live), all_, up_to, alphas)
 
 
 def _in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
@@ -231,7 +218,7 @@ def _in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) ->
 
 
 def _leap(
-    march: March, survey: Survey, notes: PyTree, beam: Int[Array, " batch"], rays: Ray, at: Progress
+    march: March, survey: Survey, notes: PyTree, beam: Int[Array, " rays"], rays: Ray, at: Progress
 ) -> Progress:
     """On to the first cell that reaches into what is not known to be empty. A ray that has nothing ahead of
     it is finished."""
@@ -240,7 +227,5 @@ def _leap(
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     cells = jnp.clip(whole.astype(at.index.dtype), 0, march.most_samples - at.index)
     leaps = (cells > 0) & ~at.finished
-    each = jax.vmap(jax.vmap(lambda ray, at, cells: move(march, ray, at, jnp.ones((), bool), cells)))
-    gone = each(rays, at, cells)
-    at = jax.tree.map(lambda a, b: jnp.where(leaps, a, b), gone, at)
-    return _with(at, finished=at.finished | (_alive(march, at) & (front(march, at) >= rays.length)))
+    gone = jax.vmap(lambda ray, at, cells: move(march, ray, at, jnp.ones((), bool), cells))(rays, at, cells)
+    return jax.tree.map(lambda a, b: jnp.where(leaps, a, b), gone, at)

@@ -638,7 +638,7 @@ def test_under_vmap_each_is_as_it_is_alone(over, method):
     for i, (camera, transfer) in enumerate(zip(cameras, transfers, strict=True)):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], images)
         whole = jv.render(volume, transfer, camera, jv.March(0.02, PLAIN))
-        assert_same(one, whole, 2e-6)
+        assert_same(one, whole, 5e-6)  # another program, whose rays are rounded otherwise
 
 
 # ---- packed voxels ----
