@@ -1,52 +1,40 @@
-"""How is an image rendered? In beams of neighbouring pixels, and waves of beams.
+"""How is an image rendered, and differentiated?
 
-Rays are made wave by wave from the camera, and a wave's memory is all that a march holds beside the
-finished pixels, however large the image. How the rays of a wave are marched is `wavefront`'s business; what
-they see is `reference`'s.
+Rays are made wave by wave, in the order of `waves`. How the rays of a wave are marched is `wavefront`'s
+business; what they see is `reference`'s; and what a loss sees of it, `replay`'s.
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt32
 
-from .beams import Box
 from .camera import Camera
 from .checks import Arrayable, finite, is_traced, require
 from .leaping import FirstHit
-from .locate import Ray, Space, enter
+from .locate import Ray
 from .march import March, Survey, View
-from .occupancy import Blocks, Occupancy
+from .occupancy import Blocks
 from .packed import with_words, words_of
-from .reference import Progress, begin, end, samples_across, step
+from .reference import begin, end, samples_across, step
 from .rendering import Rendering
+from .replay import Cotangents, Replay, Total, added, floats, with_voxels, without_voxels
 from .transfer import Transfer
 from .volume import Volume
-from .wavefront import GROUP, Beams, march_beams
+from .wavefront import Beams, march_beams
+from .waves import OwnRays, Waves, each_ray
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
-Lanes: TypeAlias = Float[Array, "groups rays"]
-Points: TypeAlias = tuple[Lanes, Lanes, Lanes]
-Pixels: TypeAlias = tuple[Int[Array, "groups rays"], Int[Array, "groups rays"]]
-
-SIDE = math.isqrt(GROUP)
-"""Pixels along the side of a group of rays."""
-
-BEAM = 2 * SIDE
-"""Pixels along the side of a beam, which is 2 x 2 groups."""
 
 WAVE = 4096
-"""Beams in a wave: 262 144 rays. A wave's memory is all that is held beside the finished pixels."""
+"""Beams in a wave: 262 144 rays."""
 
-PLAIN_WAVE = 64
-"""Beams in a wave that is marched cell by cell, to be differentiated."""
+DIRECT_WAVE = 64
+"""Beams in a wave of `"direct"`, which keeps all its states to be differentiated."""
 
 OPTIONS = {
     # 16 lanes at once where the processor has them: XLA prefers 8
@@ -55,9 +43,6 @@ OPTIONS = {
     "xla_cpu_enable_concurrency_optimized_scheduler": False,
 }
 """How XLA compiles: 20 % faster on CPU, and of no meaning elsewhere."""
-
-CHECKPOINTS = 16
-"""States that a replay keeps per ray: from the nearest one before it, each sample is computed again."""
 
 
 def render(
@@ -76,9 +61,8 @@ def render(
     - `camera`: one ray for each pixel.
     - `march`: step and transforms.
     - `adjoint`: how the image is differentiated; the image itself is the same.
-        - `"replay"`: reverse mode (`jax.grad`). A backward march recomputes the samples, so that
-          memory does not grow with their number. A gradient to the volume passes over the whole
-          volume at every step, and is slow.
+        - `"replay"`: reverse mode (`jax.grad`). A second march computes the samples again, so that memory
+          does not grow with their number: it takes one array like each leaf, and a wave's rays.
         - `"forward"`: forward mode (`jax.jvp`, `jax.jacfwd`).
         - `"direct"`: both, and higher derivatives, by letting JAX differentiate
           `render_ray_reference`. Memory grows with the number of samples.
@@ -124,7 +108,8 @@ def render_rays(
     directions = require(directions, lambda d: (d != 0).any(axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     how = _How.of(adjoint, volume, march)
-    return _render_rays((volume, transfer, origins, directions, march), how, Known.of(volume, march))
+    source = OwnRays(origins, directions)
+    return _render((volume, transfer, source, march), how, Known.of(volume, march))
 
 
 class Known(eqx.Module):
@@ -139,80 +124,24 @@ class Known(eqx.Module):
 
 
 class _How(eqx.Module):
-    """By which loop rays are marched to their ends: one for the image, others that can be differentiated."""
+    """By which loop rays are marched to their ends."""
 
     adjoint: Adjoint = eqx.field(static=True)
     length: int = eqx.field(static=True)
-    backward: bool = eqx.field(static=True, default=False)
-    """Whether the image is made anew to be differentiated."""
+    """Of the loop of `"direct"`."""
 
     @classmethod
     def of(cls, adjoint: Any, volume: Volume, march: March) -> "_How":
         if adjoint not in get_args(Adjoint):
             raise ValueError(f"adjoint must be one of {', '.join(get_args(Adjoint))}; got {adjoint!r}.")
         if adjoint != "direct":
-            return cls(adjoint, march.most_samples)
+            return cls(adjoint, 0)
         length = samples_across(volume, march)
         # to the next of few lengths, so that a change of step rarely compiles the program again
         return cls(adjoint, min(-(-length // 64) * 64, march.most_samples))
 
-    @property
-    def plain(self) -> bool:
-        """Whether one cell is marched after the other, by a loop that reverse mode goes through."""
-        return self.backward or self.adjoint == "direct"
 
-    @property
-    def most_beams(self) -> int:
-        """Beams in a wave. Where states are kept for a backward pass, fewer."""
-        return PLAIN_WAVE if self.plain else WAVE
-
-    def in_turn(self, wave: Callable[[Any], Rendering], numbered: Any) -> Rendering:
-        """Every wave's rendering, one after the other."""
-        # a replay starts again from what a wave was given, so no wave keeps a state for the backward pass
-        return jax.lax.map(jax.checkpoint(wave) if self.backward else wave, numbered)
-
-    def run(self, advance: Callable[[Progress], Progress], start: Progress) -> Progress:
-        """The state in which all rays are finished."""
-        if self.adjoint == "direct":
-            return jax.lax.scan(lambda at, _: (advance(at), None), start, None, length=self.length)[0]
-        return eqxi.while_loop(
-            lambda at: ~jnp.all(at.finished),
-            advance,
-            start,
-            max_steps=self.length,
-            kind="checkpointed",
-            checkpoints=CHECKPOINTS,
-        )
-
-
-def _replayed(image: Callable[..., Rendering], scene: Any, how: _How, known: Known) -> Rendering:
-    """`image(scene, how, known)`; in reverse mode, the derivative of the same image made cell by cell."""
-    if how.adjoint != "replay":
-        return image(scene, how, known)
-
-    @eqx.filter_custom_vjp
-    def once(scene: Any, known: Known) -> Rendering:
-        return image(scene, how, known)
-
-    @once.def_fwd
-    def _(perturbed: Any, scene: Any, known: Known) -> tuple[Rendering, Any]:
-        moving, still = eqx.partition(scene, perturbed)
-        again = replace(how, backward=True)
-        out, pull = eqx.filter_vjp(lambda moving: image(eqx.combine(moving, still), again, known), moving)
-        return out, (out, pull)
-
-    @once.def_bwd
-    def _(residuals: Any, gradient: Any, perturbed: Any, scene: Any, known: Known) -> Any:
-        out, pull = residuals
-        # None stands for what the loss does not use
-        whole = jax.tree.map(
-            lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
-            *(out, gradient),
-            is_leaf=lambda leaf: leaf is None,
-        )
-        return pull(whole)[0]
-
-    return once(scene, jax.lax.stop_gradient(known))
+Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March]
 
 
 def _compiled(function: Callable[..., Rendering]) -> Callable[..., Rendering]:
@@ -224,144 +153,129 @@ def _compiled(function: Callable[..., Rendering]) -> Callable[..., Rendering]:
 
 
 @_compiled
-def _render(scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Known) -> Rendering:
-    return _replayed(_image, scene, how, known)
+def _render(scene: Scene, how: _How, known: Known) -> Rendering:
+    return _replayed(scene, known) if how.adjoint == "replay" else _image(scene, how, known)
 
 
-def _image(scene: tuple[Volume, Transfer, Camera, March], how: _How, known: Known) -> Rendering:
-    volume, transfer, camera, march = scene
+def _replayed(scene: Scene, known: Known) -> Rendering:
+    """The image; in reverse mode, its derivative by a second march."""
+
+    @eqx.filter_custom_vjp
+    def image(scene: Scene, known: Known) -> Rendering:
+        return _image(scene, _How("replay", 0), known)
+
+    @image.def_fwd
+    def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Rendering, Rendering]:
+        rendering = image(scene, known)
+        return rendering, rendering
+
+    @image.def_bwd
+    def _(rendering: Rendering, gradient: Rendering, perturbed: Any, scene: Scene, known: Known) -> Any:
+        # None stands for what the loss does not use
+        whole = jax.tree.map(
+            lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
+            *(rendering, gradient),
+            is_leaf=lambda leaf: leaf is None,
+        )
+        return eqx.filter(_pulled(scene, perturbed, known, rendering, whole), perturbed)
+
+    return image(scene, jax.lax.stop_gradient(known))
+
+
+def _image(scene: Scene, how: _How, known: Known) -> Rendering:
+    volume, transfer, source, march = scene
     volume = with_words(volume, known.words)
-    width, height = camera.size
-    across, down = -(-width // BEAM), -(-height // BEAM)
-    count = min(how.most_beams, across * down)
-    waves = -(-across * down // count)
+    direct = how.adjoint == "direct"
+    waves, space = Waves.of(source, DIRECT_WAVE if direct else WAVE), march.locate(volume)
+    survey = None if direct else _survey((volume, transfer, source, march), known)
+    seen = transfer.over(volume)
+
+    def wave(number: Int[Array, ""]) -> Rendering:
+        rays = waves.rays(source, space, number)
+        if direct:
+            one = each_ray(lambda ray, at: step(march, ray, volume, seen, at))
+            start = each_ray(lambda ray: begin(march, ray))(rays)
+            at, _ = jax.lax.scan(lambda at, _: (one(rays, at), None), start, None, length=how.length)
+        else:
+            beams = Beams(rays, waves.beams, waves.box(source, rays, number))
+            at, _ = march_beams(march, volume, seen, survey, beams)
+        return each_ray(end)(rays, at)
+
+    return jax.tree.map(waves.assemble, jax.lax.map(wave, jnp.arange(waves.number)))
+
+
+def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gradient: Rendering) -> Any:
+    """What every leaf of the scene gets of an image's gradient."""
+    volume, transfer, source, march = scene
+    of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
+    places = any(jax.tree.leaves((perturbed[0], *perturbed[2:])))
+    packed = with_words(volume, known.words)
+    waves, survey = Waves.of(source, WAVE), _survey(scene, known)
+    seen = transfer.over(packed)
+
+    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Rendering, Rendering]) -> tuple[Any, None]:
+        (total, of_source), (number, rendering, gradient) = sums, given
+
+        def made(moving: PyTree) -> Ray:
+            volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
+            return waves.rays(source_, march_.locate(with_voxels(volume_, volume.data)), number)
+
+        moving = floats((without_voxels(volume), source, march))
+        rays, pull = eqx.filter_vjp(made, moving)
+        replay = Replay(
+            (packed, transfer, march),
+            seen,
+            *(rays, Cotangents.of(rays, rendering, gradient), total),
+            places=places,
+        )
+        beams = Beams(rays, waves.beams, waves.box(source, rays, number))
+        _, (of_rays, total) = march_beams(march, packed, seen, survey, beams, replay)
+        if not places:
+            return (total, of_source), None
+        # a depth counts from the ray's origin, a sample's from the entry
+        toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
+        of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
+        of_volume, of_rays_source, of_march = pull(of_rays)[0]
+        total = eqx.tree_at(
+            lambda t: (t.volume, t.march),
+            total,
+            (added(total.volume, of_volume), added(total.march, of_march)),
+        )
+        return (total, added(of_source, of_rays_source)), None
+
+    start = (
+        Total.zeros(volume, transfer, march, voxels=of_voxels),
+        jax.tree.map(jnp.zeros_like, floats(source)),
+    )
+    image = jax.tree.map(waves.apart, (rendering, gradient))
+    (total, of_source), _ = jax.lax.scan(wave, start, (jnp.arange(waves.number), *image))
+    of_volume = total.volume
+    if total.voxels is not None:
+        of_volume = with_voxels(of_volume, total.voxels.reshape(volume.data.shape))
+    return of_volume, total.transfer, of_source, total.march
+
+
+def _survey(scene: Scene, known: Known) -> Survey | None:
+    """What is known of empty space. Nothing of it has a gradient."""
+    volume, transfer, source, march = jax.lax.stop_gradient(scene)
+    if known.blocks is None:
+        return None
     space = march.locate(volume)
+    occupancy = space.occupancy(transfer.visible(known.blocks))
+    if isinstance(source, OwnRays):
+        return march.survey(occupancy, None)
 
     def first_hit(survey: Survey, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
         first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
-        origin, direction = _each_ray(camera.ray)(columns.reshape(-1, 1), rows.reshape(-1, 1))
-        rays = jnp.stack(origin, -1).reshape(-1, 3), jnp.stack(direction, -1).reshape(-1, 3)
-        beams = _own_beams(space, *rays, columns.size)
-        depth = _march(volume, transfer, first, how, survey, beams).depth
-        return depth.reshape(-1)[: columns.size].reshape(columns.shape)
+        ends = jax.vmap(source.ray)(columns.reshape(-1), rows.reshape(-1))
+        own, none = OwnRays(*(jnp.stack(end, axis=-1) for end in ends)), jnp.zeros((), jnp.int32)
+        waves = Waves.of(own, columns.size)
+        rays = waves.rays(own, space, none)
+        beams = Beams(rays, waves.beams, waves.box(own, rays, none))
+        at, _ = march_beams(first, volume, transfer.over(volume), survey, beams)
+        return waves.assemble(each_ray(end)(rays, at).depth[None]).reshape(columns.shape)
 
-    survey = _survey(space, transfer, march, known, how, View(camera.ray, camera.size, first_hit))
-
-    def wave(number: Int[Array, ""]) -> Rendering:
-        def pixel(part_y: Array, part_x: Array) -> Pixels:
-            """Columns and rows of these places in each beam."""
-            beam = (number * count + jnp.arange(count))[:, None]
-            return (beam % across) * BEAM + part_x[None], (beam // across) * BEAM + part_y[None]
-
-        def box(occupancy: Occupancy) -> Box:
-            y, x = jnp.divmod(jnp.arange(4), 2)
-            return Box.within(occupancy, *_each_ray(camera.ray)(*pixel(y * (BEAM - 1), x * (BEAM - 1))))
-
-        # within a beam, group by group
-        group_y, group_x, y, x = jnp.unravel_index(jnp.arange(BEAM * BEAM), (2, 2, SIDE, SIDE))
-        column, row = (i.reshape(-1, GROUP) for i in pixel(group_y * SIDE + y, group_x * SIDE + x))
-        rays = _enter(
-            space, _each_ray(camera.ray)(column, row), (column, row), (column < width) & (row < height)
-        )
-        return _march(volume, transfer, march, how, survey, Beams(rays, count, box))
-
-    def assemble(leaf: Array) -> Array:
-        leaf = leaf.reshape(-1, BEAM * BEAM, *leaf.shape[3:])[: across * down]
-        image = leaf.reshape(down, across, 2, 2, SIDE, SIDE, *leaf.shape[2:])
-        image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
-        return image.reshape(down * BEAM, across * BEAM, *leaf.shape[2:])[:height, :width]
-
-    return jax.tree.map(assemble, how.in_turn(wave, jnp.arange(waves)))
-
-
-@_compiled
-def _render_rays(scene: tuple[Volume, Transfer, Array, Array, March], how: _How, known: Known) -> Rendering:
-    return _replayed(_own_rays, scene, how, known)
-
-
-def _own_rays(scene: tuple[Volume, Transfer, Array, Array, March], how: _How, known: Known) -> Rendering:
-    volume, transfer, origins, directions, march = scene
-    volume = with_words(volume, known.words)
-    shape = origins.shape[:-1]
-    count = math.prod(shape)
-    in_wave = min(how.most_beams * BEAM * BEAM, max(count, 1))
-    waves = -(-count // in_wave)
-    space = march.locate(volume)
-    survey = _survey(space, transfer, march, known, how, None)
-
-    def in_waves(rays: Float[Array, "*_ 3"]) -> Float[Array, "waves rays 3"]:
-        padded = jnp.pad(rays.reshape(count, 3), ((0, waves * in_wave - count), (0, 0)), mode="edge")
-        return padded.reshape(waves, in_wave, 3)
-
-    def wave(given: tuple[Array, Array, Array]) -> Rendering:
-        number, origin, direction = given
-        beams = _own_beams(space, origin, direction, count, number * in_wave)
-        return jax.tree.map(
-            lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:in_wave],
-            _march(volume, transfer, march, how, survey, beams),
-        )
-
-    def assemble(leaf: Array) -> Array:
-        return leaf.reshape(-1, *leaf.shape[2:])[:count].reshape(*shape, *leaf.shape[2:])
-
-    given = jnp.arange(waves), in_waves(origins), in_waves(directions)
-    return jax.tree.map(assemble, how.in_turn(wave, given))
-
-
-def _own_beams(
-    space: Space,
-    origins: Float[Array, "rays 3"],
-    directions: Float[Array, "rays 3"],
-    count: int,
-    first: Any = 0,
-) -> Beams:
-    """Beams of rays in the order in which they were given, of which the first one has this number."""
-    length = origins.shape[0]
-    beams = max(-(-length // (BEAM * BEAM)), 1)
-    place = jnp.arange(beams * BEAM * BEAM).reshape(-1, GROUP)
-    at = jnp.minimum(place, max(length - 1, 0))
-    origin, direction = ((part[at, 0], part[at, 1], part[at, 2]) for part in (origins, directions))
-    wanted = (place < length) & (first + place < count)
-    rays = _enter(space, (origin, direction), (first + place, jnp.zeros_like(place)), wanted)
-
-    def box(occupancy: Occupancy) -> Box:
-        return Box.around(occupancy, jax.tree.map(lambda leaf: leaf.reshape(beams, -1), rays))
-
-    return Beams(rays, beams, box)
-
-
-def _survey(
-    space: Space, transfer: Transfer, march: March, known: Known, how: _How, view: View | None
-) -> Survey | None:
-    if known.blocks is None or how.plain:
-        return None
-    return march.survey(space.occupancy(transfer.visible(known.blocks)), view)
-
-
-def _each_ray(f: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of one ray, of arrays (groups, rays in a group)."""
-    return jax.vmap(jax.vmap(f))
-
-
-def _enter(
-    space: Space, rays: tuple[Points, Points], pixel: Pixels, wanted: Bool[Array, "groups rays"]
-) -> Ray:
-    """Rays cut to the volume. Those that are not wanted fill up groups, and miss it."""
-    ray = _each_ray(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(*rays, pixel)
-    return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))
-
-
-def _march(
-    volume: Volume, transfer: Transfer, march: March, how: _How, survey: Survey | None, beams: Beams
-) -> Rendering:
-    """A wave of beams, from entry to end: (groups, rays in a group)."""
-    seen = transfer.over(volume)
-    if how.plain:
-        one = _each_ray(lambda ray, at: step(march, ray, volume, seen, at))
-        at = how.run(lambda at: one(beams.rays, at), _each_ray(lambda ray: begin(march, ray))(beams.rays))
-    else:
-        at = march_beams(march, volume, seen, survey, beams)
-    return _each_ray(end)(beams.rays, at)
+    return march.survey(occupancy, View(source.ray, source.size, first_hit))
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

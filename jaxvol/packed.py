@@ -53,8 +53,6 @@ class PackedVolume(Volume):
         return [row(base), row(base + ny * nz)], fraction
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
-        # XLA limits every index to the array, one lane after the other, unless it sees that none is past it
-        flat &= self.words.shape[0] - 1
         word = self.words.at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
         # XLA fetches anew for each of several uses, but not for those of what a fetched value is converted to
         return word.astype(jnp.int32)
@@ -64,12 +62,7 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     """The packed copy of a volume's voxels; None where it is no use, or takes too much memory."""
     data = volume.data
     small = data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
-    if (
-        not small
-        or is_traced(data)
-        or not isinstance(data, jax.Array)
-        or 4 * _power_of_two(data.size) > LIMIT
-    ):
+    if not small or is_traced(data) or not isinstance(data, jax.Array) or 4 * data.size > LIMIT:
         return None
     return kept(data, _packed)
 
@@ -91,9 +84,4 @@ def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
     words = unsigned | beside(unsigned, 2) << bits
     if bits == 8:
         words = words | beside(words, 1) << 16
-    return jnp.pad(words.reshape(-1), (0, _power_of_two(words.size) - words.size))
-
-
-def _power_of_two(size: int) -> int:
-    """The next power of two."""
-    return 1 << (size - 1).bit_length()
+    return words.reshape(-1)

@@ -30,8 +30,8 @@ from .volume import Volume
 class Progress(eqx.Module):
     """How far a ray has come.
 
-    The front of the next cell lies at `offset + index d`. Counting steps, rather than adding them up,
-    keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add.
+    The front of the next cell lies at `(offset + index) d`. Counting steps, rather than adding them up,
+    keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps.
     """
 
     index: Int[Array, ""]
@@ -52,7 +52,7 @@ def begin(march: March, ray: Ray) -> Progress:
     count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
         index=count,
-        offset=march.start(ray) * march.step,
+        offset=march.start(ray),
         color=(zero, zero, zero),
         opacity=zero,
         moment=zero,
@@ -73,15 +73,18 @@ def measure(march: March, ray: Ray, seen: Classification, piece: Cell) -> Measur
     return seen.measure(ray.path(march.sample(piece)))
 
 
+def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
+    """Whether the volume is at this depth: neither past the exit nor in a gap."""
+    inside = depth < ray.length
+    return inside & ray.path.contains(ray.path(depth)) if ray.path.gaps else inside
+
+
 def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured) -> Scalar:
     """Opacity of a piece; 0 past the exit, and in gaps."""
-    depth = march.sample(piece)
     _, extinction = seen.classify(measured)
-    inside = depth < ray.length
-    if ray.path.gaps:
-        inside &= ray.path.contains(ray.path(depth))
-    # 1 - exp(-τ), so that thin cells keep their digits, as expm1 does in half as much time again
-    t = jnp.tanh(jnp.where(inside, extinction, 0) * piece.width / 2)
+    optical_depth = jnp.where(contained(ray, march.sample(piece)), extinction, 0) * piece.width
+    # 1 - exp(-τ), and thin cells keep their digits, as under expm1, which takes half as much time again
+    t = jnp.tanh(optical_depth / 2)
     return 2 * t / (1 + t)
 
 
@@ -120,13 +123,13 @@ def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""], cel
     at = replace(at, index=at.index + cells)
     if march.moves:
         steps, memory = march.advance(at.memory, ray, transparent)
-        at = replace(at, offset=at.offset + (steps - 1) * march.step, memory=memory)
+        at = replace(at, offset=at.offset + steps - 1, memory=memory)
     return replace(at, finished=at.finished | (front(march, at) >= ray.length))
 
 
 def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
     """Depth at which the next cell begins, or one so many cells ahead."""
-    return at.offset + (at.index + ahead).astype(at.offset.dtype) * march.step
+    return (at.offset + (at.index + ahead).astype(at.offset.dtype)) * march.step
 
 
 def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progress) -> Progress:

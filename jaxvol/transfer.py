@@ -56,6 +56,21 @@ class Transfer(eqx.Module):
         """Measuring and classifying the grid coordinates of this volume."""
         return Classification(lambda coordinate: self.measured(volume, coordinate), self.classifier())
 
+    def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
+        """The transposed derivative of classifying many samples, arrays of any one shape: what the transfer
+        function, and what was measured, get of these cotangents of colour and extinction. None where there
+        is no derivative."""
+
+        def classified(given: tuple[Transfer, Measured]) -> tuple[Triple, Scalar]:
+            transfer, measured = given
+            classify = transfer.classifier()
+            for _ in range(extinction.ndim):
+                classify = jax.vmap(classify)
+            return classify(measured)
+
+        _, pull = eqx.filter_vjp(classified, (self, measured))
+        return pull((color, extinction))[0]
+
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """In which blocks of a volume anything may be seen: False is a proof that the extinction is 0
         wherever the value lies in the block's range. It carries no gradient. By default nothing is proven."""
@@ -154,6 +169,22 @@ class TransferFunction(Transfer):
 
         return chosen if values.shape[0] <= FEW else looked_up
 
+    def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
+        # By one scatter of whole rows, where JAX would sum up for every entry of a row apart.
+        (value,), rows = measured, jax.lax.stop_gradient(self.rows())
+        clipped = jnp.clip(value, self.values[0], self.values[-1])
+        interval = jnp.clip(points_below(self.values, clipped) - 1, 0, rows.shape[0] - 1)
+        start, inverse, *_, r, g, b, first, last = row_of(rows, interval)
+        part = jnp.minimum((clipped - start) * inverse, 1)
+        parts = jnp.stack([*color, extinction], axis=-1)
+        shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
+        sums = jnp.zeros((rows.shape[0], 8), shared.dtype).at[interval].add(shared, mode="promise_in_bounds")
+        at_points = jnp.pad(sums[:, :4], ((0, 1), (0, 0))) + jnp.pad(sums[:, 4:], ((1, 0), (0, 0)))
+        leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
+        transfer = eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), self, leaves)
+        slope = color[0] * r + color[1] * g + color[2] * b + extinction * (last - first) * inverse
+        return transfer, (jnp.where(value == clipped, slope, 0),)
+
     def rows(self) -> Float[Array, "intervals 10"]:
         """A table with one row for each interval between points: all that a sample there needs, so that it
         finds them side by side. Start, inverse width, colour at the start and its slope, extinction at the
@@ -204,6 +235,7 @@ def seen_between(
     high: Float[Array, "*blocks"],
 ) -> Bool[Array, "*blocks"]:
     """Whether the extinction is positive anywhere from `low` to `high`."""
+    low, high = low.astype(values.dtype), high.astype(values.dtype)
     positive, n = extinction > 0, values.shape[0]
     if n > FEW:  # comparing with each point would cost more than looking up how many lie below
         before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])

@@ -129,10 +129,13 @@ class Volume(eqx.Module):
         _, ny, nz = self.shape
         base = (i * ny + j) * nz + k
         cube = [
-            [[_fetch(self.data, base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)]
+            [[self._voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)]
             for x in (0, 1)
         ]
         return cube, fraction
+
+    def _voxel(self, flat: Int[Array, ""]) -> Shaped[Array, ""]:
+        return _fetch(self.data, flat)
 
     def _trilinear_slopes(self, coordinate: Triple) -> Triple:
         (((c000, c001), (c010, c011)), ((c100, c101), (c110, c111))), (fx, fy, fz) = self._cube(coordinate)

@@ -13,9 +13,9 @@ What makes this fast was measured (on CPU, by XLA's rules), and is what this fil
 None of it shows in the result: cells, transforms and the blending are those of `reference`.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -45,6 +45,10 @@ KEPT = 0.75
 """The share of a batch's groups that must be alive for it to go on."""
 
 
+_State: TypeAlias = tuple[Progress, Any]
+"""Where all rays are, and what a follower remembers of them, adds up for them, and over all of them."""
+
+
 class Beams(eqx.Module):
     """Rays that are marched together, in groups of which some make up a beam.
 
@@ -58,10 +62,45 @@ class Beams(eqx.Module):
     box: Callable[[Occupancy], Box] = eqx.field(static=True)
 
 
+class Samples(NamedTuple):
+    """The pieces of the next cells of many rays: arrays (CELLS, rays), one of each kind for each piece that
+    a cell may fall into. Those that a ray does not come to lie past its exit."""
+
+    cells: list[Cell]
+    measured: list[Measured]
+    opacity: list[Scalar]
+
+
+class Follower(ABC):
+    """Something that goes along with a march, and looks at all its samples.
+
+    - `given`, `kept`, `sums`: what it knows of each ray, remembers, and adds up from 0: (groups, GROUP).
+    - `total`: what it adds up over all rays.
+    """
+
+    given: PyTree
+    kept: PyTree
+    sums: PyTree
+    total: PyTree
+
+    @abstractmethod
+    def follow(
+        self, ray: Ray, at: Progress, samples: Samples, given: PyTree, kept: PyTree, total: PyTree
+    ) -> tuple[PyTree, PyTree, PyTree]:
+        """What it remembers behind the samples of some rays, what they add to the rays' sums, and the total
+        with them."""
+
+
 def march_beams(
-    march: March, volume: Volume, seen: Classification, survey: Survey | None, beams: Beams
-) -> Progress:
-    """Where the marches of all rays end, of shape (groups, GROUP)."""
+    march: March,
+    volume: Volume,
+    seen: Classification,
+    survey: Survey | None,
+    beams: Beams,
+    follower: Follower | None = None,
+) -> tuple[Progress, Any]:
+    """Where the marches of all rays end, of shape (groups, GROUP); and what a follower who went along has
+    added up, for each ray and over all of them."""
     rays, groups = beams.rays, beams.rays.length.shape[0]
     size = min(BATCH, groups)
     at = jax.vmap(jax.vmap(begin, in_axes=(None, 0)), in_axes=(None, 0))(march, rays)
@@ -73,51 +112,78 @@ def march_beams(
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
     at = _with(at, finished=finished)
 
-    def run(rows: Int[Array, " batch"], at: Progress, keep: Int[Array, ""]) -> Progress:
+    def run(rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""]) -> _State:
         """March the groups in these rows for a while; a row past the last one stands for none."""
         known = jnp.minimum(rows, groups - 1)
+        beam = jnp.repeat(known // (groups // beams.count), GROUP)
 
         def take(leaf: Array) -> Array:
             # side by side, so that each is changed where it lies: a reshape in the loop would copy it
             taken = leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
             return taken.reshape(-1, *leaf.shape[2:])
 
-        some, here = jax.tree.map(take, (rays, at))
-        here = _with(here, finished=here.finished | jnp.repeat(rows >= groups, GROUP))
-        beam = jnp.repeat(known // (groups // beams.count), GROUP)
-
-        def go_on(here: Progress) -> Bool[Array, ""]:
-            return jnp.sum(jnp.any(_alive(march, here).reshape(size, GROUP), axis=-1)) > keep
-
-        def go(here: Progress) -> Progress:
-            if survey is not None:
-                here = _leap(march, survey, notes, beam, some, here)
-            return _segment(march, volume, seen, some, here)
-
         def put(leaf: Array, part: Array) -> Array:
             return leaf.at[rows].set(part.reshape(size, GROUP, *part.shape[1:]), mode="drop")
 
-        return jax.tree.map(put, at, jax.lax.while_loop(go_on, go, here))
+        def add(leaf: Array, part: Array) -> Array:
+            return leaf.at[rows].add(part.reshape(size, GROUP, *part.shape[1:]), mode="drop")
+
+        some, here = jax.tree.map(take, (rays, state[0]))
+        here = _with(here, finished=here.finished | jnp.repeat(rows >= groups, GROUP))
+
+        def go_on(here: tuple[Progress, Any]) -> Bool[Array, ""]:
+            return jnp.sum(jnp.any(_alive(march, here[0]).reshape(size, GROUP), axis=-1)) > keep
+
+        def onward(here: Progress) -> Progress:
+            return here if survey is None else _leap(march, survey, notes, beam, some, here)
+
+        if follower is None:
+
+            def go(here: tuple[Progress, None]) -> tuple[Progress, None]:
+                return _segment(march, volume, seen, some, onward(here[0]))[0], None
+
+            here, _ = jax.lax.while_loop(go_on, go, (here, None))
+            return jax.tree.map(put, state[0], here), None
+
+        companion, (at, (kept, sums, total)) = follower, state
+        given = jax.tree.map(take, follower.given)
+
+        def go_along(here: tuple[Progress, Any]) -> tuple[Progress, Any]:
+            at, (kept, sums, total) = here
+            at = onward(at)
+            after, samples = _segment(march, volume, seen, some, at)
+            kept, more, total = companion.follow(some, at, samples, given, kept, total)
+            return after, (kept, jax.tree.map(jnp.add, sums, more), total)
+
+        zeros = jax.tree.map(lambda leaf: jnp.zeros((size * GROUP, *leaf.shape[2:]), leaf.dtype), sums)
+        along = jax.tree.map(take, kept), zeros, total
+        here, (part, more, total) = jax.lax.while_loop(go_on, go_along, (here, along))
+        return jax.tree.map(put, at, here), (
+            jax.tree.map(put, kept, part),
+            jax.tree.map(add, sums, more),
+            total,
+        )
 
     def alive_rows(at: Progress) -> tuple[Int[Array, " padded"], Int[Array, ""]]:
         alive = jnp.any(_alive(march, at), axis=-1)
         rows = jnp.nonzero(alive, size=-(-groups // size) * size, fill_value=groups)[0]
         return rows.astype(jnp.int32), jnp.sum(alive, dtype=jnp.int32)
 
-    def round_(state: tuple[Progress, Array, Array]) -> tuple[Progress, Array, Array]:
-        at, rows, count = state
+    def round_(round_: tuple[_State, Array, Array]) -> tuple[_State, Array, Array]:
+        state, rows, count = round_
         # only full batches, as long as there are any: what remains joins those of the next round
         batches = jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, int(KEPT * size), 0)
 
-        def one(i: Int[Array, ""], at: Progress) -> Progress:
-            return run(jax.lax.dynamic_slice_in_dim(rows, i * size, size), at, keep)
+        def one(i: Int[Array, ""], state: _State) -> _State:
+            return run(jax.lax.dynamic_slice_in_dim(rows, i * size, size), state, keep)
 
-        at = jax.lax.fori_loop(0, batches, one, at)
-        return at, *alive_rows(at)
+        state = jax.lax.fori_loop(0, batches, one, state)
+        return state, *alive_rows(state[0])
 
-    at, _, _ = jax.lax.while_loop(lambda state: state[2] > 0, round_, (at, *alive_rows(at)))
-    return at
+    state: _State = at, None if follower is None else (follower.kept, follower.sums, follower.total)
+    (at, along), _, _ = jax.lax.while_loop(lambda state: state[2] > 0, round_, (state, *alive_rows(at)))
+    return at, None if along is None else along[1:]
 
 
 def _with(at: Progress, **changes: Array) -> Progress:
@@ -134,7 +200,9 @@ def _each(f: Any) -> Any:
     return lambda ray, *cells: jax.vmap(lambda *cells: jax.vmap(f)(ray, *cells))(*cells)
 
 
-def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
+def _segment(
+    march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress
+) -> tuple[Progress, Samples]:
     """The next cells of each ray, on to where it is finished, or has moved off the places sampled here."""
     ahead = jnp.arange(CELLS, dtype=at.index.dtype)
     live = _alive(march, at)
@@ -162,29 +230,30 @@ def _segment(march: March, volume: Volume, seen: Classification, ray: Ray, at: P
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
     any_live = jnp.any(live)
-    values = _in_memory(any_live, measured, at, given)
-    alphas = _in_memory(any_live, opacities, at, given, values)
+    values = in_memory(any_live, measured, at, given)
+    alphas = in_memory(any_live, opacities, at, given, values)
     bounded = march.moves or march.max_samples is not None
-    taken, moved = _taken(march, at, live, alphas) if bounded else (CELLS, jnp.zeros(live.shape, bool))
+    taken, moved = jnp.full_like(at.index, CELLS), jnp.zeros(live.shape, bool)
+    if bounded:
+        taken, moved = _taken(march, at, live, alphas)
 
-    def blended(ray: Ray, at: Progress, takes: Bool[Array, ""], cell: Any) -> Progress:
-        if bounded:  # what is not taken is blended as if it lay past the exit
-            cell = tuple(
-                (
-                    replace(piece, front=jnp.where(takes, piece.front, ray.length)),
-                    read,
-                    jnp.where(takes, alpha, 0),
-                )
-                for piece, read, alpha in cell
-            )
-        return blend(march, ray, seen, at, cell)
-
-    after, taken = at, jnp.broadcast_to(taken, live.shape)
-    samples = tuple(zip(cells(at, given), values, alphas, strict=True))
+    samples = Samples(list(cells(at, given)), values, alphas)
+    if bounded:  # what is not taken is blended as if it lay past the exit
+        takes = ahead[:, None] < taken[None]
+        samples = Samples(
+            [
+                eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
+                for cell in samples.cells
+            ],
+            values,
+            [jnp.where(takes, alpha, 0) for alpha in alphas],
+        )
+    after = at
     for k in range(CELLS):
-        cell = jax.tree.map(lambda leaf, k=k: leaf[k], samples)
-        after = jax.vmap(blended)(ray, after, k < taken, cell)
-    return jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, moved, taken)
+        cell = jax.tree.map(lambda leaf, k=k: leaf[k], tuple(zip(*samples, strict=True)))
+        after = jax.vmap(lambda ray, at, cell: blend(march, ray, seen, at, cell))(ray, after, cell)
+    after = jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, moved, taken)
+    return after, samples
 
 
 def _taken(
@@ -208,7 +277,7 @@ def _taken(
     return jax.lax.cond(jnp.all((settled & (left >= CELLS)) | ~live), all_, up_to, alphas)
 
 
-def _in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
+def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
     """`f(*arguments)`, computed once and put in memory for all who use it; or anything where none is live."""
 
     def nothing(*arguments: Any) -> Any:

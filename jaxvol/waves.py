@@ -1,0 +1,169 @@
+"""In which order are the rays of an image marched? In beams of neighbouring pixels, and waves of beams.
+
+A wave's memory is all that a march holds beside the finished pixels, however large the image. Rays are made
+wave by wave, as arrays (groups, rays in a group); as many groups after each other make up a beam.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .beams import Box
+from .camera import Camera
+from .locate import Ray, Space, enter
+from .occupancy import Occupancy
+from .triple import Triple
+from .wavefront import GROUP
+
+
+SIDE = math.isqrt(GROUP)
+"""Pixels along the side of a group of rays."""
+
+BEAM = 2 * SIDE
+"""Pixels along the side of a beam, which is 2 x 2 groups."""
+
+Lanes = Int[Array, "groups rays"]
+
+
+class OwnRays(eqx.Module):
+    """Rays of one's own: world origins, and unit directions."""
+
+    origins: Float[Array, "*rays 3"]
+    directions: Float[Array, "*rays 3"]
+
+
+class Waves(eqx.Module):
+    """The order of an image's rays.
+
+    - `number`: of waves. `beams`: in each wave.
+    """
+
+    number: int = eqx.field(static=True)
+    beams: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, source: Camera | OwnRays, most_beams: int) -> "Waves":
+        """Those of a camera's pixels, or of one's own rays, with at most so many beams in a wave."""
+        if isinstance(source, Camera):
+            width, height = source.size
+            across, down = -(-width // BEAM), -(-height // BEAM)
+            beams = min(most_beams, across * down)
+            return _OfPixels(-(-across * down // beams), beams, source.size, across, down)
+        shape = source.origins.shape[:-1]
+        needed = -(-math.prod(shape) // BEAM**2)
+        beams = max(min(most_beams, needed), 1)
+        return _OfRays(-(-needed // beams), beams, shape)
+
+    @abstractmethod
+    def rays(self, source: Any, space: Space, wave: Int[Array, ""]) -> Ray:
+        """The rays of a wave, cut to the volume. Those that only fill up groups miss it."""
+
+    @abstractmethod
+    def box(self, source: Any, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+        """The boxes around the beams of a wave."""
+
+    @abstractmethod
+    def assemble(self, leaf: Array) -> Array:
+        """From (waves, groups, rays in a group, *rest) to the image's shape."""
+
+    @abstractmethod
+    def apart(self, leaf: Array) -> Array:
+        """The other way round; 0 for rays that only fill up groups."""
+
+
+class _OfPixels(Waves):
+    """A camera's pixels: beams row by row, and each group by group."""
+
+    size: tuple[int, int] = eqx.field(static=True)
+    across: int = eqx.field(static=True)
+    down: int = eqx.field(static=True)
+
+    def rays(self, source: Camera, space: Space, wave: Int[Array, ""]) -> Ray:
+        group_y, group_x, y, x = jnp.unravel_index(jnp.arange(BEAM * BEAM), (2, 2, SIDE, SIDE))
+        column, row = self._pixels(wave, group_y * SIDE + y, group_x * SIDE + x)
+        column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
+        width, height = self.size
+        origin, direction = each_ray(source.ray)(column, row)
+        return entering(space, origin, direction, (column, row), (column < width) & (row < height))
+
+    def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+        y, x = jnp.divmod(jnp.arange(4), 2)
+        column, row = self._pixels(wave, y * (BEAM - 1), x * (BEAM - 1))
+        return lambda occupancy: Box.within(occupancy, *each_ray(source.ray)(column, row))
+
+    def _pixels(self, wave: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
+        """Columns and rows of these places in each of a wave's beams."""
+        beam = (wave * self.beams + jnp.arange(self.beams))[:, None]
+        return (beam % self.across) * BEAM + x[None], (beam // self.across) * BEAM + y[None]
+
+    def assemble(self, leaf: Array) -> Array:
+        rest, (width, height) = leaf.shape[3:], self.size
+        beams = leaf.reshape(-1, BEAM * BEAM, *rest)[: self.across * self.down]
+        image = beams.reshape(self.down, self.across, 2, 2, SIDE, SIDE, *rest)
+        image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
+        return image.reshape(self.down * BEAM, self.across * BEAM, *rest)[:height, :width]
+
+    def apart(self, leaf: Array) -> Array:
+        rest, (width, height) = leaf.shape[2:], self.size
+        more = (self.down * BEAM - height, self.across * BEAM - width)
+        image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
+        image = image.reshape(self.down, 2, SIDE, self.across, 2, SIDE, *rest)
+        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, BEAM * BEAM, *rest)
+        missing = self.number * self.beams - self.across * self.down
+        beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (1 + len(rest)))
+        return beams.reshape(self.number, -1, GROUP, *rest)
+
+
+class _OfRays(Waves):
+    """Rays of one's own, in the order in which they were given."""
+
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def rays(self, source: OwnRays, space: Space, wave: Int[Array, ""]) -> Ray:
+        count = math.prod(self.shape)
+        if count == 0:  # one to look up where there is none
+            source = jax.tree.map(lambda leaf: jnp.ones((1, 3), leaf.dtype), source)
+        place = wave * self.beams * BEAM**2 + jnp.arange(self.beams * BEAM**2).reshape(-1, GROUP)
+        known = jnp.minimum(place, max(count - 1, 0))
+        x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
+        dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
+        return entering(space, (x, y, z), (dx, dy, dz), (place, jnp.zeros_like(place)), place < count)
+
+    def box(self, source: OwnRays, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beams, -1), rays)
+        return lambda occupancy: Box.around(occupancy, by_beam)
+
+    def assemble(self, leaf: Array) -> Array:
+        rest = leaf.shape[3:]
+        return leaf.reshape(-1, *rest)[: math.prod(self.shape)].reshape(*self.shape, *rest)
+
+    def apart(self, leaf: Array) -> Array:
+        rest, count = leaf.shape[len(self.shape) :], math.prod(self.shape)
+        missing = self.number * self.beams * BEAM**2 - count
+        padded = jnp.pad(leaf.reshape(count, *rest), [(0, missing)] + [(0, 0)] * len(rest))
+        return padded.reshape(self.number, self.beams * BEAM**2 // GROUP, GROUP, *rest)
+
+
+def each_ray(f: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of one ray, of arrays (groups, rays in a group)."""
+    return jax.vmap(jax.vmap(f))
+
+
+def entering(
+    space: Space,
+    origin: Triple,
+    direction: Triple,
+    pixel: tuple[Lanes, Lanes],
+    wanted: Bool[Array, "groups rays"],
+) -> Ray:
+    """Rays cut to the volume; those that are not wanted miss it."""
+    ray = each_ray(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(
+        origin, direction, pixel
+    )
+    return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))
