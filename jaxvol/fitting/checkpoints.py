@@ -60,8 +60,8 @@ def load(path: Path, about: dict[str, Any]) -> Arrays | None:
         for what, here in about.items():
             if not _agree(found.get(what), here):
                 raise ValueError(
-                    f"checkpoint {candidate} belongs to another fit: its {what} is {found.get(what)}, that of "
-                    f"this fit is {here}. Give another file, or delete this one."
+                    f"checkpoint {candidate} belongs to another fit: its {what} is {found.get(what)}, "
+                    f"that of this fit is {here}. Give another file, or delete this one."
                 )
         return arrays
     return None

@@ -1,8 +1,8 @@
 """How far does a Levenberg–Marquardt step go? As far in each parameter as the Jacobian says something of it.
 
-Optimistix damps by λ |d|², which depends on the units of the residual and of every parameter: where residuals
-are small, as those of images are, steps are damped to a standstill. Marquardt (1963) damps by λ Σ Dᵢ² dᵢ² with
-Dᵢ² = (JᵀJ)ᵢᵢ, which no unit changes. It is Optimistix's step in the parameters D d.
+Optimistix damps by λ |d|², which depends on the units of the residual and of every parameter: where
+residuals are small, as those of images are, steps are damped to a standstill. Marquardt (1963) damps by
+λ Σ Dᵢ² dᵢ² with Dᵢ² = (JᵀJ)ᵢᵢ, which no unit changes. It is Optimistix's step in the parameters D d.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 
-FLOOR = 1e-3
-"""Least Dᵢ, as part of the greatest: a parameter of which next to nothing shows must not run away."""
+FLOOR = 0.1
+"""Least Dᵢ, as part of the greatest: a parameter of which next to nothing shows must not run away. (A
+transfer function is recovered from two images of a head to rounding at 0.1, to a wrong minimum at 0.001.)"""
 
 
 class ScaledDescent(optx.AbstractDescent):
@@ -49,6 +50,6 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     rtol: float
     atol: float
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
-    descent: ScaledDescent = ScaledDescent()
-    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(high_cutoff=0.75)
+    descent: optx.AbstractDescent = ScaledDescent()
+    search: optx.AbstractSearch = optx.ClassicalTrustRegion(high_cutoff=0.75)
     verbose: Callable[..., None] = lambda **_: None

@@ -5,6 +5,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
@@ -34,8 +35,8 @@ class Outcome(optx.RESULTS):  # pyright: ignore
     """How a fit ended: Optimistix's results, and one more."""
 
     stalled = (
-        "No step lowered the loss any more: a minimum, as far as the float type can tell, or a place where the "
-        "derivative does not say how the loss changes."
+        "No step lowered the loss any more by more than rtol: a minimum, as far as the float type can tell, "
+        "or a place where the derivative does not say how the loss changes."
     )
 
 
@@ -109,10 +110,11 @@ def fit(
       float array is unconstrained.
     - `where`: the parts that are free, `where(parameters)` as for `equinox.tree_at`: all else stays
       fixed. `lambda transfer: transfer.extinction`, or a tuple of parts.
-    - `rtol`, `atol`: tolerances for changes of the free numbers and of the residual in a step that ends a fit.
+    - `rtol`, `atol`: a fit has converged when in a step neither the free numbers nor the residual change by
+      more than this.
     - `max_steps`: the most steps. Each is an evaluation with derivative, also where the step is rejected.
-    - `patience`: steps without a lower loss after which a fit has stalled: 10, or 100 for Optax, by
-      default.
+    - `patience`: steps in which the loss does not fall by more than `rtol`, relatively, after which a fit
+      has stalled: 10, or 100 for Optax, by default.
     - `max_jacobian`: bytes. With a least-squares solver, only as many rows of the Jacobian are held at once
       as fit (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image. The
       result does not depend on it, but for rounding.
@@ -143,23 +145,20 @@ def fit(
     problem = Problem(residual, free, tile_entries(residual, y, max_jacobian, least_squares))
 
     run = _Run.begin(solver, problem, y)
-    file = None if checkpoint is None else Path(checkpoint)
-    if file is not None:
-        about = _about(solver, problem, run)
-        run = run.resumed(checkpoints.load(file, about))
-        saved = time.monotonic()
+    keeper = None if checkpoint is None else _Keeper(Path(checkpoint), _about(solver, problem, run))
+    if keeper is not None:
+        run = run.resumed(checkpoints.load(keeper.file, keeper.about))
     with _bar(progress, max_steps) as show:
-        while run.ended(max_steps, patience) is None:
+        while run.ended(max_steps, patience, rtol) is None:
             run = run.step(solver, problem)
             show(run)
             if callback is not None:
                 callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
-            if file is not None and time.monotonic() - saved >= checkpoint_seconds:
-                checkpoints.save(file, run.arrays(), about)
-                saved = time.monotonic()
-    if file is not None:
-        checkpoints.save(file, run.arrays(), about)
-    return _told(run, problem, run.ended(max_steps, patience), max_steps)
+            if keeper is not None and keeper.age >= checkpoint_seconds:
+                keeper.save(run)
+    if keeper is not None:
+        keeper.save(run)
+    return _told(run, problem, run.ended(max_steps, patience, rtol), max_steps)
 
 
 def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
@@ -180,7 +179,8 @@ def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
         optim = optax.adam(LEARNING_RATE) if solver == "adam" else solver
         return optx.OptaxMinimiser(optim, rtol, atol), 100
     raise ValueError(
-        f"solver must be one of {', '.join(get_args(Solver))}, or a solver of Optimistix or Optax; got {solver!r}."
+        f"solver must be one of {', '.join(get_args(Solver))}, or a solver of Optimistix or Optax; "
+        f"got {solver!r}."
     )
 
 
@@ -215,18 +215,19 @@ class _Run(eqx.Module):
     def step(self, solver: Any, problem: Problem) -> "_Run":
         y, state, (loss, seen, triangle), done, result = _advanced(solver, problem, self.y, self.state)
         loss = float(loss)
-        better = loss < np.nanmin(self.losses) if self.losses else True
+        better = loss < min(self.losses, default=math.inf)
         best, triangle = (seen, triangle) if better else (self.best, self.triangle)
         return _Run(y, state, seen, best, triangle, done, result, [*self.losses, loss])
 
-    def ended(self, max_steps: int, patience: int) -> Any:
+    def ended(self, max_steps: int, patience: int, rtol: float) -> Any:
         """The result, once the fit has ended."""
         finite = all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(self.y))
         if not finite or not math.isfinite(self.losses[-1]):
             return Outcome.nonfinite
         if self.done or self.result != optx.RESULTS.successful:
             return Outcome.promote(self.result)
-        if len(self.losses) - int(np.nanargmin(self.losses)) > patience:
+        earlier, late = self.losses[:-patience], self.losses[-patience:]
+        if earlier and min(late) >= (1 - rtol) * min(earlier):
             return Outcome.stalled
         if len(self.losses) >= max_steps:
             return Outcome.nonlinear_max_steps_reached
@@ -247,33 +248,19 @@ class _Run(eqx.Module):
         leaves, structure = jax.tree.flatten(dynamic)
         leaves = [jnp.asarray(arrays[f"a{i}"]) for i in range(len(leaves))]
         run = eqx.combine(jax.tree.unflatten(structure, leaves), static)
-        return _Run(
-            run.y,
-            run.state,
-            run.seen,
-            run.best,
-            run.triangle,
-            run.done,
-            run.result,
-            arrays["losses"].tolist(),
-        )
+        return replace(run, losses=arrays["losses"].tolist())
 
 
-def _objective(y: tuple, problem: Problem, least_squares: bool) -> tuple[Array, tuple[Array, tuple, Any]]:
-    """What the solver makes small; beside it the loss, and where it was taken."""
-    if not least_squares:
-        loss = problem.loss(y)
-        return loss, (loss, y, None)
+def _squares(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, Array]]:
+    """What a least-squares solver makes small; beside it the loss, where it was taken, and the triangle."""
     triangle = problem.condensed(y)
     return triangle[:, -1], (jnp.sum(triangle[:, -1] ** 2) / 2, y, triangle)
 
 
-def _squares(y: tuple, problem: Problem) -> Any:
-    return _objective(y, problem, True)
-
-
-def _loss(y: tuple, problem: Problem) -> Any:
-    return _objective(y, problem, False)
+def _loss(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, None]]:
+    """What a minimiser makes small; the same beside it."""
+    loss = problem.loss(y)
+    return loss, (loss, y, None)
 
 
 def _function(solver: Any) -> Callable[..., Any]:
@@ -296,6 +283,21 @@ def _advanced(solver: Any, problem: Problem, y: tuple, state: Any) -> Any:
     return y, state, getattr(state, "aux", before), done, result
 
 
+class _Keeper:
+    """Who writes checkpoints, and how old the last one is, seconds."""
+
+    def __init__(self, file: Path, about: dict[str, Any]):
+        self.file, self.about, self.written = file, about, time.monotonic()
+
+    @property
+    def age(self) -> float:
+        return time.monotonic() - self.written
+
+    def save(self, run: _Run) -> None:
+        checkpoints.save(self.file, run.arrays(), self.about)
+        self.written = time.monotonic()
+
+
 def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
     """What tells one fit from another."""
     free = problem.free
@@ -304,7 +306,7 @@ def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
         "solver": type(solver).__name__,
         "parameters": [f"{place}: {kind}" for place, kind in zip(free.places, kinds, strict=True)],
         "state": [f"{x.dtype}{list(x.shape)}" for x in jax.tree.leaves(eqx.filter(run, eqx.is_array))],
-        "number of residuals": problem.residual.count,
+        "number of residuals": problem.residual.count(),
         "loss at the start": run.losses[0],
     }
 
@@ -312,12 +314,12 @@ def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
 def _told(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     known = None
     if run.triangle is not None:
-        known = uncertainty(np.asarray(run.triangle), problem.residual.count, problem.free, run.best)
+        known = uncertainty(np.asarray(run.triangle), problem.residual.count(), problem.free, run.best)
         if known.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in known.undetermined[:6])
             warnings.warn(
-                f"{len(known.undetermined)} of {run.triangle.shape[0] - 1} directions are not determined by the "
-                f"residual; most moved by them: {moved}.",
+                f"{len(known.undetermined)} of {run.triangle.shape[0] - 1} directions are not determined by "
+                f"the residual; most moved by them: {moved}.",
                 stacklevel=3,
             )
     stats = {"num_steps": len(run.losses), "max_steps": max_steps}

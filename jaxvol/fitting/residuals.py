@@ -36,7 +36,7 @@ TANGENTS = 64
 
 
 class Tiles(NamedTuple):
-    """Pieces of a residual, all of one shape: `of(parameters, item, adjoint)` for each of the stacked items."""
+    """Pieces of a residual, of one shape: `of(parameters, item, adjoint)` for each of the stacked items."""
 
     of: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
     items: PyTree
@@ -50,7 +50,6 @@ class Residual(eqx.Module):
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most so many entries."""
 
-    @property
     @abstractmethod
     def count(self) -> int:
         """Entries of the whole."""
@@ -60,7 +59,7 @@ class OwnResidual(Residual):
     """A function from parameters to arrays, in one piece."""
 
     function: Callable[[PyTree], PyTree]
-    count: int
+    length: int
 
     @classmethod
     def of(cls, function: Any, parameters: PyTree) -> "OwnResidual":
@@ -75,17 +74,20 @@ class OwnResidual(Residual):
             raise ValueError("residual must return at least one number; got none.")
         return cls(function, count)
 
+    def count(self) -> int:
+        return self.length
+
     def tiles(self, most: int) -> list[Tiles]:
-        if self.count > most:
+        if self.length > most:
             raise ValueError(
-                f"max_jacobian leaves room for {most} of the residual's {self.count} entries, and a function "
-                "of one's own is not taken apart. Raise max_jacobian, or use an ImageResidual."
+                f"max_jacobian leaves room for {most} of the residual's {self.length} entries, and a "
+                "function of one's own is not taken apart. Raise max_jacobian, or use an ImageResidual."
             )
 
         def of(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
             return ravel_pytree(self.function(parameters))[0]
 
-        return [Tiles(of, jnp.zeros(1), self.count)]
+        return [Tiles(of, jnp.zeros(1), self.length)]
 
 
 class _Group(eqx.Module):
@@ -113,8 +115,8 @@ class ImageResidual(Residual):
     The residual is divided by the square root of the number of its entries, so that the loss, half the
     sum of squares, is half the mean square error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
 
-    A Jacobian that is too large is made in tiles of whole rows of an image. What is random along a ray is keyed
-    by its pixel in the tile: with `Jitter`, an image in tiles is jittered otherwise than in one piece.
+    A Jacobian that is too large is made in tiles of whole rows of an image. What is random along a ray is
+    keyed by its pixel in the tile: with `Jitter`, an image in tiles is jittered otherwise than in one piece.
 
     **Raises:** `ValueError` for no views, an image of another size than its camera's, NaN or infinite
     pixels, and a scene that returns something else.
@@ -145,7 +147,6 @@ class ImageResidual(Residual):
             for group in alike.values()
         ]
 
-    @property
     def count(self) -> int:
         return sum(group.images.size for group in self.groups)
 
@@ -161,7 +162,7 @@ class ImageResidual(Residual):
             )
         pieces = math.ceil(height / min(height, most // (width * channels)))
         rows = math.ceil(height / pieces)
-        weight = 1 / math.sqrt(self.count)
+        weight = 1 / math.sqrt(self.count())
 
         def of(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
@@ -220,8 +221,8 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
     image = np.asarray(image, np.float32)
     if image.shape not in ((height, width, 3), (height, width, 4)):
         raise ValueError(
-            f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, as its "
-            f"camera of size {camera.size} has; got {image.shape}."
+            f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, "
+            f"as its camera of size {camera.size} has; got {image.shape}."
         )
     if not np.all(finite(image)):
         bad = int(np.sum(~finite(image)))
@@ -275,8 +276,8 @@ class Problem(eqx.Module):
         return loss(free)
 
     def condensed(self, free: tuple) -> Float[Array, "numbers numbers"]:
-        """The triangle, of which the last column is n + 1 numbers that stand for the residual, in value and in
-        derivative. Forward mode."""
+        """The triangle, of which the last column is n + 1 numbers that stand for the residual, in value and
+        in derivative. Forward mode."""
 
         @jax.custom_jvp
         def condensed(free: tuple) -> Array:
@@ -338,7 +339,7 @@ def tile_entries(residual: Residual, free: tuple, max_jacobian: int, least_squar
     """How many entries of the residual are differentiated at once: so many that their rows [J r] fit into
     `max_jacobian` bytes; all, where no Jacobian is made."""
     if not least_squares:
-        return residual.count
+        return residual.count()
     bytes_of_row = (size(free) + 1) * 4
     if bytes_of_row * (size(free) + 1) > max_jacobian:
         raise ValueError(

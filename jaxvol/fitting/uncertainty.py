@@ -1,8 +1,8 @@
 """How well do the images determine the parameters? Covariance from the triangle of a least-squares fit.
 
-With residuals that are independent and of one variance σ², the free numbers scatter with σ² (JᵀJ)⁻¹ around the
-truth, to first order, and σ² is estimated by Σ r² / (m - n). JᵀJ = RᵀR is inverted through the singular values
-of R; the parameters' own covariance follows by the Jacobian of the bijections.
+With residuals that are independent and of one variance σ², the free numbers scatter with σ² (JᵀJ)⁻¹ around
+the truth, to first order, and σ² is estimated by Σ r² / (m - n). JᵀJ = RᵀR is inverted through the singular
+values of R; the parameters' own covariance follows by the Jacobian of the bijections.
 """
 
 from typing import NamedTuple
@@ -23,8 +23,10 @@ TOUCHED = 0.01
 
 
 class Uncertainty(NamedTuple):
-    """- `covariance`: of the fitted parameters, in the order of `names`. Where a direction that the residual does
-      not determine moves a parameter, its variance is infinite and its covariances are NaN.
+    """What is known of fitted parameters.
+
+    - `covariance`: in the order of `names`. Where a direction that the residual does not determine moves a
+      parameter, its variance is infinite and its covariances are NaN.
     - `names`: such as `.extinction[3]`.
     - `undetermined`: for each such direction, the parameters that it moves most.
     """
