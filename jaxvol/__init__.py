@@ -19,6 +19,10 @@ from .fitting import (
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
     fit as fit,
+    flat_grey as flat_grey,
+    read_transfer as read_transfer,
+    read_views as read_views,
+    write_transfer as write_transfer,
 )
 from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter

@@ -8,5 +8,11 @@ from .bijections import (
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
 )
-from .driver import Fit as Fit, fit as fit
+from .driver import Fit as Fit, Outcome as Outcome, fit as fit
+from .files import (
+    read_transfer as read_transfer,
+    read_views as read_views,
+    write_transfer as write_transfer,
+)
 from .residuals import ImageResidual as ImageResidual
+from .starts import flat_grey as flat_grey

@@ -163,7 +163,7 @@ class Pose(Bijection):
         return dict(zip(("position", "focal_point", "view_up"), _moved(value), strict=True))
 
 
-def _moved(camera: Camera) -> tuple[Array, Array, Array]:
+def _moved(camera: Camera) -> tuple[Any, Any, Any]:
     return camera.position, camera.focal_point, camera.view_up
 
 
@@ -183,4 +183,4 @@ def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "
 
 
 def _finite(value: Arrayable, name: str) -> Array:
-    return finite_array(name, value, (None,) * jnp.ndim(value))
+    return finite_array(name, value, (None,) * np.ndim(value))

@@ -81,7 +81,7 @@ def _is_bijection(node: Any) -> bool:
 def _resolved(parameters: PyTree, constraints: PyTree) -> PyTree:
     """A bijection for every leaf, and for every object that is fitted as a whole."""
 
-    def meant(constraint: Bijection | None, node: Any) -> PyTree:
+    def meant(constraint: Any, node: Any) -> PyTree:
         if constraint is None:
             return jax.tree.map(_usual, node, is_leaf=lambda n: isinstance(n, tuple(_USUAL)))
         if not _is_bijection(constraint):

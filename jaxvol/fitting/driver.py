@@ -72,7 +72,7 @@ class Fit(eqx.Module):
 
 
 def fit(
-    residual: Residual | Callable[[Any], PyTree],
+    residual: Residual | Callable[[Any], PyTree] | Any,
     parameters: PyTree,
     *,
     solver: Solver | optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | Any = "levenberg_marquardt",
@@ -80,9 +80,9 @@ def fit(
     where: Where | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
-    max_steps: int = 100,
-    patience: int | None = None,
-    max_jacobian: int = 2**30,
+    max_steps: int | Any = 100,
+    patience: int | Any | None = None,
+    max_jacobian: int | Any = 2**30,
     callback: Callable[[int, PyTree, float], Any] | None = None,
     progress: bool = False,
     checkpoint: str | PathLike[str] | None = None,
@@ -147,15 +147,15 @@ def fit(
     run = _Run.begin(solver, problem, y)
     keeper = None if checkpoint is None else _Keeper(Path(checkpoint), _about(solver, problem, run))
     if keeper is not None:
-        run = run.resumed(checkpoints.load(keeper.file, keeper.about))
+        run = keeper.resumed(run)
     with _bar(progress, max_steps) as show:
         while run.ended(max_steps, patience, rtol) is None:
             run = run.step(solver, problem)
             show(run)
             if callback is not None:
                 callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
-            if keeper is not None and keeper.age >= checkpoint_seconds:
-                keeper.save(run)
+            if keeper is not None:
+                keeper.save(run, checkpoint_seconds)
     if keeper is not None:
         keeper.save(run)
     return _told(run, problem, run.ended(max_steps, patience, rtol), max_steps)
@@ -240,10 +240,7 @@ class _Run(eqx.Module):
             "losses": np.asarray(self.losses),
         }
 
-    def resumed(self, arrays: checkpoints.Arrays | None) -> "_Run":
-        """The run that was saved; this one, where none was."""
-        if arrays is None:
-            return self
+    def with_arrays(self, arrays: checkpoints.Arrays) -> "_Run":
         dynamic, static = eqx.partition(self, eqx.is_array)
         leaves, structure = jax.tree.flatten(dynamic)
         leaves = [jnp.asarray(arrays[f"a{i}"]) for i in range(len(leaves))]
@@ -270,32 +267,49 @@ def _function(solver: Any) -> Callable[..., Any]:
 @eqx.filter_jit
 def _begun(solver: Any, problem: Problem, y: tuple) -> Any:
     function = _function(solver)
-    out, aux = eqx.filter_eval_shape(function, y, problem)
-    return solver.init(function, y, problem, {}, out, aux, frozenset())
+    with _lenient():
+        out, aux = eqx.filter_eval_shape(function, y, problem)
+        return solver.init(function, y, problem, {}, out, aux, frozenset())
 
 
 @eqx.filter_jit
 def _advanced(solver: Any, problem: Problem, y: tuple, state: Any) -> Any:
     function = _function(solver)
-    y, state, before = solver.step(function, y, problem, {}, state, frozenset())
-    done, result = solver.terminate(function, y, problem, {}, state, frozenset())
+    with _lenient():
+        y, state, before = solver.step(function, y, problem, {}, state, frozenset())
+        done, result = solver.terminate(function, y, problem, {}, state, frozenset())
     # solvers that try points tell of the one they stood at before; they keep what they know of the new one
     return y, state, getattr(state, "aux", before), done, result
 
 
+@contextmanager
+def _lenient() -> Iterator[None]:
+    """Solvers count on JAX's promotion of types and ranks, also where a user has forbidden it."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
 class _Keeper:
-    """Who writes checkpoints, and how old the last one is, seconds."""
+    """Who writes checkpoints, and knows which step was written when."""
 
     def __init__(self, file: Path, about: dict[str, Any]):
-        self.file, self.about, self.written = file, about, time.monotonic()
+        self.file, self.about = file, about
+        self.step, self.time = 0, time.monotonic()
 
-    @property
-    def age(self) -> float:
-        return time.monotonic() - self.written
+    def resumed(self, run: _Run) -> _Run:
+        """The run that was saved; this one, where none was."""
+        arrays = checkpoints.load(self.file, self.about)
+        if arrays is None:
+            return run
+        run = run.with_arrays(arrays)
+        self.step = len(run.losses)
+        return run
 
-    def save(self, run: _Run) -> None:
-        checkpoints.save(self.file, run.arrays(), self.about)
-        self.written = time.monotonic()
+    def save(self, run: _Run, seconds: float = 0) -> None:
+        """Save the run, unless it is as it was, or so many seconds have not yet passed."""
+        if len(run.losses) > self.step and time.monotonic() - self.time >= seconds:
+            checkpoints.save(self.file, run.arrays(), self.about)
+            self.step, self.time = len(run.losses), time.monotonic()
 
 
 def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:

@@ -13,7 +13,7 @@ any solver, exactly; and unlike JᵀJ it does not square the condition.
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -128,13 +128,13 @@ class ImageResidual(Residual):
 
     def __init__(
         self,
-        scene: Scene,
-        views: Sequence[tuple[Camera, Arrayable]],
+        scene: Scene | Any,
+        views: Sequence[tuple[Camera, Arrayable]] | Any,
         background: Arrayable = (1.0, 1.0, 1.0),
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
-        self.scene = scene
+        self.scene = cast(Scene, scene)
         self.background = finite_array("background", background, (3,))
         alike: dict[Any, list[tuple[Camera, Array]]] = {}
         for number, view in enumerate(_pairs(views)):
