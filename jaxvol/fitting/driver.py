@@ -118,7 +118,7 @@ def fit(
     - `max_jacobian`: bytes. With a least-squares solver, only as many rows of the Jacobian are held at once
       as fit (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image. The
       result does not depend on it, but for rounding.
-    - `callback`: `callback(step, parameters, loss)` after each step.
+    - `callback`: `callback(step, parameters, loss)` after each step but the first, which looks at the start.
     - `progress`: shows a progress bar (`pip install "jaxvol[fit]"`).
     - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, and at the end. If
       it exists, the fit goes on from there, and ends with the same parameters, to the bit, as if it had never
