@@ -10,6 +10,20 @@ from .alignment import AlphaCorrection as AlphaCorrection
 from .camera import Camera as Camera
 from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to_srgb
 from .engine import render as render, render_rays as render_rays
+from .fitting import (
+    Fit as Fit,
+    Fixed as Fixed,
+    ImageResidual as ImageResidual,
+    Pose as Pose,
+    Positive as Positive,
+    Unconstrained as Unconstrained,
+    UnitInterval as UnitInterval,
+    fit as fit,
+    flat_grey as flat_grey,
+    read_transfer as read_transfer,
+    read_views as read_views,
+    write_transfer as write_transfer,
+)
 from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .labels import LabelTransferFunction as LabelTransferFunction

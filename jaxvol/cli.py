@@ -1,4 +1,5 @@
-"""What does the command `jaxvol` do? It renders volumes to pictures, without a line of Python."""
+"""What does the command `jaxvol` do? Pictures of volumes, and transfer functions of pictures, without a line
+of Python."""
 
 import argparse
 import os
@@ -14,6 +15,7 @@ from .alignment import AlphaCorrection
 from .camera import Camera
 from .display import save_png
 from .engine import render
+from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
 from .leaping import SpaceLeaping
 from .march import March
@@ -32,6 +34,7 @@ examples:
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
+  jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
 """
 
 
@@ -45,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     try:
         options.run(options)
-    except (ValueError, OSError) as fault:
+    except (ValueError, OSError, ImportError) as fault:
         print(f"jaxvol {options.command}: error: {' '.join(str(fault).split())}", file=sys.stderr)
         return 2
     return 0
@@ -66,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="where compiled programs are kept for the next time (default: %(default)s)",
     )
+    scene = _scene_options()
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     demo = commands.add_parser(
@@ -78,34 +82,16 @@ def _parser() -> argparse.ArgumentParser:
 
     one = commands.add_parser(
         "render",
-        parents=[shared],
+        parents=[shared, scene],
         help="render a volume file to a PNG",
         description="Render a volume file to a PNG.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument(
-        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
-    )
-    one.add_argument(
         "-o", "--output", type=Path, default=Path("out.png"), help="picture to write (default: %(default)s)"
     )
     one.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
-    one.add_argument(
-        "--step", type=float, help="distance between samples, world length (default: half a voxel)"
-    )
-    one.add_argument(
-        "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
-    )
-
-    what = one.add_argument_group("the data", "needed where the file and its name do not tell")
-    what.add_argument(
-        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
-    )
-    what.add_argument("--dtype", help="such as uint8 or uint16le")
-    what.add_argument(
-        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
-    )
 
     look = one.add_argument_group("the look")
     kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
@@ -142,7 +128,69 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
     one.set_defaults(run=_render)
+
+    found = commands.add_parser(
+        "fit",
+        parents=[shared, scene],
+        help="find the transfer function under which a volume looks as in pictures",
+        description="Find the transfer function under which a volume looks as in pictures.",
+    )
+    found.add_argument(
+        "--images", type=Path, nargs="+", required=True, metavar="PICTURE", help="sRGB, as PNG"
+    )
+    found.add_argument(
+        "--cameras",
+        type=Path,
+        required=True,
+        metavar="JSON",
+        help="a list with an object for each picture: position, focal_point, and optionally view_up, "
+        "view_angle, parallel_scale, window",
+    )
+    found.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("transfer.json"),
+        help="JSON to write (default: %(default)s)",
+    )
+    begin = found.add_argument_group("the start")
+    begin.add_argument(
+        "--start", type=Path, metavar="JSON", help="a transfer function, as this command writes"
+    )
+    begin.add_argument("--points", type=int, default=8, help="else, flat grey of so many points (default: 8)")
+    begin.add_argument(
+        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of their values (default: all)"
+    )
+    how = found.add_argument_group("the solver")
+    how.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
+    how.add_argument("--max-steps", type=int, default=100)
+    how.add_argument("--checkpoint", type=Path, metavar="FILE", help="go on from here after a break")
+    how.add_argument("--progress", action="store_true", help="show a progress bar")
+    found.set_defaults(run=_fit)
     return parser
+
+
+def _scene_options() -> argparse.ArgumentParser:
+    """Options of all that is rendered from a volume file."""
+    scene = argparse.ArgumentParser(add_help=False)
+    scene.add_argument(
+        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
+    )
+    scene.add_argument(
+        "--step", type=float, help="distance between samples, world length (default: half a voxel)"
+    )
+    scene.add_argument(
+        "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
+    )
+    what = scene.add_argument_group("the data", "needed where the file and its name do not tell")
+    what.add_argument(
+        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
+    )
+    what.add_argument("--dtype", help="such as uint8 or uint16le")
+    what.add_argument(
+        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
+    )
+    return scene
 
 
 def _programs() -> Path:
@@ -169,7 +217,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    volume = load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
+    volume, march = _scene(options)
     if options.preset:
         transfer = preset(options.preset, options.clim, options.unit_distance)
     else:
@@ -180,9 +228,32 @@ def _render(options: argparse.Namespace) -> None:
         camera = Camera(options.camera[:3], options.camera[3:], **view)
     else:
         camera = Camera.looking_at(volume, options.direction, **view)
-    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
-    march = March(step, FAST, "midpoint")
     _timed(volume, transfer, camera.zoom(options.zoom), march, options.output, options.background)
+
+
+def _fit(options: argparse.Namespace) -> None:
+    volume, march = _scene(options)
+    views = read_views(options.images, options.cameras)
+    given = options.start
+    start = read_transfer(given) if given else flat_grey(volume, options.points, options.clim)
+    found = fit(
+        ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, options.background),
+        start,
+        solver=options.solver,
+        max_steps=options.max_steps,
+        checkpoint=options.checkpoint,
+        progress=options.progress,
+    )
+    path = write_transfer(options.output, found.parameters)
+    error = (2 * found.loss) ** 0.5
+    print(f"{path}: RMSE {error:.5f} in linear RGB after {len(found.losses)} steps. {found.message}")
+
+
+def _scene(options: argparse.Namespace) -> tuple[Volume, March]:
+    """The volume in the file, and how it is marched."""
+    volume = load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
+    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
+    return volume, March(step, FAST, "midpoint")
 
 
 def _timed(

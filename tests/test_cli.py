@@ -1,5 +1,7 @@
 """The command line, run as a user would."""
 
+import json
+import re
 import subprocess
 import sys
 
@@ -95,6 +97,95 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys
     assert not output.exists()
 
 
+@pytest.fixture
+def seen(volume_file, tmp_path):
+    """Two pictures of the engine, and their cameras, in files."""
+    volume, pictures, cameras = jv.load(volume_file), [], []
+    march = jv.March(0.5, (jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
+    for number, position in enumerate([(40, -30, 20), (-30, 5, 45)]):
+        fields = {"position": position, "focal_point": [11.5] * 3, "view_up": [0, 0, 1], "view_angle": 35}
+        image = jv.render(volume, jv.preset("engine"), jv.Camera(**fields, size=(20, 16)), march).image()
+        pictures.append(str(jv.save_png(tmp_path / f"{number}.png", image)))
+        cameras.append(fields)
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    return pictures
+
+
+@pytest.mark.slow
+def test_fit_finds_a_transfer_function_that_makes_the_pictures(volume_file, seen, tmp_path, capsys):
+    output = tmp_path / "folder" / "transfer.json"
+    cameras = ["--cameras", str(tmp_path / "cameras.json")]
+    command = ["fit", str(volume_file), "--images", *seen, *cameras, "-o", str(output)]
+    with pytest.warns(UserWarning, match="not determined"):
+        assert main([*command, "--max-steps", "20"]) == 0
+    told = capsys.readouterr().out
+    assert float(told.partition("RMSE ")[2].split()[0]) < 0.01
+    transfer = jv.read_transfer(output)
+    assert transfer.values.shape == (8,)
+    assert float(transfer.extinction.max()) > 0
+
+
+BAD_FIT = {
+    "no picture": ({"--images": ["nowhere.png", "1.png"]}, "there is no file nowhere.png"),
+    "no cameras": ({"--cameras": ["nowhere.json"]}, "nowhere.json"),
+    "no picture's file": ({"--images": ["CAMERAS", "CAMERAS"]}, "cannot be read as a picture"),
+    "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
+    "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "one camera for each of 3 images; got 2"),
+    "solver": ({"--solver": ["newton"]}, "solver must be one of"),
+    "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
+    "start": ({"--start": ["CAMERAS"]}, "must be an object with values, colors, extinction"),
+    "clim": ({"--clim": ["5", "4"]}, "clim must be (low, high)"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FIT)
+def test_errors_of_fit_are_one_line_and_exit_code_2(case, volume_file, seen, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    changed, message = BAD_FIT[case]
+    options = {"--images": ["0.png", "1.png"], "--cameras": ["cameras.json"], **changed}
+    words = [w for name, values in options.items() for w in (name, *values)]
+    words = ["cameras.json" if w == "CAMERAS" else w for w in words]
+    assert main(["fit", str(volume_file), *words, "-o", "x.json"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("jaxvol fit: error: ")
+    assert told.count("\n") == 1
+    assert message in told
+    assert not (tmp_path / "x.json").exists()
+
+
+BAD_CAMERAS = {
+    "field": ([{"position": [1, 2, 3], "focus": [0, 0, 0]}] * 2, "camera 0 must be an object with position"),
+    "value": (
+        [{"position": [1, 2], "focal_point": [0, 0, 0]}] * 2,
+        "camera 0: position must have shape (3,)",
+    ),
+    "no list": ({"position": [1, 2, 3]}, "must hold a list of cameras; got dict"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CAMERAS)
+def test_bad_cameras_are_named(case, seen, tmp_path):
+    cameras, message = BAD_CAMERAS[case]
+    path = tmp_path / "bad.json"
+    path.write_text(json.dumps(cameras))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        jv.read_views(seen, path)
+
+
+def test_a_picture_s_values_are_read_as_they_were_written(seen, tmp_path):
+    views = jv.read_views(seen, tmp_path / "cameras.json")
+    assert [camera.size for camera, _ in views] == [(20, 16)] * 2
+    assert np.array_equal(np.asarray(jv.to_srgb(views[1][1]) * 255).round(), imread(seen[1]))
+    np.testing.assert_array_equal(views[0][0].position, (40, -30, 20))
+
+
+def test_a_transfer_function_is_read_as_it_was_written(tmp_path):
+    transfer = jv.preset("engine")
+    again = jv.read_transfer(jv.write_transfer(tmp_path / "a" / "t.json", transfer))
+    for name in ("values", "colors", "extinction"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(transfer, name))
+
+
 def test_a_slip_in_the_options_is_told_by_usage(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["render", "x.raw", "--size", "many", "few"])
@@ -106,7 +197,7 @@ def test_help_names_commands_presets_and_examples():
     told = subprocess.run(
         [sys.executable, "-m", "jaxvol", "--help"], capture_output=True, text=True, check=True
     ).stdout
-    for word in ("demo", "render", "examples:"):
+    for word in ("demo", "render", "fit", "examples:"):
         assert word in told
     told = subprocess.run(
         [sys.executable, "-m", "jaxvol", "render", "--help"], capture_output=True, text=True, check=True

@@ -7,7 +7,17 @@ from pathlib import Path
 import pytest
 from skimage.io import imread
 
-from experiments import growth, jitter_accuracy, kisti, minimum_distance, overhead, record, speed
+from experiments import (
+    fit_pose,
+    fit_transfer,
+    growth,
+    jitter_accuracy,
+    kisti,
+    minimum_distance,
+    overhead,
+    record,
+    speed,
+)
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.scenes import PHANTOM
 from paper_figs import chae_fig5, common, kisti_table, table1
@@ -18,7 +28,7 @@ FIGURES = sorted(path.stem for path in (ROOT / "paper_figs").glob("*fig*.py") if
 """Figures that are drawn without recorded results."""
 MEASURES = {
     module.__name__.rpartition(".")[2]: module
-    for module in (growth, jitter_accuracy, kisti, minimum_distance, overhead, speed)
+    for module in (fit_pose, fit_transfer, growth, jitter_accuracy, kisti, minimum_distance, overhead, speed)
 }
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
 
@@ -111,6 +121,22 @@ def test_speed_tells_which_peers_there_are_and_an_error_beside_each_time(measure
         assert {speed.OURS, speed.PLAIN} <= set(rows)
         assert all(row["rmse"] > 0 for row in rows.values())
     assert result["first image"]["compiled before"]["import"] > 0
+
+
+@pytest.mark.slow
+def test_fits_recover_what_was_hidden(measured):
+    scenes = record.read(measured / "fit_transfer.json")["result"]["scenes"]
+    for rows in scenes.values():
+        for points in (fit_transfer.KNOWN, fit_transfer.EVEN):
+            assert (
+                min(rows[points]["psnr held out"])
+                > fit_transfer.GOAL
+                > max(rows[points]["psnr at the start"])
+            )
+            assert rows[points]["steps"] <= fit_transfer.STEPS
+    # on a volume and an image as coarse as these, not every start leads back
+    reached = record.read(measured / "fit_pose.json")["result"]["reached"]
+    assert reached["from coarse to fine"] >= max(0.5, reached["as they are"])
 
 
 @pytest.mark.slow

@@ -1,0 +1,170 @@
+"""Is a transfer function recovered from four views, and do other views agree?
+
+A hidden transfer function of eight points renders four reference images of a volume. From flat grey, a fit
+finds colours and extinction, by Levenberg–Marquardt: once at the points of the truth, and once at 32 points
+evenly spaced, as one who knows nothing of the truth would. Judged by the PSNR of views that were held out.
+
+The head phantom, and the engine where JAXVOL_DATA names the folder of real volumes.
+"""
+
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.metrics import psnr
+
+from . import common, record
+from .common import plt
+
+
+GOAL = 40.0
+STEPS = 40
+SEEN = ((0.65, -1, 0.15), (-1, -0.3, 0.4), (0.2, 1, 0.3), (1, 0.4, -0.5))
+HELD_OUT = ((1, -0.2, 0.6), (-0.5, 1, -0.2), (-0.3, -1, -0.6))
+KNOWN, EVEN = "points of the truth", "32 even points"
+
+
+class Scene(NamedTuple):
+    volume: jv.Volume
+    truth: jv.TransferFunction
+    march: jv.March
+
+
+def _scene(volume: jv.Volume, points: list[Any], unit_distance: float) -> Scene:
+    march = jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(),), "midpoint")
+    return Scene(volume, jv.TransferFunction.from_points(points, unit_distance), march)
+
+
+def head(folder: Path | None, resolution: int) -> Scene:
+    points = [
+        (0, (0.2, 0.1, 0.1), 0.0),
+        (40, (0.4, 0.2, 0.15), 0.0),
+        (78, (0.85, 0.5, 0.35), 0.08),
+        (100, (0.8, 0.35, 0.25), 0.03),
+        (130, (0.7, 0.65, 0.3), 0.05),
+        (185, (0.9, 0.85, 0.7), 0.5),
+        (225, (0.95, 0.95, 0.9), 0.8),
+        (255, (0.8, 0.9, 0.98), 0.9),
+    ]
+    return _scene(jv.phantom("head", resolution), points, 0.1)
+
+
+def engine(folder: Path, resolution: int) -> Scene:
+    """Real data, thinned to about this many voxels along the longest axis."""
+    whole = jv.load(folder / "engine_256x256x128_uint8.raw.gz")
+    every = max(whole.shape) // resolution
+    data = np.asarray(whole.data)[::every, ::every, ::every]
+    points = [
+        (0, (0.1, 0.1, 0.1), 0.0),
+        (50, (0.3, 0.2, 0.2), 0.0),
+        (80, (0.6, 0.5, 0.4), 0.01),
+        (120, (0.7, 0.55, 0.35), 0.03),
+        (150, (0.6, 0.3, 0.2), 0.02),
+        (190, (0.2, 0.5, 0.8), 0.2),
+        (220, (0.3, 0.6, 0.9), 0.5),
+        (255, (0.9, 0.95, 0.98), 0.7),
+    ]
+    return _scene(jv.Volume(data, np.asarray(whole.spacing) * every, whole.origin), points, 4.0)
+
+
+SCENES = {"head phantom": head, "engine": engine}
+
+
+def measure(scene: Scene, size: int) -> dict[str, Any]:
+    """A fit at known and at even points: loss by step, PSNR of views seen and held out."""
+    volume, truth, march = scene
+
+    def camera(direction: tuple[float, float, float]) -> jv.Camera:
+        return jv.Camera.looking_at(volume, direction, size=(size, size)).zoom(1.3)
+
+    def image(transfer: jv.TransferFunction, view: jv.Camera) -> np.ndarray:
+        return np.asarray(jv.render(volume, transfer, view, march).image())
+
+    seen, held_out = ([camera(direction) for direction in some] for some in (SEEN, HELD_OUT))
+    residual = jv.ImageResidual(
+        lambda transfer, view: (volume, transfer, view, march), [(view, image(truth, view)) for view in seen]
+    )
+    even = jv.flat_grey(volume, 32, (0, 255))
+    extinction = np.full(truth.values.shape, float(even.extinction[0]))
+    known = jv.TransferFunction(truth.values, np.full((len(extinction), 3), 0.5), extinction)
+    rows = {}
+    for name, start in ((KNOWN, known), (EVEN, even)):
+        begun = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # colours of what is transparent are not determined: recorded
+            found = jv.fit(residual, start, max_steps=STEPS)
+        rows[name] = {
+            "steps": len(found.losses),
+            "message": found.message,
+            "seconds with compilation": round(time.perf_counter() - begun, 2),
+            "losses": found.losses.tolist(),
+            "psnr at the start": [psnr(image(start, view), image(truth, view)) for view in held_out],
+            "psnr seen": [psnr(image(found.parameters, view), image(truth, view)) for view in seen],
+            "psnr held out": [psnr(image(found.parameters, view), image(truth, view)) for view in held_out],
+            "undetermined": found.uncertainty.undetermined,
+            "values": np.asarray(start.values).tolist(),
+            "extinction": np.asarray(found.parameters.extinction).tolist(),
+        }
+    return {"truth": {k: np.asarray(getattr(truth, k)).tolist() for k in ("values", "extinction")}, **rows}
+
+
+def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
+    figure, axes = plt.subplots(
+        len(result), 2, figsize=(9, 3 * len(result)), squeeze=False, layout="constrained"
+    )
+    for (left, right), (scene, rows) in zip(axes, result.items(), strict=True):
+        right.plot(rows["truth"]["values"], rows["truth"]["extinction"], "k-", linewidth=3, alpha=0.3)
+        for name, style in ((KNOWN, "C0.-"), (EVEN, "C3.-")):
+            row = rows[name]
+            least = min(row["psnr held out"])
+            left.plot(
+                range(1, row["steps"] + 1), -10 * np.log10(2 * np.asarray(row["losses"])), style, label=name
+            )
+            right.plot(row["values"], row["extinction"], style, label=f"{name}: held out ≥ {least:.1f} dB")
+        left.axhline(GOAL, color="k", linestyle=":", linewidth=0.8)
+        left.set(xlabel="step", ylabel=f"{scene}\nPSNR of the views seen, dB")
+        right.set(xlabel="value", ylabel="extinction (grey: the truth)")
+        right.legend(fontsize=8)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=1)
+    parser.add_argument("--size", type=int, default=96, help="pixels along a side")
+    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    folder, names = common.data(), list(SCENES)
+    if folder is None or chosen.quick:
+        names = names[:1]
+    if chosen.quick:
+        chosen.size, chosen.resolution = 24, 24
+
+    result = {}
+    for name in names:
+        result[name] = measure(SCENES[name](folder, chosen.resolution), chosen.size)
+        for points in (KNOWN, EVEN):
+            row = result[name][points]
+            print(
+                f"{name:14} {points:20} {row['steps']:3} steps  held out {min(row['psnr held out']):6.2f} dB"
+                f" (start {min(row['psnr at the start']):5.2f}, goal {GOAL:g})"
+                f"  {row['seconds with compilation']:.1f} s  {row['message']}",
+                flush=True,
+            )
+    path = record.write(
+        chosen.output / "fit_transfer.json",
+        "Is a transfer function recovered from four views, and do other views agree?",
+        {"image": [chosen.size] * 2, "resolution": chosen.resolution, "goal": GOAL, "scenes": result},
+        seed=chosen.seed,
+        command=["experiments.fit_transfer", *given],
+    )
+    draw(result, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

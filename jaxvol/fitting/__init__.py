@@ -1,0 +1,18 @@
+"""Which parameters make rendered images agree with given ones?"""
+
+from .bijections import (
+    Bijection as Bijection,
+    Fixed as Fixed,
+    Pose as Pose,
+    Positive as Positive,
+    Unconstrained as Unconstrained,
+    UnitInterval as UnitInterval,
+)
+from .driver import Fit as Fit, Outcome as Outcome, fit as fit
+from .files import (
+    read_transfer as read_transfer,
+    read_views as read_views,
+    write_transfer as write_transfer,
+)
+from .residuals import ImageResidual as ImageResidual
+from .starts import flat_grey as flat_grey

@@ -1,0 +1,186 @@
+"""Which numbers may a parameter take? Smooth one-to-one maps from all real numbers onto those.
+
+A fit moves freely in real numbers, `free`; what is rendered is `forward(free)`, so no step can leave what is
+allowed. Free numbers are of order 1 whatever the units, which a damped step wants.
+"""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
+
+from ..camera import Camera
+from ..checks import Arrayable, finite_array, number, require
+
+
+MARGIN = 1e-3
+"""A start nearer than this to an end that is never quite reached (as part of the scale) begins so far away:
+at the end itself the map is flat, and a fit could never leave it."""
+
+
+class Bijection(eqx.Module):
+    """A smooth map from free real numbers onto the values that are allowed."""
+
+    whole: bool = eqx.field(static=True, default=False, init=False)
+    """Whether it maps a whole object, such as a camera, and not each array on its own."""
+
+    @abstractmethod
+    def forward(self, free: Any) -> Any:
+        """The value that these free numbers stand for."""
+
+    @abstractmethod
+    def inverse(self, value: Any, name: str = "value") -> Any:
+        """The free numbers that stand for a value.
+
+        **Raises:** `ValueError`, naming `name`, for a value that is not allowed.
+        """
+
+    def moved(self, value: Any) -> Any:
+        """The parts of a value that the free numbers change."""
+        return value
+
+
+class Fixed(Bijection):
+    """No free numbers at all: the value stays what it was at the start."""
+
+    def forward(self, free: Any) -> Any:
+        raise ValueError("Fixed has no free numbers: the value is kept by whoever holds it.")
+
+    def inverse(self, value: Any, name: str = "value") -> None:
+        return None
+
+
+class Unconstrained(Bijection):
+    """Any real number: the value is the free number."""
+
+    def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return free
+
+    def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
+        return _finite(value, name)
+
+
+class Positive(Bijection):
+    """Positive numbers: `scale` · log(1 + exp(free)).
+
+    **Arguments:**
+
+    - `scale`: a typical value, in the value's unit, > 0. Far above it the map is linear, far below
+      exponential.
+
+    A start at 0, or below `scale` / 1000, begins at `scale` / 1000.
+
+    **Raises:** `ValueError` for a scale that is not positive, and for starts that are negative.
+    """
+
+    scale: Float[Array, ""]
+
+    def __init__(self, scale: Arrayable = 1.0):
+        self.scale = number("scale", scale, above=0)
+
+    def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return self.scale.astype(free.dtype) * jax.nn.softplus(free)
+
+    def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
+        value = require(
+            _finite(value, name), lambda v: v >= 0, f"{name} must not be negative to be fitted; got {{got}}."
+        )
+        part = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
+        return part + jnp.log(-jnp.expm1(-part))
+
+
+class UnitInterval(Bijection):
+    """Numbers between 0 and 1: 1 / (1 + exp(-free)).
+
+    A start within 1/1000 of an end begins that far from it.
+
+    **Raises:** `ValueError` for starts outside [0, 1].
+    """
+
+    def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        return jax.nn.sigmoid(free)
+
+    def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
+        value = require(
+            _finite(value, name),
+            lambda v: (v >= 0) & (v <= 1),
+            f"{name} must be in [0, 1] to be fitted; got {{got}}.",
+        )
+        value = jnp.clip(value, MARGIN, 1 - MARGIN)
+        return jnp.log(value) - jnp.log1p(-value)
+
+
+class Pose(Bijection):
+    """Where a camera stands and how it is turned, as a rigid motion of the camera `start`.
+
+    The free numbers are `rotation` (3,), the rotation vector (exponential map) in radians, about the
+    camera's focal point, and `translation` (3,), of camera and focal point alike, in units of the distance
+    between the two. All else (field of view, size) stays. About the focal point, rather than the camera
+    itself, turning and shifting do not stand for one another.
+
+    **Raises:** `ValueError` for a camera that no rigid motion of `start` yields.
+    """
+
+    whole: bool = eqx.field(static=True, default=True, init=False)
+    start: Camera
+
+    def forward(self, free: dict[str, Float[Array, "3"]]) -> Camera:
+        start = jax.lax.stop_gradient(self.start)
+        arm = start.position - start.focal_point
+        focal_point = start.focal_point + jnp.linalg.norm(arm) * free["translation"]
+        return eqx.tree_at(
+            _moved,
+            self.start,
+            (
+                focal_point + rotate(free["rotation"], arm),
+                focal_point,
+                rotate(free["rotation"], start.view_up),
+            ),
+        )
+
+    def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
+        start = self.start
+        kept = [(c.view_angle, c.parallel_scale, c.window, _distance(c)) for c in (start, value)]
+        same = jax.tree.structure(value) == jax.tree.structure(start) and all(
+            np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, kept), strict=True)
+        )
+        if not same:
+            raise ValueError(
+                f"{name} must be a camera that differs from the pose's start in position and orientation "
+                f"alone, and stands as far from its focal point; got {value}, and started from {start}."
+            )
+        axes = [np.stack([np.asarray(axis, float) for axis in c._axes()], axis=1) for c in (start, value)]
+        turned = Rotation.from_matrix(axes[1] @ axes[0].T).as_rotvec()
+        shift = (value.focal_point - start.focal_point) / _distance(start)
+        return {"rotation": jnp.asarray(turned, shift.dtype), "translation": shift}
+
+    def moved(self, value: Camera) -> dict[str, Float[Array, "3"]]:
+        return dict(zip(("position", "focal_point", "view_up"), _moved(value), strict=True))
+
+
+def _moved(camera: Camera) -> tuple[Any, Any, Any]:
+    return camera.position, camera.focal_point, camera.view_up
+
+
+def _distance(camera: Camera) -> Float[Array, ""]:
+    return jnp.linalg.norm(camera.position - camera.focal_point)
+
+
+def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A vector, turned about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0."""
+    square = jnp.sum(turn**2)
+    small = square < 1e-6
+    angle = jnp.sqrt(jnp.where(small, 1, square))  # its slope at 0 is infinite, and not used there
+    first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
+    second = jnp.where(small, 0.5 - square / 24, 2 * (jnp.sin(angle / 2) / angle) ** 2)
+    across = jnp.cross(turn, vector)
+    return vector + first * across + second * jnp.cross(turn, across)
+
+
+def _finite(value: Arrayable, name: str) -> Array:
+    return finite_array(name, value, (None,) * np.ndim(value))

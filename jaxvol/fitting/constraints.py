@@ -1,0 +1,152 @@
+"""Which parameters are free, and within which bounds? A bijection for each of them."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from ..camera import Camera
+from ..march import March
+from ..transfer import TransferFunction
+from ..volume import Volume
+from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInterval
+
+
+Where = Callable[[Any], Any]
+
+
+class Free(eqx.Module):
+    """Parameters as the free numbers that a solver moves: one entry for each bijection, None where fixed."""
+
+    bijections: list[Bijection]
+    held: list[Any]
+    places: list[str] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", tuple]:
+        """The free numbers' meaning, and those that stand for `parameters`.
+
+        **Raises:** `ValueError` for constraints that do not fit the parameters, a `where` that does
+        not either, parameters outside their bounds or not finite, and if nothing is free."""
+        parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
+        tree = _chosen(_resolved(parameters, constraints), where)
+        found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
+        bijections = [bijection for _, bijection in found]
+        nodes = structure.flatten_up_to(parameters)
+        places = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
+        start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, places, strict=True))
+        if not jax.tree.leaves(start):
+            raise ValueError("parameters must hold a float array that is free; all that came is fixed.")
+        held = [n if isinstance(b, Fixed) else None for b, n in zip(bijections, nodes, strict=True)]
+        return cls(bijections, held, places, structure), start
+
+    def forward(self, free: tuple) -> PyTree:
+        """The parameters that these free numbers stand for."""
+        return jax.tree.unflatten(self.structure, self._nodes(free))
+
+    def moved(self, free: tuple) -> list[Any]:
+        """The parts of the parameters that are fitted."""
+        nodes = zip(self.bijections, self._nodes(free), strict=True)
+        return [None if isinstance(b, Fixed) else b.moved(node) for b, node in nodes]
+
+    def names(self, free: tuple) -> list[str]:
+        """The name of every number in `moved`, such as `.extinction[3]`."""
+        names = []
+        for place, node in zip(self.places, self.moved(free), strict=True):
+            for path, leaf in jax.tree_util.tree_flatten_with_path(node)[0]:
+                name = place.removeprefix("parameters") + jax.tree_util.keystr(path)
+                names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
+        return names
+
+    def _nodes(self, free: tuple) -> list[Any]:
+        each = zip(self.bijections, self.held, free, strict=True)
+        return [held if isinstance(b, Fixed) else b.forward(u) for b, held, u in each]
+
+
+def size(free: tuple) -> int:
+    """How many free numbers there are."""
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(free))
+
+
+def _is_bijection(node: Any) -> bool:
+    return isinstance(node, Bijection)
+
+
+def _resolved(parameters: PyTree, constraints: PyTree) -> PyTree:
+    """A bijection for every leaf, and for every object that is fitted as a whole."""
+
+    def meant(constraint: Any, node: Any) -> PyTree:
+        if constraint is None:
+            return jax.tree.map(_usual, node, is_leaf=lambda n: isinstance(n, tuple(_USUAL)))
+        if not _is_bijection(constraint):
+            raise ValueError(f"constraints must hold bijections, such as Positive(); got {constraint!r}.")
+        if constraint.whole:
+            return constraint
+        return jax.tree.map(lambda leaf: constraint if eqx.is_inexact_array(leaf) else Fixed(), node)
+
+    def is_leaf(node: Any) -> bool:
+        return node is None or _is_bijection(node)
+
+    try:
+        return jax.tree.map(meant, constraints, parameters, is_leaf=is_leaf)
+    except (ValueError, TypeError, KeyError) as fault:
+        if "constraints" in str(fault):
+            raise
+        raise ValueError(
+            "constraints must be a tree like the parameters, or the beginning of one, with a bijection, or "
+            f"None for the usual one, at each end: {jax.tree.structure(parameters)}; got {constraints!r}."
+        ) from fault
+
+
+def _usual(node: Any) -> PyTree:
+    for kind, constraint in _USUAL.items():
+        if isinstance(node, kind):
+            return constraint(node)
+    return Unconstrained() if eqx.is_inexact_array(node) else Fixed()
+
+
+def _of_transfer(transfer: TransferFunction) -> PyTree:
+    top = float(jnp.max(transfer.extinction))
+    bounds = Fixed(), UnitInterval(), Positive(top if top > 0 else 1.0)
+    return eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), transfer, bounds)
+
+
+def _of_volume(volume: Volume) -> PyTree:
+    data = Unconstrained() if eqx.is_inexact_array(volume.data) else Fixed()
+    return eqx.tree_at(lambda v: v.data, _fixed(volume), data)
+
+
+def _fixed(node: Any) -> PyTree:
+    return jax.tree.map(lambda _: Fixed(), node)
+
+
+_USUAL: dict[type, Callable[[Any], PyTree]] = {
+    TransferFunction: _of_transfer,
+    Camera: Pose,
+    Volume: _of_volume,
+    March: _fixed,
+}
+"""How things are fitted unless one says otherwise."""
+
+
+def _chosen(tree: PyTree, where: Where | None) -> PyTree:
+    """All fixed but what `where` chooses."""
+    if where is None:
+        return tree
+    leaves, structure = jax.tree.flatten(tree, is_leaf=_is_bijection)
+    try:
+        chosen = set(jax.tree.leaves(where(jax.tree.unflatten(structure, range(len(leaves))))))
+    except (AttributeError, KeyError, IndexError, TypeError) as fault:
+        raise ValueError(
+            "where must choose parts of the parameters, as lambda p: p.extinction does (a camera that is "
+            f"fitted as a pose is one part); it failed on them with {fault!r}."
+        ) from fault
+    if not chosen <= set(range(len(leaves))):
+        raise ValueError(f"where must return parts of the parameters, unchanged; got {sorted(chosen)}.")
+    return jax.tree.unflatten(structure, [b if i in chosen else Fixed() for i, b in enumerate(leaves)])

@@ -1,0 +1,112 @@
+"""How do images, their cameras and transfer functions come from files? Pictures, and JSON."""
+
+import json
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..camera import Camera
+from ..display import from_srgb
+from ..transfer import TransferFunction
+
+
+CAMERA = ("position", "focal_point", "view_up", "view_angle", "parallel_scale", "window")
+"""Fields of a camera in a file; its size is that of the image."""
+
+TRANSFER = ("values", "colors", "extinction")
+
+File = str | PathLike[str]
+
+
+def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Float[Array, "h w 3"]]]:
+    """Pictures with their cameras, as `ImageResidual` takes them.
+
+    **Arguments:**
+
+    - `images`: pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They become linear RGB.
+    - `cameras`: a JSON file: a list of one object for each image, in the same order, with the fields
+      `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`, as
+      `Camera` takes them.
+
+    **Raises:** `ValueError`, naming the file, for files that do not hold this, and `OSError` for
+    those that are not there.
+    """
+    found = _json(cameras)
+    if not isinstance(found, list):
+        raise ValueError(f"{cameras} must hold a list of cameras; got {type(found).__name__}.")
+    if len(found) != len(images):
+        raise ValueError(
+            f"{cameras} must hold one camera for each of {len(images)} images; got {len(found)}."
+        )
+    pictures = [_picture(path) for path in images]
+    return [
+        (_camera(f"{cameras}: camera {number}", fields, picture.shape[1::-1]), picture)
+        for number, (fields, picture) in enumerate(zip(found, pictures, strict=True))
+    ]
+
+
+def read_transfer(path: File) -> TransferFunction:
+    """The transfer function in a JSON file with the fields `values`, `colors` and `extinction`.
+
+    **Raises:** `ValueError`, naming the file, for one that does not hold this."""
+    fields = _fields(str(path), _json(path), TRANSFER, TRANSFER)
+    try:
+        return TransferFunction(**fields)
+    except ValueError as fault:
+        raise ValueError(f"{path}: {fault}") from fault
+
+
+def write_transfer(path: File, transfer: TransferFunction) -> Path:
+    """Write a transfer function as `read_transfer` reads it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fields = {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}
+    path.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def _json(path: File) -> Any:
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as fault:
+        raise ValueError(f"{path} is not JSON: {fault}.") from fault
+
+
+def _fields(what: str, found: Any, allowed: Sequence[str], needed: Sequence[str]) -> dict[str, Any]:
+    if not isinstance(found, dict) or not set(needed) <= set(found) <= set(allowed):
+        got = ", ".join(found) if isinstance(found, dict) else type(found).__name__
+        raise ValueError(
+            f"{what} must be an object with {', '.join(needed)} (of {', '.join(allowed)}); got {got}."
+        )
+    return found
+
+
+def _camera(what: str, found: Any, size: tuple[int, ...]) -> Camera:
+    fields = _fields(what, found, CAMERA, CAMERA[:2])
+    try:
+        return Camera(**fields, size=size)
+    except ValueError as fault:
+        raise ValueError(f"{what}: {fault}") from fault
+
+
+def _picture(path: File) -> Float[Array, "h w 3"]:
+    from skimage.io import imread
+    from skimage.util import img_as_float32
+
+    if not Path(path).is_file():
+        raise ValueError(f"there is no file {path}.")
+    try:
+        picture = imread(path)
+    except Exception as fault:  # each of many readers fails in its own way
+        raise ValueError(f"{path} cannot be read as a picture: {fault}") from fault
+    if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype not in (np.uint8, np.uint16):
+        raise ValueError(
+            f"{path} must be an RGB picture of 8 or 16 bits without transparency; got shape {picture.shape} "
+            f"of {picture.dtype}."
+        )
+    return from_srgb(jnp.asarray(img_as_float32(picture)))

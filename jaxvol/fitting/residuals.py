@@ -1,0 +1,350 @@
+"""What is to become small? Residuals, in tiles that memory holds, and what a solver needs of them.
+
+A least-squares solver asks for the residual r (m,) and its Jacobian J (m, n). With millions of pixels J is
+too large to hold, and all that a Gauss–Newton or Levenberg–Marquardt step needs of both is the triangle of
+
+    [J r] = Q [R c; 0 ρ]      with      |J d + r|² = |R d + c|² + ρ²   for every step d,
+
+which is (n + 1, n + 1) and is made tile by tile, by QR of the triangle so far and the tile's rows (TSQR,
+Demmel et al. 2012). So a residual of n + 1 numbers with the Jacobian [R; 0] stands for that of all pixels, to
+any solver, exactly; and unlike JᵀJ it does not square the condition.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, PyTree
+
+from ..camera import Camera
+from ..checks import Arrayable, finite, finite_array
+from ..engine import Adjoint, render
+from ..march import March
+from ..transfer import Transfer
+from ..volume import Volume
+from .constraints import Free, size
+
+
+TANGENTS = 64
+"""Columns of the Jacobian that are computed at once: a march keeps its state for each of them."""
+
+
+class Tiles(NamedTuple):
+    """Pieces of a residual, of one shape: `of(parameters, item, adjoint)` for each of the stacked items."""
+
+    of: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
+    items: PyTree
+    entries: int
+
+
+class Residual(eqx.Module):
+    """What is to become small: the loss is half the sum of its squares."""
+
+    @abstractmethod
+    def tiles(self, most: int) -> list[Tiles]:
+        """The residual in pieces of at most so many entries."""
+
+    @abstractmethod
+    def count(self) -> int:
+        """Entries of the whole."""
+
+
+class OwnResidual(Residual):
+    """A function from parameters to arrays, in one piece."""
+
+    function: Callable[[PyTree], PyTree]
+    length: int
+
+    @classmethod
+    def of(cls, function: Any, parameters: PyTree) -> "OwnResidual":
+        if not callable(function):
+            raise ValueError(
+                "residual must be an ImageResidual, or a function from parameters to arrays; "
+                f"got {type(function).__name__}."
+            )
+        shapes = jax.tree.leaves(eqx.filter_eval_shape(function, parameters))
+        count = sum(math.prod(leaf.shape) for leaf in shapes)
+        if count == 0:
+            raise ValueError("residual must return at least one number; got none.")
+        return cls(function, count)
+
+    def count(self) -> int:
+        return self.length
+
+    def tiles(self, most: int) -> list[Tiles]:
+        if self.length > most:
+            raise ValueError(
+                f"max_jacobian leaves room for {most} of the residual's {self.length} entries, and a "
+                "function of one's own is not taken apart. Raise max_jacobian, or use an ImageResidual."
+            )
+
+        def of(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
+            return ravel_pytree(self.function(parameters))[0]
+
+        return [Tiles(of, jnp.zeros(1), self.length)]
+
+
+class _Group(eqx.Module):
+    """Views that agree in size and kind, stacked."""
+
+    cameras: Camera
+    images: Float[Array, "views height width channels"]
+
+
+Scene = Callable[[Any, Camera], tuple[Volume, Transfer, Camera, March]]
+
+
+class ImageResidual(Residual):
+    """Rendered images minus reference images, as the residual of a fit.
+
+    **Arguments:**
+
+    - `scene`: `scene(parameters, camera)` returns what is to be rendered, `(volume, transfer, camera,
+      march)`, from the parameters and a view's camera. The solver decides by which adjoint it is
+      differentiated.
+    - `views`: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
+      `background`, or (height, width, 4), as `Rendering.rgba`.
+    - `background`: linear RGB behind the volume, for images of three channels.
+
+    The residual is divided by the square root of the number of its entries, so that the loss, half the
+    sum of squares, is half the mean square error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
+
+    A Jacobian that is too large is made in tiles of whole rows of an image. What is random along a ray is
+    keyed by its pixel in the tile: with `Jitter`, an image in tiles is jittered otherwise than in one piece.
+
+    **Raises:** `ValueError` for no views, an image of another size than its camera's, NaN or infinite
+    pixels, and a scene that returns something else.
+    """
+
+    scene: Scene
+    groups: list[_Group]
+    background: Float[Array, "3"]
+
+    def __init__(
+        self,
+        scene: Scene | Any,
+        views: Sequence[tuple[Camera, Arrayable]] | Any,
+        background: Arrayable = (1.0, 1.0, 1.0),
+    ):
+        if not callable(scene):
+            raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
+        self.scene = cast(Scene, scene)
+        self.background = finite_array("background", background, (3,))
+        alike: dict[Any, list[tuple[Camera, Array]]] = {}
+        for number, view in enumerate(_pairs(views)):
+            camera, image = _view(number, *view)
+            alike.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
+        self.groups = [
+            _Group(
+                *(jax.tree.map(lambda *leaves: jnp.stack(leaves), *part) for part in zip(*group, strict=True))
+            )
+            for group in alike.values()
+        ]
+
+    def count(self) -> int:
+        return sum(group.images.size for group in self.groups)
+
+    def tiles(self, most: int) -> list[Tiles]:
+        return [self._tiles(group, most) for group in self.groups]
+
+    def _tiles(self, group: _Group, most: int) -> Tiles:
+        views, height, width, channels = group.images.shape
+        if most < width * channels:
+            raise ValueError(
+                f"max_jacobian leaves room for {most} entries of the residual, and one row of an image has "
+                f"{width * channels}. Raise max_jacobian, or fit fewer parameters."
+            )
+        pieces = math.ceil(height / min(height, most // (width * channels)))
+        rows = math.ceil(height / pieces)
+        weight = 1 / math.sqrt(self.count())
+
+        def of(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
+            view, first = item
+            volume, transfer, camera, march = self._scene(parameters, group, view)
+            if pieces > 1:
+                camera = _rows_of(camera, first, rows)
+            rendering = render(volume, transfer, camera, march, adjoint=adjoint)
+            seen = rendering.rgba if channels == 4 else rendering.image(self.background)
+            row = first + jnp.arange(rows)
+            wanted = group.images[view, jnp.minimum(row, height - 1)]
+            # the last piece may reach past the image
+            inside = (row < height)[:, None, None]
+            return jnp.where(inside, (seen - wanted) * weight, 0).reshape(-1)
+
+        view, piece = np.divmod(np.arange(views * pieces), pieces)
+        return Tiles(of, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
+
+    def _scene(
+        self, parameters: PyTree, group: _Group, view: Int[Array, ""]
+    ) -> tuple[Volume, Transfer, Camera, March]:
+        of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
+        made = self.scene(parameters, of_view)
+        kinds = Volume, Transfer, Camera, March
+        if not (
+            isinstance(made, tuple)
+            and len(made) == 4
+            and all(isinstance(thing, kind) for thing, kind in zip(made, kinds, strict=True))
+        ):
+            kinds = (
+                [type(thing).__name__ for thing in made] if isinstance(made, tuple) else type(made).__name__
+            )
+            raise ValueError(f"scene must return (volume, transfer, camera, march); got {kinds}.")
+        if made[2].size != of_view.size:
+            raise ValueError(
+                f"scene must return a camera of its view's size {of_view.size}; got {made[2].size}."
+            )
+        return made
+
+
+def _pairs(views: Any) -> list[tuple[Any, Any]]:
+    try:
+        pairs = [(camera, image) for camera, image in views]
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"views must be pairs (camera, image); got {type(views).__name__}.") from fault
+    if not pairs:
+        raise ValueError("views must hold at least one pair (camera, image); got none.")
+    return pairs
+
+
+def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
+    if not isinstance(camera, Camera):
+        raise ValueError(
+            f"views[{number}] must be a pair (camera, image); got {type(camera).__name__} first."
+        )
+    width, height = camera.size
+    image = np.asarray(image, np.float32)
+    if image.shape not in ((height, width, 3), (height, width, 4)):
+        raise ValueError(
+            f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, "
+            f"as its camera of size {camera.size} has; got {image.shape}."
+        )
+    if not np.all(finite(image)):
+        bad = int(np.sum(~finite(image)))
+        raise ValueError(
+            f"views[{number}]: the image must be finite; {bad} of its numbers are NaN or infinite."
+        )
+    return camera, jnp.asarray(image)
+
+
+def _rows_of(camera: Camera, first: Int[Array, ""], rows: int) -> Camera:
+    """`Camera.crop` to whole rows from one that is known only when the program runs; they may reach past
+    the image."""
+    left, right, bottom, top = camera.window
+    width, height = camera.size
+    edges = jnp.stack([first + rows, first]).astype(top.dtype) / height
+    below, above = top - (top - bottom) * edges
+    return camera._showing(jnp.stack([left, right, below, above]), (width, rows))
+
+
+class Problem(eqx.Module):
+    """A residual of free numbers, and what solvers ask of it."""
+
+    residual: Residual
+    free: Free
+    tile: int = eqx.field(static=True)
+    """Entries of the residual that are differentiated at once."""
+
+    def loss(self, free: tuple) -> Float[Array, ""]:
+        """Half the sum of squares. Its gradient is summed tile by tile, by reverse mode."""
+
+        def add(tiles: Tiles, total: Array, item: Any) -> Array:
+            return total + self._loss_of(tiles, item, free)
+
+        def value_and_gradient(free: tuple) -> tuple[Array, tuple]:
+            def add(tiles: Tiles, total: Any, item: Any) -> Any:
+                one = jax.value_and_grad(lambda free: self._loss_of(tiles, item, free))(free)
+                return jax.tree.map(jnp.add, total, one)
+
+            return self._over(add, (self._nothing, jax.tree.map(jnp.zeros_like, free)))
+
+        @jax.custom_jvp
+        def loss(free: tuple) -> Array:
+            return self._over(add, self._nothing)
+
+        @loss.defjvp
+        def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
+            value, gradient = value_and_gradient(*primal)
+            products = jax.tree.map(jnp.vdot, gradient, *tangent)
+            return value, jnp.sum(jnp.stack(jax.tree.leaves(products)))
+
+        return loss(free)
+
+    def condensed(self, free: tuple) -> Float[Array, "numbers numbers"]:
+        """The triangle, of which the last column is n + 1 numbers that stand for the residual, in value and
+        in derivative. Forward mode."""
+
+        @jax.custom_jvp
+        def condensed(free: tuple) -> Array:
+            return self._triangle(free)
+
+        @condensed.defjvp
+        def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
+            triangle = self._triangle(*primal)
+            change = triangle[:, :-1] @ ravel_pytree(*tangent)[0]
+            return triangle, jnp.zeros_like(triangle).at[:, -1].set(change)
+
+        return condensed(free)
+
+    def _triangle(self, free: tuple) -> Float[Array, "numbers numbers"]:
+        """The triangle R c; 0 ρ of the QR factors of [J r], with a diagonal that is not negative."""
+        flat, unravel = ravel_pytree(free)
+        n = flat.size
+
+        def add(tiles: Tiles, triangle: Array, item: Any) -> Array:
+            def residual(flat: Array) -> Array:
+                return tiles.of(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
+
+            rows = jnp.concatenate([triangle, _jacobian(residual, flat)])
+            return jnp.linalg.qr(rows, mode="r")
+
+        triangle = self._over(add, jnp.zeros((n + 1, n + 1), flat.dtype))
+        # the signs of QR's rows are arbitrary, and must not jump from step to step
+        return triangle * jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
+
+    @property
+    def _nothing(self) -> Float[Array, ""]:
+        return jnp.zeros(())
+
+    def _loss_of(self, tiles: Tiles, item: Any, free: tuple) -> Float[Array, ""]:
+        return jnp.sum(tiles.of(self.free.forward(free), item, "replay") ** 2) / 2
+
+    def _over(self, add: Callable[[Tiles, Any, Any], Any], total: Any) -> Any:
+        """The sum of what each tile adds."""
+        for tiles in self.residual.tiles(self.tile):
+            total, _ = jax.lax.scan(
+                lambda total, item, tiles=tiles: (add(tiles, total, item), None), total, tiles.items
+            )
+        return total
+
+
+def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Array, "entries numbers"]:
+    """[J r] by forward mode, a number of columns at a time."""
+    n = at.size
+    chunk = min(n, TANGENTS)
+    chunks = math.ceil(n / chunk)
+    directions = jnp.eye(chunks * chunk, n, dtype=at.dtype).reshape(chunks, chunk, n)
+    push = jax.vmap(lambda direction: jax.jvp(f, (at,), (direction,)), out_axes=(None, 0))
+    value, columns = jax.lax.map(push, directions)
+    columns = columns.reshape(chunks * chunk, -1)[:n]
+    return jnp.concatenate([columns, value[:1]]).T
+
+
+def tile_entries(residual: Residual, free: tuple, max_jacobian: int, least_squares: bool) -> int:
+    """How many entries of the residual are differentiated at once: so many that their rows [J r] fit into
+    `max_jacobian` bytes; all, where no Jacobian is made."""
+    if not least_squares:
+        return residual.count()
+    bytes_of_row = (size(free) + 1) * 4
+    if bytes_of_row * (size(free) + 1) > max_jacobian:
+        raise ValueError(
+            f"max_jacobian must hold the triangle of {size(free)} parameters, "
+            f"{bytes_of_row * (size(free) + 1)} bytes; got {max_jacobian}. "
+            'For so many parameters, use solver="adam" or "bfgs".'
+        )
+    return max_jacobian // bytes_of_row

@@ -1,0 +1,36 @@
+"""Where does a fit begin that knows nothing yet?"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..checks import Arrayable, finite_array, integer, require
+from ..transfer import TransferFunction
+from ..volume import Volume
+
+
+def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = None) -> TransferFunction:
+    """A transfer function to start a fit from: middle grey, and the same extinction everywhere.
+
+    **Arguments:**
+
+    - `volume`: the optical depth across it is about 1: what lies behind is seen, and so is what is in
+      front.
+    - `points`: how many control points, at least 2, evenly spaced.
+    - `clim`: their range (low, high), value units; by default that of the volume's values.
+
+    **Raises:** `ValueError` for fewer than two points, and a range that does not increase.
+    """
+    points = integer("points", points, 2)
+    clim = (float(volume.data.min()), float(volume.data.max())) if clim is None else clim
+    low, high = require(
+        finite_array("clim", clim, (2,)),
+        lambda c: c[0] < c[1],
+        "clim must be (low, high), low first; got {got}.",
+    )
+    bounds = volume.bounds
+    extent = float(jnp.mean(bounds[1::2] - bounds[::2]))
+    return TransferFunction(
+        np.linspace(float(low), float(high), points), np.full((points, 3), 0.5), np.full(points, 1 / extent)
+    )
