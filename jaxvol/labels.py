@@ -66,7 +66,8 @@ class LabelTransferFunction(Transfer):
             values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)
             value = jnp.clip(value, values[0], values[-1])
             interval = jnp.clip(points_below(values, value) - 1, 0, intervals - 1)
-            return interpolated(row_of(rows, label * intervals + interval), value)
+            row = row_of(rows, label * intervals + interval)
+            return interpolated(row, value - row[0])
 
         return classify
 

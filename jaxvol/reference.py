@@ -69,8 +69,9 @@ def pieces(march: March, ray: Ray, volume: Volume, front: Scalar) -> tuple[Cell,
 
 
 def measure(march: March, ray: Ray, seen: Classification, piece: Cell) -> Measured:
-    """What is read from the volume at the piece's sample."""
-    return seen.measure(ray.path(march.sample(piece)))
+    """What is read from the volume at the piece's sample, and what the transfer function finds of it."""
+    measured = seen.measure(ray.path(march.sample(piece)))
+    return measured if seen.search is None else (*measured, *seen.search(measured))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:

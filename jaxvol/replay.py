@@ -15,7 +15,6 @@ be 0. What the optical depths, colours and depths owe to the transfer function, 
 step is left to JAX, a segment at a time.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,7 +29,7 @@ from .rendering import Rendering
 from .transfer import Classification, Transfer
 from .triple import Scalar, Triple
 from .volume import Volume
-from .wavefront import CELLS, Follower, Samples
+from .wavefront import CELLS, Follower, Samples, over_cells
 
 
 class Cotangents(NamedTuple):
@@ -224,8 +223,3 @@ def with_voxels(volume: Volume, data: Array) -> Volume:
 def added(a: PyTree, b: PyTree) -> PyTree:
     """Leaf by leaf."""
     return jax.tree.map(jnp.add, a, b)
-
-
-def over_cells(f: Callable[..., Any], of_cells: tuple[bool, ...] = (True,)) -> Callable[..., Any]:
-    """A function of one ray, of arrays (rays,) and, where `of_cells`, (CELLS, rays)."""
-    return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))

@@ -38,6 +38,8 @@ class Classification(NamedTuple):
 
     measure: Callable[[Triple], Measured]
     classify: Classify
+    search: Callable[[Measured], Measured] | None = None
+    """What is worth finding once, for all that `classify` makes of it. It comes after what was measured."""
 
 
 class Transfer(eqx.Module):
@@ -52,14 +54,20 @@ class Transfer(eqx.Module):
         """From what was measured to colour and extinction. What does not depend on it is computed here, once,
         outside the march's loop."""
 
+    def search(self) -> Callable[[Measured], Measured] | None:
+        """What the classifier wants to be found of what was measured, and given after it: nothing."""
+        return None
+
     def over(self, volume: Volume) -> Classification:
         """Measuring and classifying the grid coordinates of this volume."""
-        return Classification(lambda coordinate: self.measured(volume, coordinate), self.classifier())
+        return Classification(
+            lambda coordinate: self.measured(volume, coordinate), self.classifier(), self.search()
+        )
 
     def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
         """The transposed derivative of classifying many samples, arrays of any one shape: what the transfer
         function, and what was measured, get of these cotangents of colour and extinction. None where there
-        is no derivative."""
+        is no derivative. `measured` ends in what `search` has found."""
 
         def classified(given: tuple[Transfer, Measured]) -> tuple[Triple, Scalar]:
             transfer, measured = given
@@ -139,7 +147,8 @@ class TransferFunction(Transfer):
 
     def __call__(self, value: Scalar) -> tuple[Triple, Scalar]:
         """Colour (r, g, b) and extinction of a value."""
-        return self.classifier()((value,))
+        search, measured = self.search(), (value,)
+        return self.classifier()(measured if search is None else (*measured, *search(measured)))
 
     def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
         """Opacity at the control points of a layer of thickness `unit_distance`."""
@@ -150,14 +159,38 @@ class TransferFunction(Transfer):
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
         return seen_between(values, extinction, blocks.low, blocks.high)
 
+    def search(self) -> Callable[[Measured], Measured] | None:
+        values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
+        if last < FEW:
+            return None
+        first, step = values[0], (values[-1] - values[0]) / last
+        even = jnp.all(jnp.abs(values[1:] - values[:-1] - step) < 1e-3 * step)
+
+        def counted(value: Scalar) -> Int[Array, "..."]:
+            """For points that lie evenly: by a division, which may be off by one."""
+            guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
+            return guess + (value >= at(guess + 1)).astype(jnp.int32) - (value < at(guess)).astype(jnp.int32)
+
+        def at(point: Int[Array, "..."]) -> Scalar:
+            return values.at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+        def searched(value: Scalar) -> Int[Array, "..."]:
+            return points_below(values, value) - 1
+
+        def search(measured: Measured) -> Measured:
+            value = jnp.clip(measured[0], values[0], values[-1])
+            interval = jnp.clip(jax.lax.cond(even, counted, searched, value), 0, last - 1)
+            return interval, value - at(interval)
+
+        return search
+
     def classifier(self) -> Classify:
         """Look-up of colour and extinction."""
         rows, values = self.rows(), jax.lax.stop_gradient(self.values)
 
         def looked_up(measured: Measured) -> tuple[Triple, Scalar]:
-            (value,) = measured
-            value = jnp.clip(value, values[0], values[-1])
-            return interpolated(row_of(rows, points_below(values, value) - 1), value)
+            _, interval, past = measured
+            return interpolated(row_of(rows, interval), past)
 
         def chosen(measured: Measured) -> tuple[Triple, Scalar]:
             (value,) = measured
@@ -165,17 +198,21 @@ class TransferFunction(Transfer):
             row = tuple(rows[0])
             for start, following in zip(values[1:-1], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
-            return interpolated(row, value)
+            return interpolated(row, value - row[0])
 
         return chosen if values.shape[0] <= FEW else looked_up
 
     def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
         # By one scatter of whole rows, where JAX would sum up for every entry of a row apart.
-        (value,), rows = measured, jax.lax.stop_gradient(self.rows())
+        rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
         clipped = jnp.clip(value, self.values[0], self.values[-1])
-        interval = jnp.clip(points_below(self.values, clipped) - 1, 0, rows.shape[0] - 1)
-        start, inverse, *_, r, g, b, first, last = row_of(rows, interval)
-        part = jnp.minimum((clipped - start) * inverse, 1)
+        if self.values.shape[0] <= FEW:
+            interval = jnp.clip(points_below(self.values, clipped) - 1, 0, rows.shape[0] - 1)
+            past = clipped - row_of(rows, interval)[0]
+        else:
+            _, interval, past = measured
+        _, inverse, *_, r, g, b, first, last = row_of(rows, interval)
+        part = jnp.minimum(past * inverse, 1)
         parts = jnp.stack([*color, extinction], axis=-1)
         shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
         sums = jnp.zeros((rows.shape[0], 8), shared.dtype).at[interval].add(shared, mode="promise_in_bounds")
@@ -219,9 +256,8 @@ def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, "..."]) -> R
     )
 
 
-def interpolated(row: Row, value: Scalar) -> tuple[Triple, Scalar]:
-    """Colour and extinction of a value within the table's range, from the row of its interval."""
-    past = value - row[0]
+def interpolated(row: Row, past: Scalar) -> tuple[Triple, Scalar]:
+    """Colour and extinction of a value so far past the start of an interval, from its row."""
     color = row[2] + past * row[5], row[3] + past * row[6], row[4] + past * row[7]
     # from end to end, and exact at both: where extinction falls to 0, it must be 0
     part = jnp.minimum(past * row[1], 1)

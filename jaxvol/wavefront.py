@@ -200,6 +200,11 @@ def _each(f: Any) -> Any:
     return lambda ray, *cells: jax.vmap(lambda *cells: jax.vmap(f)(ray, *cells))(*cells)
 
 
+def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
+    """A function of one ray, of arrays (rays,) and, where `of_cells`, (CELLS, rays)."""
+    return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
+
+
 def _segment(
     march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress
 ) -> tuple[Progress, Samples]:
@@ -222,7 +227,8 @@ def _segment(
         return given if divided else whole(at)
 
     def measured(at: Progress, given: Any) -> list[Measured]:
-        each = _each(lambda ray, piece: measure(march, ray, seen, piece))
+        # what is searched for must not have the voxels fetched once more
+        each = _each(lambda ray, piece: measure(march, ray, seen._replace(search=None), piece))
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
@@ -231,6 +237,9 @@ def _segment(
 
     any_live = jnp.any(live)
     values = in_memory(any_live, measured, at, given)
+    if seen.search is not None:
+        found = in_memory(any_live, lambda values: [over_cells(seen.search)(v) for v in values], values)
+        values = [(*read, *more) for read, more in zip(values, found, strict=True)]
     alphas = in_memory(any_live, opacities, at, given, values)
     bounded = march.moves or march.max_samples is not None
     taken, moved = jnp.full_like(at.index, CELLS), jnp.zeros(live.shape, bool)

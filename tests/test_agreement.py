@@ -142,4 +142,5 @@ def test_real_volumes_agree_with_the_independent_marcher(real_volume, file, spac
     march = jv.March(0.8, (jv.AlphaCorrection(),), "left")
     rendering = jv.render(volume, transfer, camera, march)
     assert float(rendering.rgba[..., 3].max()) > 0.5
-    compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5)
+    # 300 voxels from the entry float32 resolves 3e-5 of a voxel, and values differ by thousands between two
+    compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=3e-5)
