@@ -111,7 +111,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
             panel.set_xlabel("R, pixels", fontsize=8)
             panel.set_title(f"{scene}: {label}", fontsize=9)
             panel.tick_params(labelsize=8)
-            panel.set_ylim(bottom=0)
+            panel.set_ylim(0, 1.1 * panel.get_ylim()[1])
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     common.save(figure, path)
 

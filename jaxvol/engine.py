@@ -159,14 +159,15 @@ def _render(scene: Scene, how: _How, known: Known) -> Rendering:
 
 def _replayed(scene: Scene, known: Known) -> Rendering:
     """The image; in reverse mode, its derivative by a second march."""
+    how = _How("replay", 0)
 
     @eqx.filter_custom_vjp
     def image(scene: Scene, known: Known) -> Rendering:
-        return _image(scene, _How("replay", 0), known)
+        return _image(scene, how, known)
 
     @image.def_fwd
     def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Rendering, Rendering]:
-        rendering = image(scene, known)
+        rendering = _image(scene, how, known)
         return rendering, rendering
 
     @image.def_bwd

@@ -122,7 +122,9 @@ def test_every_leaf_matches_central_differences(name, adjoint):
             np.testing.assert_allclose(jnp.vdot(backwards[1], random), (ends[0] - ends[1]) / 2e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SETS])
+@pytest.mark.parametrize(
+    "name", [n if n == "leapt" else pytest.param(n, marks=pytest.mark.slow) for n in SETS]
+)
 def test_float32_gradients_are_those_of_float64(name):
     def gradient():
         scene, background = scene_of(name), jnp.asarray([0.2, 0.5, 0.9], float)
@@ -167,6 +169,7 @@ def test_gradients_that_are_wrong_by_nature_are(leaf):
     assert off("aligned") < 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [inside, orthographic])
 def test_replay_is_direct_for_other_cameras(camera):
     with in_float64():
