@@ -92,16 +92,14 @@ def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured:
 def blend(
     march: March,
     ray: Ray,
-    seen: Classification,
     at: Progress,
-    cell: tuple[tuple[Cell, Measured, Scalar], ...],
+    cell: tuple[tuple[Cell, Triple, Scalar], ...],
 ) -> Progress:
-    """What has been accumulated behind a cell. Of its pieces are known what was measured, and the opacity."""
+    """What has been accumulated behind a cell. Of its pieces are known colour and opacity."""
     (r, g, b), total, moment = at.color, at.opacity, at.moment
     samples, aligned = at.samples, at.aligned
-    for piece, measured, alpha in cell:
+    for piece, (red, green, blue), alpha in cell:
         depth = march.sample(piece)
-        (red, green, blue), _ = seen.classify(measured)
         weight = jnp.where(at.finished, 0, (1 - total) * alpha)
         r, g, b = r + weight * red, g + weight * green, b + weight * blue
         total, moment = total + weight, moment + weight * depth
@@ -139,7 +137,8 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
     measured = [measure(march, ray, seen, piece) for piece in cut]
     alphas = [opacity(march, ray, seen, piece, read) for piece, read in zip(cut, measured, strict=True)]
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    after = blend(march, ray, seen, at, tuple(zip(cut, measured, alphas, strict=True)))
+    colors = [seen.classify(read)[0] for read in measured]
+    after = blend(march, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
     return move(march, ray, after, transparent)
 
 

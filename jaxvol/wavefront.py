@@ -257,10 +257,11 @@ def _segment(
             values,
             [jnp.where(takes, alpha, 0) for alpha in alphas],
         )
-    after = at
-    for k in range(CELLS):
-        cell = jax.tree.map(lambda leaf, k=k: leaf[k], tuple(zip(*samples, strict=True)))
-        after = jax.vmap(lambda ray, at, cell: blend(march, ray, seen, at, cell))(ray, after, cell)
+    colors = [over_cells(seen.classify)(read)[0] for read in values]
+    blended = jax.vmap(lambda ray, at, cell: blend(march, ray, at, cell))
+    taken_cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
+    # unrolled, so that nothing between two cells is put in memory
+    after, _ = jax.lax.scan(lambda at, cell: (blended(ray, at, cell), None), at, taken_cells, unroll=CELLS)
     after = jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, moved, taken)
     return after, samples
 
