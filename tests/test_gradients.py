@@ -182,6 +182,76 @@ def test_replay_is_direct_for_other_cameras(camera):
             np.testing.assert_allclose(got, want, rtol=1e-7, atol=1e-9 * np.abs(want).max() + 1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
+def test_rays_of_ones_own_match_central_differences(adjoint):
+    with in_float64():
+        volume, transfer, camera, march = scene_of("leapt")
+        origins, directions = (part.reshape(-1, 3)[::3] for part in camera.rays())
+        random = np.random.default_rng(2)
+        weights = jnp.asarray(random.normal(size=(origins.shape[0], 4)))
+
+        @jax.jit
+        def loss(rays):
+            return jnp.sum(jv.render_rays(volume, transfer, *rays, march, adjoint=adjoint).rgba * weights)
+
+        rays = (origins, directions)
+        for i in range(2):
+            along = tuple(
+                jnp.asarray(random.normal(size=r.shape)) if i == j else jnp.zeros_like(r)
+                for j, r in enumerate(rays)
+            )
+            ends = [loss(jax.tree.map(lambda r, d, h=h: r + h * d, rays, along)) for h in (1e-6, -1e-6)]
+            difference = (ends[0] - ends[1]) / 2e-6
+            if adjoint == "forward":
+                slope = jax.jvp(loss, (rays,), (along,))[1]
+            else:
+                slope = sum(jnp.vdot(g, d) for g, d in zip(jax.grad(loss)(rays), along, strict=True))
+            np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
+def test_functions_by_label_match_central_differences(adjoint):
+    with in_float64():
+        volume, transfer, camera, march = scene_of("leapt")
+        labels = (np.indices(volume.shape).sum(axis=0) // 4 % 3).astype(np.uint8)
+        volume = jv.Volume(volume.data, volume.spacing, volume.origin, labels)
+        march = jv.March(march.step, (*march.transforms[:1], jv.AlphaCorrection(labels=True)), max_samples=64)
+        random = np.random.default_rng(3)
+        functions = doubled(
+            jv.LabelTransferFunction(
+                [
+                    None,
+                    transfer,
+                    jv.TransferFunction(transfer.values, 1 - transfer.colors, 2 * transfer.extinction),
+                ]
+            )
+        )
+        weights = jnp.asarray(random.normal(size=(SIZE[1], SIZE[0], 4)))
+
+        @eqx.filter_jit
+        def loss(functions):
+            rendering = jv.render(volume, functions, camera, march, adjoint=adjoint)
+            return jnp.sum(rendering.rgba * weights)
+
+        for where in (lambda f: f.stacked.colors, lambda f: f.stacked.extinction):
+            leaf = where(functions)
+            # the functions of labels that are not seen stay dark
+            along = jnp.asarray(random.normal(size=leaf.shape)) * jnp.any(leaf != 0)
+            along = along.at[jnp.asarray([0, -1])].set(0)
+            ends = [loss(eqx.tree_at(where, functions, leaf + h * along)) for h in (1e-6, -1e-6)]
+            difference = (ends[0] - ends[1]) / 2e-6
+            if adjoint == "forward":
+                still = jax.tree.map(
+                    lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, functions
+                )
+                slope = eqx.filter_jvp(loss, (functions,), (eqx.tree_at(where, still, along),))[1]
+            else:
+                slope = jnp.vdot(where(eqx.filter_grad(loss)(functions)), along)
+            np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-8)
+
+
 def test_tables_pull_as_jax_does():
     """Their scatter of whole rows, against what JAX makes of the look-up."""
     random = np.random.default_rng(0)
