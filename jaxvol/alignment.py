@@ -61,7 +61,8 @@ class AlphaCorrection(Transform):
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         reaches_past = cell.front + cell.width > ray.length
         # A cell that lies past the exit altogether is not sampled; its width just has to be ≥ 0.
-        left = jnp.maximum(ray.length - cell.front, 0)
+        # Not by a maximum, whose derivative XLA loses in the loops of the CPU (jaxlib 0.10).
+        left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
         cell = Cell(cell.front, jnp.where(reaches_past, left, cell.width), cell.cut | reaches_past)
         if not self.labels and not ray.path.gaps:
             return (cell,)

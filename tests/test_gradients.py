@@ -67,8 +67,8 @@ LEAVES = {
 }
 
 
-def loss_of(adjoint):
-    """A scalar of the image, its depth and a background, as a function of the scene."""
+def loss_of(adjoint, depths=0.1):
+    """A scalar of the image, its depths and a background, as a function of the scene."""
     random = np.random.default_rng(5)
     weights, of_depth = random.normal(size=(SIZE[1], SIZE[0], 3)), random.normal(size=(SIZE[1], SIZE[0]))
 
@@ -78,7 +78,7 @@ def loss_of(adjoint):
         color, opacity = rendering.rgba[..., :3], rendering.rgba[..., 3:]
         image = color + (1 - opacity) * background[None, None]
         depth = jnp.where(opacity[..., 0] > 0, rendering.depth, 0)
-        return jnp.sum(image * jnp.asarray(weights, image.dtype)) + 0.1 * jnp.sum(
+        return jnp.sum(image * jnp.asarray(weights, image.dtype)) + depths * jnp.sum(
             depth * jnp.asarray(of_depth, depth.dtype)
         )
 
@@ -140,16 +140,16 @@ def test_float32_gradients_are_those_of_float64(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("leaf", ["position", "spacing", "step"])
+@pytest.mark.parametrize("leaf", ["position", "step"])
 def test_gradients_that_are_wrong_by_nature_are(leaf):
     """Over a distance at which samples cross the exit, the image changes by more than its gradient says;
     and does not, once cells end at the exit."""
 
     def off(name):
-        """How far the mean of many derivatives is from the difference that they should add up to."""
+        """How far the mean of many derivatives is from the difference that they add up to; and that one."""
         scene, background = scene_of(name), jnp.zeros(3)
         scene = (jv.Volume(jnp.ones((6, 5, 7)), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1)), *scene[1:])
-        loss, where = loss_of("forward"), LEAVES[leaf]
+        loss, where = loss_of("forward", depths=0.0), LEAVES[leaf]  # a depth jumps where a ray first hits
         direction = jnp.full(where(scene).shape, 0.04)
         still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
         tangent = eqx.tree_at(where, still, direction)
@@ -162,11 +162,12 @@ def test_gradients_that_are_wrong_by_nature_are(leaf):
             for i in range(40)
         ]
         change = loss(at(1.0), background) - loss(at(0.0), background)
-        return abs(float(np.mean(slopes) - change)) / abs(float(change))
+        return abs(float(np.mean(slopes) - change)), abs(float(change))
 
     assert ("plain", leaf) in JUMPS
-    assert off("plain") > 0.1
-    assert off("aligned") < 1e-2
+    wrong, change = off("plain")
+    assert wrong > 0.1 * change
+    assert off("aligned")[0] < 0.02 * change
 
 
 @pytest.mark.slow
@@ -238,7 +239,7 @@ def test_functions_by_label_match_central_differences(adjoint):
         for where in (lambda f: f.stacked.colors, lambda f: f.stacked.extinction):
             leaf = where(functions)
             # the functions of labels that are not seen stay dark
-            along = jnp.asarray(random.normal(size=leaf.shape)) * jnp.any(leaf != 0)
+            along = jnp.asarray(random.normal(size=leaf.shape))
             along = along.at[jnp.asarray([0, -1])].set(0)
             ends = [loss(eqx.tree_at(where, functions, leaf + h * along)) for h in (1e-6, -1e-6)]
             difference = (ends[0] - ends[1]) / 2e-6
@@ -280,7 +281,7 @@ def test_tables_pull_as_jax_does():
 
 def workspace(samples, size=512, resolution=256):
     """Bytes that the compiled gradient needs beside its inputs and outputs."""
-    shape = jax.ShapeDtypeStruct((resolution,) * 3, jnp.float32)
+    data = jnp.zeros((resolution,) * 3)
     small = jv.Volume(jnp.zeros((2, 2, 2)), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
     camera = jv.Camera((3, 2, 2.5), (0, 0, 0), size=(size, size))
     march = jv.March(3.4 / samples, (jv.AlphaCorrection(), jv.EarlyTermination(0.01)))
@@ -290,7 +291,7 @@ def workspace(samples, size=512, resolution=256):
         return jnp.sum(jv.render(volume, transfer, camera, march).rgba ** 2)
 
     program = eqx.filter_jit(jax.grad(loss, argnums=(0, 1, 2)), donate="none")
-    compiled = program.lower(shape, soft_transfer(), camera).compile()
+    compiled = program.lower(data, soft_transfer(), camera).compile()
     return compiled.compiled.memory_analysis().temp_size_in_bytes
 
 
