@@ -61,7 +61,7 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> 
     try:
         if not is_traced(value) and not isinstance(value, jax.Array):
             value = np.asarray(value)
-            if value.dtype.kind in "OSU":
+            if value.dtype.kind not in "biufV":  # V: JAX's own short floats
                 raise TypeError
             value = value.astype(jnp.result_type(float))
         with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():

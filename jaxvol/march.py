@@ -195,11 +195,6 @@ class March(eqx.Module):
         return any(type(transform).survey is not Transform.survey for transform in self.transforms)
 
     @property
-    def cuts(self) -> bool:
-        """Whether any transform may cut cells."""
-        return any(type(transform).cut is not Transform.cut for transform in self.transforms)
-
-    @property
     def moves(self) -> bool:
         """Whether any transform may answer with other than whole steps."""
         return any(type(transform).advance is not Transform.advance for transform in self.transforms)

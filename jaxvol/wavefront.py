@@ -4,7 +4,8 @@ What makes this fast was measured (on CPU, by XLA's rules), and is what this fil
 
 - A *segment* is CELLS cells of a ray. All its samples are taken before any is blended, since only then XLA
   fetches each voxel once: it repeats a fetch for every use that it makes of it, unless a branch stands
-  between, behind which values lie in memory. So measuring is one `lax.cond`, and the opacities another.
+  between, behind which values lie in memory. So measuring is one `lax.cond`, what a transfer function
+  searches for in its table another, and the opacities a third.
 - Rays come in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is marched
   segment after segment until a quarter of its groups is finished; then batches are made up anew from the
   groups that are left. Lanes that idle cost as much as those that work.
@@ -26,7 +27,7 @@ from .beams import Box
 from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
-from .reference import Progress, begin, blend, front, measure, move, opacity, pieces
+from .reference import Progress, begin, blend, front, move, opacity, pieces
 from .transfer import Classification, Measured
 from .triple import Scalar
 from .volume import Volume
@@ -195,11 +196,6 @@ def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
     return ~at.finished & (at.index < march.most_samples)
 
 
-def _each(f: Any) -> Any:
-    """A function of one ray, and of what each of its cells has, over rays (n,) and cells (CELLS, n)."""
-    return lambda ray, *cells: jax.vmap(lambda *cells: jax.vmap(f)(ray, *cells))(*cells)
-
-
 def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     """A function of one ray, of arrays (rays,) and, where `of_cells`, (CELLS, rays)."""
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
@@ -227,12 +223,13 @@ def _segment(
         return given if divided else whole(at)
 
     def measured(at: Progress, given: Any) -> list[Measured]:
-        # what is searched for must not have the voxels fetched once more
-        each = _each(lambda ray, piece: measure(march, ray, seen._replace(search=None), piece))
+        each = over_cells(lambda ray, piece: seen.measure(ray.path(march.sample(piece))), (False, True))
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
-        each = _each(lambda ray, piece, read: opacity(march, ray, seen, piece, read))
+        each = over_cells(
+            lambda ray, piece, read: opacity(march, ray, seen, piece, read), (False, True, True)
+        )
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
     any_live = jnp.any(live)
