@@ -5,7 +5,7 @@ a volume gives values, a transfer function their colour and extinction; the cell
 back into a `Rendering`.
 """
 
-from . import metrics as metrics
+from . import lighting as lighting, metrics as metrics
 from .alignment import AlphaCorrection as AlphaCorrection
 from .camera import Camera as Camera
 from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to_srgb
@@ -28,6 +28,7 @@ from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .leaping import SpaceLeaping as SpaceLeaping
+from .lighting import Material as Material
 from .march import March as March, Transform as Transform
 from .phantoms import (
     colon_path as colon_path,

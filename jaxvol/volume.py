@@ -5,6 +5,8 @@ grid of n nodes spans n - 1 steps along an axis. Between nodes the value is tril
 the grid it is that of the nearest point of the grid.
 """
 
+import itertools
+import math
 from typing import Literal, TypeAlias
 
 import equinox as eqx
@@ -121,6 +123,19 @@ class Volume(eqx.Module):
         )
         _, ny, nz = self.shape
         return _fetch(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
+
+    def label_share(self, coordinate: Triple, label: int) -> Scalar:
+        """The trilinear share of a label at a grid coordinate: 1 among nodes that have it, 0 among others."""
+        if self.labels is None:
+            raise ValueError("labels are needed here and this volume has none; give Volume(..., labels=...).")
+        (i, j, k), fraction = split(coordinate, self.shape)
+        _, ny, nz = self.shape
+        share = jnp.zeros_like(fraction[0])
+        for x, y, z in itertools.product((0, 1), repeat=3):
+            node = _fetch(self.labels, ((i + x) * ny + j + y) * nz + k + z)
+            sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
+            share = share + math.prod(sides) * (node == label)
+        return share
 
     def _cube(self, coordinate: Triple) -> tuple[Cube, Triple]:
         """The eight voxels around a coordinate, [x][y][z], and the fractions between them."""

@@ -1,0 +1,9 @@
+"""How does light fall on what is seen? Lights, and the materials that scatter it."""
+
+from .lights import (
+    ConstantLight as ConstantLight,
+    DirectionalLight as DirectionalLight,
+    Light as Light,
+    PointLight as PointLight,
+)
+from .materials import Material as Material, material as material
