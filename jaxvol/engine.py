@@ -15,13 +15,16 @@ from jaxtyping import Array, Float, Int, PyTree, UInt32
 from .camera import Camera
 from .checks import Arrayable, finite, is_traced, require
 from .leaping import FirstHit
+from .lighting.seam import Lighting, Surroundings, classification
 from .locate import Ray
 from .march import March, Survey, View
 from .occupancy import Blocks
 from .packed import with_words, words_of
 from .reference import begin, end, samples_across, step
+from .relight import Lit
 from .rendering import Rendering
-from .replay import Cotangents, Replay, Total, added, floats, with_voxels, without_voxels
+from .replay import Cotangents, Replay, Total
+from .taps import added, floats, with_voxels, without_voxels
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, march_beams
@@ -51,6 +54,7 @@ def render(
     camera: Camera,
     march: March,
     *,
+    lighting: Lighting | None = None,
     adjoint: Adjoint = "replay",
 ) -> Rendering:
     """The image of a volume.
@@ -60,6 +64,8 @@ def render(
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: one ray for each pixel.
     - `march`: step and transforms.
+    - `lighting`: how samples are lit, such as `lighting.ScattererTemplates`. Without, colours are those of
+      the transfer function.
     - `adjoint`: how the image is differentiated; the image itself is the same.
         - `"replay"`: reverse mode (`jax.grad`). A second march computes the samples again, so that memory
           does not grow with their number: it takes one array like each leaf, and a wave's rays.
@@ -76,7 +82,7 @@ def render(
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
     """
     how = _How.of(adjoint, volume, march)
-    return _render((volume, transfer, camera, march), how, Known.of(volume, march))
+    return _render((volume, transfer, camera, march, _lighting(lighting)), how, Known.of(volume, march))
 
 
 def render_rays(
@@ -86,6 +92,7 @@ def render_rays(
     directions: Arrayable,
     march: March,
     *,
+    lighting: Lighting | None = None,
     adjoint: Adjoint = "replay",
 ) -> Rendering:
     """What rays of one's own see. As `render`, but for:
@@ -109,7 +116,7 @@ def render_rays(
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     how = _How.of(adjoint, volume, march)
     source = OwnRays(origins, directions)
-    return _render((volume, transfer, source, march), how, Known.of(volume, march))
+    return _render((volume, transfer, source, march, _lighting(lighting)), how, Known.of(volume, march))
 
 
 class Known(eqx.Module):
@@ -141,7 +148,7 @@ class _How(eqx.Module):
         return cls(adjoint, min(-(-length // 64) * 64, march.most_samples))
 
 
-Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March]
+Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
 
 
 def _compiled(function: Callable[..., Rendering]) -> Callable[..., Rendering]:
@@ -184,12 +191,12 @@ def _replayed(scene: Scene, known: Known) -> Rendering:
 
 
 def _image(scene: Scene, how: _How, known: Known) -> Rendering:
-    volume, transfer, source, march = scene
+    volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
     direct = how.adjoint == "direct"
     waves, space = Waves.of(source, DIRECT_WAVE if direct else WAVE), march.locate(volume)
-    survey = None if direct else _survey((volume, transfer, source, march), known)
-    seen = transfer.over(volume)
+    survey = None if direct else _survey((volume, transfer, source, march, None), known)
+    seen = classification(volume, transfer, space, lighting)
 
     def wave(number: Int[Array, ""]) -> Rendering:
         rays = waves.rays(source, space, number)
@@ -207,12 +214,15 @@ def _image(scene: Scene, how: _How, known: Known) -> Rendering:
 
 def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gradient: Rendering) -> Any:
     """What every leaf of the scene gets of an image's gradient."""
-    volume, transfer, source, march = scene
+    volume, transfer, source, march, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
-    places = any(jax.tree.leaves((perturbed[0], *perturbed[2:])))
+    places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
     packed = with_words(volume, known.words)
     waves, survey = Waves.of(source, WAVE), _survey(scene, known)
     seen = transfer.over(packed)
+    light, pull_light = None, None
+    if lighting is not None:
+        light, pull_light = _light(scene, packed, voxels=of_voxels)
 
     def wave(sums: tuple[Total, PyTree], given: tuple[Array, Rendering, Rendering]) -> tuple[Any, None]:
         (total, of_source), (number, rendering, gradient) = sums, given
@@ -226,7 +236,7 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gr
         replay = Replay(
             (packed, transfer, march),
             seen,
-            *(rays, Cotangents.of(rays, rendering, gradient), total),
+            *(rays, Cotangents.of(rays, rendering, gradient), total, light),
             places=places,
         )
         beams = Beams(rays, waves.beams, waves.box(source, rays, number))
@@ -245,7 +255,7 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gr
         return (total, added(of_source, of_rays_source)), None
 
     start = (
-        Total.zeros(volume, transfer, march, voxels=of_voxels),
+        Total.zeros(volume, transfer, march, light, voxels=of_voxels),
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
     image = jax.tree.map(waves.apart, (rendering, gradient))
@@ -253,12 +263,42 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gr
     of_volume = total.volume
     if total.voxels is not None:
         of_volume = with_voxels(of_volume, total.voxels.reshape(volume.data.shape))
-    return of_volume, total.transfer, of_source, total.march
+    if pull_light is None:
+        return of_volume, total.transfer, of_source, total.march, None
+    more_volume, more_transfer, more_march, of_lighting = pull_light(total.light)[0]
+    return (
+        added(of_volume, more_volume),
+        added(total.transfer, more_transfer),
+        of_source,
+        added(total.march, more_march),
+        of_lighting,
+    )
+
+
+def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable[[PyTree], Any]]:
+    """By what an image is lit; and what volume, transfer function, march and lighting get of the gradient of
+    that."""
+    volume, transfer, _, march, lighting = scene
+    parts = volume if voxels else without_voxels(volume), transfer, march, lighting
+    moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
+
+    def made(moving: PyTree) -> tuple[PyTree, Lit]:
+        moved, transfer, march, lighting = eqx.combine(moving, fixed)
+        # the packed copy is for fetching alone
+        whole = moved if voxels else with_voxels(moved, volume.data)
+        around = Surroundings(whole, transfer, march.locate(whole))
+        light = Lit(lighting.over(around), around)
+        return floats(light.leaves), light
+
+    _, pull, light = jax.vjp(made, moving, has_aux=True)
+    return light._replace(
+        around=Surroundings(packed, transfer, march.locate(volume))
+    ), pull
 
 
 def _survey(scene: Scene, known: Known) -> Survey | None:
     """What is known of empty space. Nothing of it has a gradient."""
-    volume, transfer, source, march = jax.lax.stop_gradient(scene)
+    volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
     if known.blocks is None:
         return None
     space = march.locate(volume)
@@ -277,6 +317,14 @@ def _survey(scene: Scene, known: Known) -> Survey | None:
         return waves.assemble(each_ray(end)(rays, at).depth[None]).reshape(columns.shape)
 
     return march.survey(occupancy, View(source.ray, source.size, first_hit))
+
+
+def _lighting(lighting: Any) -> Lighting | None:
+    if lighting is not None and not isinstance(lighting, Lighting):
+        raise ValueError(
+            f"lighting must be a Lighting, such as ScattererTemplates, or None; got {lighting!r}."
+        )
+    return lighting
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

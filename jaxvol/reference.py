@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .checks import is_traced
+from .lighting.seam import Lighting, Sample, classification
 from .locate import Ray, enter
 from .march import Cell, March
 from .rendering import Rendering
 from .transfer import Classification, Measured, Transfer
-from .triple import Scalar, Triple, apart
+from .triple import Scalar, Triple, along, apart
 from .volume import Volume
 
 
@@ -89,6 +90,17 @@ def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured:
     return 2 * t / (1 + t)
 
 
+def color(
+    march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured, transmittance: Scalar
+) -> Triple:
+    """Colour of a piece, of which so much reaches the camera; as lit, where there is a light."""
+    color, extinction = seen.classify(measured)
+    if seen.light is None:
+        return color
+    point = along(ray.entry, ray.direction, march.sample(piece))
+    return seen.light(Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel))
+
+
 def blend(
     march: March,
     ray: Ray,
@@ -137,7 +149,10 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
     measured = [measure(march, ray, seen, piece) for piece in cut]
     alphas = [opacity(march, ray, seen, piece, read) for piece, read in zip(cut, measured, strict=True)]
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    colors = [seen.classify(read)[0] for read in measured]
+    total, colors = at.opacity, []
+    for piece, read, alpha in zip(cut, measured, alphas, strict=True):
+        colors.append(color(march, ray, seen, piece, read, 1 - total))
+        total = total + (1 - total) * alpha
     after = blend(march, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
     return move(march, ray, after, transparent)
 
@@ -163,6 +178,7 @@ def render_ray_reference(
     march: March,
     *,
     pixel: tuple[Any, Any] = (0, 0),
+    lighting: Lighting | None = None,
 ) -> Rendering:
     """What one ray sees, by a plain scan over its cells.
 
@@ -173,6 +189,7 @@ def render_ray_reference(
 
     - `origin`, `direction`: world point and unit direction of the ray.
     - `pixel`: (column, row), on which everything random depends.
+    - `lighting`: how samples are lit.
 
     **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
@@ -181,8 +198,9 @@ def render_ray_reference(
     """
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
-    ray = enter(march.locate(volume), apart(origin), apart(direction), pixel)
-    seen = transfer.over(volume)
+    space = march.locate(volume)
+    ray = enter(space, apart(origin), apart(direction), pixel)
+    seen = classification(volume, transfer, space, lighting)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(march, ray, volume, seen, at), None

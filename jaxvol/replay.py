@@ -20,14 +20,17 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Float, PyTree
 
 from .locate import Ray
 from .march import March
 from .reference import Progress, contained, front, pieces
+from .relight import LightTotal, Lit, Relit, relit
 from .rendering import Rendering
+from .taps import Tapped, added, floats, scattered, without_voxels
 from .transfer import Classification, Transfer
-from .triple import Scalar, Triple
+from .triple import Scalar, Triple, along
+from .visible import Weighed, weighed
 from .volume import Volume
 from .wavefront import CELLS, Follower, Samples, over_cells
 
@@ -62,15 +65,19 @@ class Total(eqx.Module):
     volume: PyTree
     """Of all but the voxels."""
     voxels: Float[Array, " voxels"] | None
+    light: PyTree
+    """Of its shading, and the space in which it looks around."""
 
     @classmethod
-    def zeros(cls, volume: Volume, transfer: Transfer, march: March, *, voxels: bool) -> "Total":
+    def zeros(
+        cls, volume: Volume, transfer: Transfer, march: March, light: Lit | None, *, voxels: bool
+    ) -> "Total":
         """None yet."""
-        transfer, march, volume_ = (
-            jax.tree.map(jnp.zeros_like, floats(part)) for part in (transfer, march, without_voxels(volume))
-        )
+        lit = None if light is None else light.leaves
+        parts = transfer, march, without_voxels(volume), lit
+        transfer, march, volume_, lit = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
         data = volume.data
-        return cls(transfer, march, volume_, jnp.zeros(data.size, data.dtype) if voxels else None)
+        return cls(transfer, march, volume_, jnp.zeros(data.size, data.dtype) if voxels else None, lit)
 
 
 class Replay(Follower):
@@ -79,6 +86,7 @@ class Replay(Follower):
     **Arguments:**
 
     - `total`: to be added to.
+    - `light`: by what the samples are lit.
     - `places`: whether the gradient of anything but the transfer function is asked for.
     """
 
@@ -89,11 +97,12 @@ class Replay(Follower):
         rays: Ray,
         given: Cotangents,
         total: Total,
+        light: Lit | None,
         *,
         places: bool,
     ):
         self.volume, self.transfer, self.march = scene
-        self.seen, self.places = seen, places
+        self.seen, self.places, self.light = seen, places, light
         self.given, self.total = given, total
         self.kept = jnp.zeros_like(given.worth)  # of the samples in front
         self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if places else None
@@ -106,55 +115,45 @@ class Replay(Follower):
         classify = over_cells(self.seen.classify)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.march.sample(cell) for cell in samples.cells]
+        known = weighed(self.march, at, samples.opacity)
+        wanted = [(weight * red, weight * green, weight * blue) for weight in known.weight]
+        lit: list[Relit] | None = None
+        colors = [color for color, _ in classified]
+        if self.light is not None:
+            sums = LightTotal(total.light, total.transfer, total.voxels)
+            lit, sums = relit(self.light, self.seen, self.march, ray, samples, known, wanted, sums)
+            total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
+            colors, wanted = [part.color for part in lit], [part.of_color for part in lit]
         worth = [
             red * r + green * g + blue * b + each.opacity + each.depth * (depth - each.middle)
-            for ((r, g, b), _), depth in zip(classified, depths, strict=True)
+            for (r, g, b), depth in zip(colors, depths, strict=True)
         ]
         inside = over_cells(contained, of_cells=(False, True))
-        kept, weights, slopes = self._weighed(at, samples.opacity, worth, given.worth, kept)
+        kept, slopes = _slopes(known, worth, given.worth, kept)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
         of_measured = []
-        for cell, measured, weight, slope in zip(
-            samples.cells, samples.measured, weights, slopes, strict=True
-        ):
-            of_color = weight * red, weight * green, weight * blue
-            of_transfer, pulled = self.transfer.pull(measured, of_color, slope * cell.width)
+        for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
+            of_extinction = slopes[i] * cell.width + (0 if lit is None else lit[i].of_extinction)
+            of_transfer, pulled = self.transfer.pull(measured, wanted[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
-            of_measured.append(pulled)
+            of_measured.append(pulled if lit is None else added(pulled, lit[i].of_measured))
         if not self.places:
             return kept, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
-        of_depth = [weight * each.depth for weight in weights]
-        wanted = list(zip(of_measured, of_width, of_depth, strict=True))
-        of_march, of_volume, of_rays, of_voxels = self._placed(ray, at, wanted)
-        voxels: Any = total.voxels
-        for place, part in of_voxels:
-            voxels = voxels.at[place].add(part, mode="promise_in_bounds", wrap_negative_indices=False)
+        of_depth = [weight * each.depth for weight in known.weight]
+        of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
+        of_march, of_volume, of_rays, asked, of_voxels = self._placed(
+            ray, at, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
+        )
+        voxels = None if total.voxels is None else scattered(total.voxels, asked, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
-        return kept, of_rays, Total(total.transfer, march, volume, voxels)
+        return kept, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
-    def _weighed(
-        self, at: Progress, alphas: list[Scalar], worth: list[Scalar], whole: Scalar, front: Scalar
-    ) -> tuple[Scalar, list[Scalar], list[Scalar]]:
-        """What the samples so far are worth; each one's weight; and how the loss changes with its optical
-        depth."""
-        opacity, finished = at.opacity, at.finished
-        weights: list[list[Scalar]] = [[] for _ in alphas]
-        slopes: list[list[Scalar]] = [[] for _ in alphas]
-        for k in range(CELLS):
-            for i, (alpha, value) in enumerate(zip(alphas, worth, strict=True)):
-                weight = jnp.where(finished, 0, (1 - opacity) * alpha[k])
-                opacity, front = opacity + weight, front + weight * value[k]
-                slope = (1 - opacity) * value[k] - (whole - front)
-                weights[i].append(weight)
-                slopes[i].append(jnp.where(finished, 0, slope))
-            finished |= jax.vmap(self.march.stop)(1 - opacity)
-        return front, [jnp.stack(w) for w in weights], [jnp.stack(s) for s in slopes]
-
-    def _placed(self, ray: Ray, at: Progress, wanted: list[tuple[PyTree, Scalar, Scalar]]) -> tuple:
-        """What march, volume, rays and voxels get of what is wanted of each piece's measured values, width
-        and depth. Which samples a ray has is taken as it is."""
+    def _placed(self, ray: Ray, at: Progress, wanted: list[tuple[PyTree, Scalar, Scalar, Any]]) -> tuple:
+        """What march, volume and rays get of what is wanted of each piece's measured values, width, depth,
+        and, where it is lit, point; then the voxels that were asked for, and what they get. Which samples a
+        ray has is taken as it is."""
         voxels = self.total.voxels is not None
         march, march_rest = eqx.partition(self.march, eqx.is_inexact_array)
         volume, volume_rest = eqx.partition(without_voxels(self.volume), eqx.is_inexact_array)
@@ -164,12 +163,13 @@ class Replay(Follower):
             march: PyTree, volume: PyTree, ray: PyTree, taps: Any, ray_rest: PyTree, at: Progress, k: Array
         ):
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
-            tapped = _Tapped(eqx.combine(volume, volume_rest), self.volume, taps if voxels else None)
+            tapped = Tapped(eqx.combine(volume, volume_rest), self.volume, taps if voxels else None)
             found = []
             for piece in pieces(march, ray, tapped, front(march, at, k)):
                 depth = march.sample(piece)
                 measured = self.transfer.measured(tapped, ray.path(depth))
-                found.append((floats(measured), piece.width, depth))
+                point = None if self.light is None else along(ray.entry, ray.direction, depth)
+                found.append((floats(measured), piece.width, depth, point))
             return found, tapped.asked
 
         ahead = jnp.arange(CELLS, dtype=at.index.dtype)
@@ -185,41 +185,15 @@ class Replay(Follower):
             taps = [jnp.zeros(place.shape, self.volume.data.dtype) for place in asked]
         _, pull, asked = jax.vjp(all_, march, volume, ray_floats, taps, has_aux=True)
         of_march, of_volume, of_ray, of_taps = pull(wanted)
-        return of_march, of_volume, of_ray, list(zip(asked, of_taps, strict=True)) if voxels else []
+        return of_march, of_volume, of_ray, asked, of_taps
 
 
-class _Tapped(Volume):
-    """A volume that writes down which voxels it is asked for, and adds something to each."""
-
-    taps: list | None
-    asked: list = eqx.field(static=True)
-
-    def __init__(self, volume: Volume, whole: Volume, taps: list | None):
-        self.data, self.labels = whole.data, whole.labels
-        self.spacing, self.origin = volume.spacing, volume.origin
-        self.taps, self.asked = taps, []
-
-    def _voxel(self, flat: Int[Array, ""]) -> Shaped[Array, ""]:
-        self.asked.append(flat)
-        value = jax.lax.stop_gradient(super()._voxel(flat))
-        return value if not self.taps else value + self.taps[len(self.asked) - 1]
-
-
-def floats(tree: PyTree) -> PyTree:
-    """What of it can have a gradient."""
-    return eqx.filter(tree, eqx.is_inexact_array)
-
-
-def without_voxels(volume: Volume) -> Volume:
-    """A volume but for its voxels, of which there are too many to be handed around."""
-    return eqx.tree_at(lambda v: v.data, volume, None)
-
-
-def with_voxels(volume: Volume, data: Array) -> Volume:
-    """The volume with these voxels."""
-    return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
-
-
-def added(a: PyTree, b: PyTree) -> PyTree:
-    """Leaf by leaf."""
-    return jax.tree.map(jnp.add, a, b)
+def _slopes(known: Weighed, worth: list[Scalar], whole: Scalar, front: Scalar) -> tuple[Scalar, list[Scalar]]:
+    """What the samples so far are worth, and how the loss changes with each one's optical depth."""
+    slopes: list[list[Scalar]] = [[] for _ in worth]
+    for k in range(CELLS):
+        for i, value in enumerate(worth):
+            front = front + known.weight[i][k] * value[k]
+            slope = (1 - known.behind[i][k]) * value[k] - (whole - front)
+            slopes[i].append(jnp.where(known.finished[i][k], 0, slope))
+    return front, [jnp.stack(each) for each in slopes]

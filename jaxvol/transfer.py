@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -40,13 +40,16 @@ class Classification(NamedTuple):
     classify: Classify
     search: Callable[[Measured], Measured] | None = None
     """What is worth finding once, for all that `classify` makes of it. It comes after what was measured."""
+    light: Callable[[Any], Triple] | None = None
+    """From a sample (`lighting.seam.Sample`) to its colour as lit. None where colours are as classified."""
 
 
 class Transfer(eqx.Module):
     """What a renderer asks of a transfer function, of whatever kind."""
 
     def measured(self, volume: Volume, coordinate: Triple) -> Measured:
-        """What is read from the volume at a grid coordinate: by default, its value."""
+        """What is read from the volume at a grid coordinate, of which the value comes first: by default, it
+        alone."""
         return (volume.value(coordinate),)
 
     @abstractmethod

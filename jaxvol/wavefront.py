@@ -26,10 +26,12 @@ from jaxtyping import Array, Bool, Int, PyTree
 from .beams import Box
 from .locate import Ray
 from .march import Cell, March, Survey
+from .memory import in_memory
 from .occupancy import Occupancy
 from .reference import Progress, begin, blend, front, move, opacity, pieces
 from .transfer import Classification, Measured
 from .triple import Scalar
+from .visible import lit_colors
 from .volume import Volume
 
 
@@ -254,7 +256,10 @@ def _segment(
             values,
             [jnp.where(takes, alpha, 0) for alpha in alphas],
         )
-    colors = [over_cells(seen.classify)(read)[0] for read in values]
+    if seen.light is None:
+        colors = [over_cells(seen.classify)(read)[0] for read in values]
+    else:
+        colors = lit_colors(seen, march, ray, at, *samples)
     blended = jax.vmap(lambda ray, at, cell: blend(march, ray, at, cell))
     taken_cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
     # unrolled, so that nothing between two cells is put in memory
@@ -282,15 +287,6 @@ def _taken(
         return jnp.full_like(left, CELLS), jnp.zeros_like(settled)
 
     return jax.lax.cond(jnp.all((settled & (left >= CELLS)) | ~live), all_, up_to, alphas)
-
-
-def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, computed once and put in memory for all who use it; or anything where none is live."""
-
-    def nothing(*arguments: Any) -> Any:
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(f, *arguments))
-
-    return jax.lax.cond(live, f, nothing, *arguments)
 
 
 def _leap(

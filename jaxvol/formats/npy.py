@@ -33,11 +33,29 @@ def read_npz(path: Path, header: Header) -> dict[str, Any]:
                 f"path: {path} must hold an array called data, or one array; got {sorted(arrays)}. "
                 "Save it with np.savez(path, data=...)."
             )
-        found = {}
-        for name, member in arrays.items():
-            with archive.open(member) as stream:
-                found[name] = _npy_array(path, stream, member.file_size)
-        return found
+        return _arrays(path, archive, arrays)
+
+
+def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The arrays of these names from an `.npz` file. **Raises** `ValueError` where one is missing."""
+    file_size(path)
+    with decoding(path), zipfile.ZipFile(path) as archive:
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        if missing := set(names) - set(members):
+            raise ValueError(
+                f"path: {path} must hold arrays {', '.join(names)}; {sorted(missing)} is missing."
+            )
+        return _arrays(path, archive, {name: members[name] for name in names})
+
+
+def _arrays(
+    path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]
+) -> dict[str, np.ndarray]:
+    found = {}
+    for name, member in members.items():
+        with archive.open(member) as stream:
+            found[name] = _npy_array(path, stream, member.file_size)
+    return found
 
 
 def _npy_array(path: Path, stream: Stream, held: int) -> np.ndarray:

@@ -7,3 +7,11 @@ from .lights import (
     PointLight as PointLight,
 )
 from .materials import Material as Material, material as material
+from .scatterers import ScattererTemplates as ScattererTemplates
+from .seam import Lighting as Lighting
+from .template import (
+    ScattererTemplate as ScattererTemplate,
+    scatterer_template as scatterer_template,
+    scatterer_templates as scatterer_templates,
+    template_capacity as template_capacity,
+)

@@ -1,6 +1,7 @@
 """What does a material do to light inside it, and where in a volume is it?"""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,6 +11,18 @@ from jaxtyping import Array, Float
 from ..checks import Arrayable, finite_array, integer, number, require, unit_interval
 from ..triple import Scalar, Triple
 from ..volume import Volume
+
+
+class Optics(NamedTuple):
+    """What a material does to light, wherever it is; of several materials, arrays."""
+
+    opacity: Float[Array, "..."]
+    mean_free_path: Float[Array, "..."]
+    refractive_index: Float[Array, "..."]
+
+    @property
+    def optics(self) -> "Optics":
+        return self
 
 
 class Material(eqx.Module):
@@ -59,6 +72,11 @@ class Material(eqx.Module):
                 "values must be (low, high) with low < high; got {got}.",
             )
         self.label = None if label is None else integer("label", label, 0)
+
+    @property
+    def optics(self) -> Optics:
+        """Opacity, mean free path and refractive index."""
+        return Optics(self.opacity, self.mean_free_path, self.refractive_index)
 
     @classmethod
     def from_scatterers(
@@ -142,13 +160,13 @@ def shares(
                 there = ((value >= low) & (value <= high)).astype(value.dtype)
             else:
                 width = edge * (high - low)
-                there = _step((value - low) / width + 0.5) * _step((high - value) / width + 0.5)
+                there = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
         each.append(left * there)
         left = left * (1 - there)
     return tuple(each)
 
 
-def _step(x: Scalar) -> Scalar:
+def smoothstep(x: Scalar) -> Scalar:
     """From 0 at 0 to 1 at 1, smoothly."""
     x = jnp.clip(x, 0, 1)
     return x * x * (3 - 2 * x)

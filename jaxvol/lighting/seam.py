@@ -1,0 +1,164 @@
+"""How is a classified sample lit? By looking around it, place after place, and summing up.
+
+This is the seam between the transfer function and the compositor. A `Lighting` is what a user gives;
+a `Shading` is what it becomes for one image; and `lit` is what every engine asks of it.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+from ..locate import Space
+from ..memory import in_memory
+from ..transfer import Classification, Measured, Transfer
+from ..triple import Scalar, Triple
+from ..volume import Volume
+
+
+class Sample(NamedTuple):
+    """A sample that is to be lit.
+
+    - `point`: in the world. `direction`: of the ray, a unit vector.
+    - `measured`, `color`, `extinction`: what the volume and the transfer function say there.
+    - `transmittance`: how much of it reaches the camera.
+    - `pixel`: (column, row), the key of everything random.
+    """
+
+    point: Triple
+    direction: Triple
+    measured: Measured
+    color: Triple
+    extinction: Scalar
+    transmittance: Scalar
+    pixel: tuple[Int[Array, ""], Int[Array, ""]]
+
+
+class Place(NamedTuple):
+    """What is at a point of the world.
+
+    - `inside`: how much of it: 1 in the volume, and falling to 0 at one voxel outside, so that no light
+      changes at once where the volume ends. `extinction` falls with it.
+    """
+
+    inside: Scalar
+    coordinate: Triple
+    value: Scalar
+    color: Triple
+    extinction: Scalar
+
+
+class Surroundings(eqx.Module):
+    """What can be seen from a sample."""
+
+    volume: Volume
+    transfer: Transfer
+    space: Space
+    live: Bool[Array, ""] | None = None
+    """True, which XLA must not know: see `memory`. None: no branches, out of which a volume could not tell
+    what it was asked for."""
+
+    def at(self, point: Triple) -> Place:
+        """What is at a point."""
+        inside, coordinate, measured = self._measured(point)
+
+        def found(measured: Measured) -> tuple[Triple, Scalar]:
+            return self.transfer.over(self.volume).classify(measured)
+
+        color, extinction = self._in_memory(found, measured)
+        return Place(inside, coordinate, measured[0], color, inside * extinction)
+
+    def extinction(self, point: Triple) -> Scalar:
+        """The extinction at a point, and no more."""
+        inside, _, measured = self._measured(point)
+        return inside * self.transfer.over(self.volume).classify(measured)[1]
+
+    def _measured(self, point: Triple) -> tuple[Scalar, Triple, Measured]:
+        coordinate, seen = self.space.coordinate(point), self.transfer.over(self.volume)
+        x, y, z = (
+            jnp.clip(jnp.minimum(c + 1, n - c), 0, 1) for c, n in zip(coordinate, self.volume.shape, strict=True)
+        )
+
+        def measured(coordinate: Triple) -> Measured:
+            found = seen.measure(coordinate)
+            return found if seen.search is None else (*found, *seen.search(found))
+
+        return x * y * z, coordinate, self._in_memory(measured, coordinate)
+
+    def _in_memory(self, f: Callable[[Any], Any], argument: Any) -> Any:
+        return f(argument) if self.live is None else in_memory(self.live, f, argument)
+
+
+class Shading(eqx.Module):
+    """A lighting made ready for one image. All methods see one sample.
+
+    A sample's light is a sum over places around it, of which only `term` looks at the volume's values.
+    """
+
+    @property
+    def terms(self) -> int:
+        """How many places are looked at."""
+        return 0
+
+    @abstractmethod
+    def about(self, around: Surroundings, sample: Sample) -> PyTree:
+        """What all terms want to know of the sample itself."""
+
+    def term(self, around: Surroundings, sample: Sample, notes: PyTree, number: Int[Array, ""]) -> PyTree:
+        """What one place adds: arrays, which are summed up over all."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def color(self, sample: Sample, notes: PyTree, sums: PyTree) -> Triple:
+        """The colour as lit."""
+
+
+class Lighting(eqx.Module):
+    """How samples are lit."""
+
+    @abstractmethod
+    def over(self, around: Surroundings) -> Shading:
+        """Ready for one image. What does not depend on the sample is computed here, once."""
+
+
+def classification(
+    volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None
+) -> Classification:
+    """What transfer function and lighting make of the places of a volume."""
+    seen = transfer.over(volume)
+    if lighting is None:
+        return seen
+    around = Surroundings(volume, transfer, space)
+    shading = lighting.over(around)
+    return seen._replace(light=lambda sample: lit(shading, around, sample)[0])
+
+
+def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None) -> tuple[Triple, Any]:
+    """The colour of a sample as lit.
+
+    `taps`: for a gradient of the voxels, what `replay` adds to each voxel that a term asks for: arrays with a
+    leading axis for the terms. Returned are also the voxels that were asked for, in the same way.
+    """
+    notes = shading.about(around, sample)
+
+    # What it knows of one place is computed again on the way back, where it would take a place in memory for
+    # each of them.
+    @jax.checkpoint
+    def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
+        number, taps = each
+        volume: Any = around.volume if taps is None else around.volume.tapped(taps)  # pyright: ignore
+        live = number >= 0 if taps is None else None
+        here = Surroundings(volume, around.transfer, around.space, live)
+        added = shading.term(here, sample, notes, number)
+        return jax.tree.map(jnp.add, sums, added), None if taps is None else volume.asked
+
+    if shading.terms == 0:
+        return shading.color(sample, notes, None), None
+    term = jax.eval_shape(lambda: shading.term(around, sample, notes, jnp.zeros((), jnp.int32)))
+    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
+    sums, asked = jax.lax.scan(one, none, (jnp.arange(shading.terms), taps))
+    return shading.color(sample, notes, sums), asked

@@ -1,0 +1,342 @@
+"""How does light spread inside a material? A few photons, simulated once: a scatterer template.
+
+Packets of light start from the origin. Each flies to its next scatterer, where a photon is left and the rest
+goes on as two packets, one refracted and one reflected: a binary tree, grown level by level in arrays whose
+shapes are known beforehand, so that many templates, of many materials, grow at once.
+
+Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
+volume rendering (2016), section 3.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ..checks import integer, is_traced, number
+from ..formats.npy import read_arrays
+from ..triple import Scalar
+from .materials import Material, Optics, materials_of, smoothstep
+
+
+Energy = Literal["conserving", "printed"]
+
+FADES = 0.8
+"""From the threshold down to this part of it a photon fades."""
+
+
+class ScattererTemplate(eqx.Module):
+    """Photons around the place of a sample, brightest first; or several such sets, along leading axes.
+
+    - `offset`: from the sample, world length.
+    - `intensity`: the share of the light that each photon holds; 0 for those that only fill up the array.
+    """
+
+    offset: Float[Array, "*templates n 3"]
+    intensity: Float[Array, "*templates n"]
+
+    def brightest(self, photons: int) -> "ScattererTemplate":
+        """So many of the brightest photons, scaled so that they hold the energy of all."""
+        count = min(integer("photons", photons, 1), self.intensity.shape[-1])
+        kept, whole = self.intensity[..., :count], jnp.sum(self.intensity, axis=-1, keepdims=True)
+        some = jnp.sum(kept, axis=-1, keepdims=True)
+        scale = whole / jnp.where(some > 0, some, 1)
+        return ScattererTemplate(self.offset[..., :count, :], kept * scale)
+
+    def blended(self) -> "ScattererTemplate":
+        """One template of all photons of those along the last leading axis, with the mean energy of these."""
+        *rest, templates, n = self.intensity.shape
+        offset = self.offset.reshape(*rest, templates * n, 3)
+        intensity = self.intensity.reshape(*rest, templates * n) / templates
+        return _sorted(ScattererTemplate(offset, intensity))
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a NumPy file, `.npz`."""
+        path = Path(path)
+        if path.suffix != ".npz":
+            raise ValueError(f"path must end in .npz; got {path}.")
+        np.savez(path, offset=np.asarray(self.offset), intensity=np.asarray(self.intensity))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ScattererTemplate":
+        """Read what `save` wrote. **Raises** `ValueError` naming what is wrong with the file."""
+        found = read_arrays(Path(path), ("offset", "intensity"))
+        offset, intensity = found["offset"], found["intensity"]
+        if offset.shape != (*intensity.shape, 3) or intensity.ndim < 1:
+            raise ValueError(
+                f"path: {path} must hold offset (*templates, n, 3) and intensity (*templates, n); "
+                f"got {offset.shape} and {intensity.shape}."
+            )
+        if not (np.isfinite(offset).all() and np.isfinite(intensity).all() and (intensity >= 0).all()):
+            raise ValueError(f"path: {path} must hold finite offsets, and finite intensities of at least 0.")
+        return cls(jnp.asarray(offset, float), jnp.asarray(intensity, float))
+
+
+def scatterer_template(
+    material: Material | Optics,
+    key: PRNGKeyArray | int,
+    *,
+    packets: int = 4,
+    threshold: float = 0.01,
+    energy: Energy = "conserving",
+    flights: bool = True,
+    critical_angle: float | Any | None = None,
+    merge: float = 0.01,
+    levels: int | None = None,
+) -> ScattererTemplate:
+    """Simulate the light around a place in a material.
+
+    A packet of energy I flies Δx = -λ ln u in its direction, u uniform. Where it arrives, in a material of
+    opacity α, αI is absorbed and becomes a photon; `I' cos θ'` is refracted, at the angle θ' to its
+    direction, uniformly distributed over the cone within the critical angle; and `I' (1 - cos θ')` is
+    reflected, anywhere into the half-space it came from. A packet whose photon would be fainter than the
+    threshold ends.
+
+    **Arguments:**
+
+    - `key`: a JAX key, or an integer from which one is made. All draws depend on it alone, so offsets are λ
+      times fixed ones.
+    - `packets`: into how many the light, of energy 1, is divided at the origin. Their directions are spread
+      evenly, turned at random. One packet makes a lopsided template.
+    - `threshold`: of a photon's intensity, in (0, 1). It fades between this and 0.8 of it, rather than to
+      vanish at once.
+    - `energy`: `"conserving"`: I' = (1 - α) I, so that all parts add up to I, and the template's energy falls
+      short of 1 by what the threshold cuts off alone. `"printed"`: as the paper has it, I' = α I, after I was
+      multiplied by exp(-Δx / λ) cos θ, θ the angle of incidence, whose cosine is drawn uniformly. Its energy
+      is not 1; without these factors (`flights=False`) it is α / (1 - α), above 1 for α > ½.
+    - `critical_angle`: degrees, in (0, 90]. By default that of total reflection between the material and
+      air, arcsin of 1/n, or of n where it is below 1.
+    - `merge`: photons closer than this part of λ become one.
+    - `levels`: of the tree. By default as many as leave photons above the threshold, which asks for an
+      opacity that is known when the program is compiled; to be given where it is traced.
+
+    **Returns:** a `ScattererTemplate` of `template_capacity` photons, differentiable in the material's mean
+    free path, opacity and refractive index (at an index of 1, where the critical angle has no derivative,
+    that one is 0).
+
+    **Raises:** `ValueError` for numbers out of range, and where `levels` are needed.
+    """
+    packets, threshold = (
+        integer("packets", packets, 1),
+        float(number("threshold", threshold, above=0, below=1)),
+    )
+    if energy not in get_args(Energy):
+        raise ValueError(f"energy must be one of {', '.join(get_args(Energy))}; got {energy!r}.")
+    if not flights and energy != "printed":
+        raise ValueError(
+            'flights=False belongs to energy="printed"; a conserving template has no such factors.'
+        )
+    if levels is None:
+        levels = template_levels(material, packets=packets, threshold=threshold, energy=energy)
+    grow = _Growth(packets, threshold, energy == "conserving", flights, float(merge), levels)
+    return grow(material.optics, _cosine_of_critical_angle(material.optics, critical_angle), _key(key))
+
+
+def scatterer_templates(
+    materials: Material | Sequence[Material], key: PRNGKeyArray | int, *, count: int = 8, **how: Any
+) -> ScattererTemplate:
+    """Several templates for each of some materials, grown at once.
+
+    **Arguments:** as for `scatterer_template`, and `count`: templates for each material.
+
+    **Returns:** a `ScattererTemplate` with leading axes (materials, count). The draws are keyed by the number
+    of the material, and that of its template.
+    """
+    materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
+    if how.get("levels") is None:
+        settings = {name: how[name] for name in ("packets", "threshold", "energy") if name in how}
+        how["levels"] = max(template_levels(each, **settings) for each in materials)
+    optics = jax.tree.map(lambda *each: jnp.stack(each), *(each.optics for each in materials))
+
+    def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
+        draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
+        return scatterer_template(optics, draws, **how)
+
+    several = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)), in_axes=(0, 0, None))
+    return several(optics, jnp.arange(len(materials)), jnp.arange(count))
+
+
+def template_levels(
+    material: Material | Optics, *, packets: int = 4, threshold: float = 0.01, energy: Energy = "conserving"
+) -> int:
+    """How many levels of the tree may hold a photon above the threshold: the brightest one of level k has
+    `α (1 - α)^k / packets`, or under the printed form `α^(k + 1) / packets`.
+
+    **Raises:** `ValueError` where the material's opacity is traced.
+    """
+    if is_traced(material.opacity):
+        raise ValueError("levels must be given where opacity is traced: the number of photons depends on it.")
+    alpha = float(np.asarray(material.opacity))
+    passed, least = (1 - alpha if energy == "conserving" else alpha), FADES * threshold * packets
+    if alpha <= least or passed == 0:
+        return 1
+    if passed == 1:
+        raise ValueError('opacity must be below 1 under energy="printed", whose tree would never end; got 1.')
+    return 1 + math.floor(math.log(least / alpha) / math.log(passed) + 1e-9)
+
+
+def photons_above(
+    material: Material | Optics, *, packets: int = 4, threshold: float = 0.01, energy: Energy = "conserving"
+) -> int:
+    """How many of a template's photons can be above 0 at once: in each level no more than its energy allows.
+    Often far fewer than `template_capacity`, which the tree alone allows."""
+    levels = template_levels(material, packets=packets, threshold=threshold, energy=energy)
+    alpha = float(np.asarray(material.opacity))
+    passed = 1 - alpha if energy == "conserving" else alpha
+    allowed = (passed**level * alpha / (FADES * threshold) + 1e-9 for level in range(levels))
+    return max(1, sum(min(packets * 2 ** min(k, 32), int(most)) for k, most in enumerate(allowed)))
+
+
+def template_capacity(
+    material: Material | Optics, *, packets: int = 4, threshold: float = 0.01, energy: Energy = "conserving"
+) -> int:
+    """How many photons a template has room for: a tree of `template_levels`, and no more than a light of
+    energy 1 could fill."""
+    levels = template_levels(material, packets=packets, threshold=threshold, energy=energy)
+    return _Growth(packets, threshold, energy == "conserving", True, 0.0, levels).capacity
+
+
+class _Growth(NamedTuple):
+    """How a template grows."""
+
+    packets: int
+    threshold: float
+    conserving: bool
+    flights: bool
+    merge: float
+    levels: int
+
+    @property
+    def most(self) -> int:
+        """Packets of a level that can be above the threshold at once, while their energies sum to 1."""
+        return math.floor(1 / (FADES * self.threshold) + 1e-9)
+
+    @property
+    def capacity(self) -> int:
+        whole = sum(min(self.packets * 2**level, self.most) for level in range(min(self.levels, 64)))
+        whole += max(self.levels - 64, 0) * self.most
+        return min(whole, self.most) if self.conserving else whole
+
+    def __call__(self, optics: Optics, cone: Scalar, key: PRNGKeyArray) -> ScattererTemplate:
+        origin, draws = jax.random.split(key)
+        start, even = jnp.zeros((self.packets, 3)), jnp.full(self.packets, 1 / self.packets)
+        packets = _Packets(start, _spread(origin, self.packets), even)
+        found, level = [], 0
+        while level < self.levels and packets.light.shape[0] < self.most:
+            packets, photons = self._level(optics, cone, jax.random.fold_in(draws, level), packets)
+            found.append(photons)
+            level += 1
+        if level < self.levels:  # from here on all levels are alike
+
+            def one(packets: _Packets, level: Int[Array, ""]) -> tuple[_Packets, ScattererTemplate]:
+                return self._level(optics, cone, jax.random.fold_in(draws, level), packets)
+
+            _, photons = jax.lax.scan(one, packets, jnp.arange(level, self.levels))
+            found.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), photons))
+        photons = _sorted(jax.tree.map(lambda *each: jnp.concatenate(each), *found))
+        if self.merge > 0:
+            photons = _sorted(_merged(photons, self.merge))
+        offset = photons.offset[: self.capacity] * optics.mean_free_path
+        return ScattererTemplate(offset, photons.intensity[: self.capacity])
+
+    def _level(
+        self, optics: Optics, cone: Scalar, key: PRNGKeyArray, packets: "_Packets"
+    ) -> tuple["_Packets", ScattererTemplate]:
+        """The photons that packets leave where they arrive, lengths in λ; and the packets that go on."""
+        position, direction, light = packets
+        alpha = optics.opacity
+        u = jax.random.uniform(key, (6, light.shape[0]))
+        flight = -jnp.log1p(-u[0])
+        position = position + flight[:, None] * direction
+        if self.flights and not self.conserving:
+            light = light * jnp.exp(-flight) * u[1]
+        light = light * _fade(alpha * light / self.threshold)
+        passed = ((1 - alpha) if self.conserving else alpha) * light
+        cosine = 1 - u[2] * (1 - cone)
+        after = _Packets(
+            jnp.concatenate([position] * 2),
+            jnp.concatenate([_turned(direction, cosine, u[3]), _turned(-direction, u[4], u[5])]),
+            jnp.concatenate([passed * cosine, passed * (1 - cosine)]),
+        )
+        if after.light.shape[0] > self.most:
+            _, brightest = jax.lax.top_k(jax.lax.stop_gradient(after.light), self.most)
+            after = jax.tree.map(lambda leaf: leaf[brightest], after)
+        return after, ScattererTemplate(position, alpha * light)
+
+
+class _Packets(NamedTuple):
+    """Light on its way: where from, in which direction, how much."""
+
+    position: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]
+    light: Float[Array, " n"]
+
+
+def _key(key: PRNGKeyArray | int) -> PRNGKeyArray:
+    return jax.random.key(key) if isinstance(key, int | np.integer) else key
+
+
+def _cosine_of_critical_angle(optics: Optics, degrees: Any) -> Scalar:
+    if degrees is not None:
+        return jnp.cos(jnp.deg2rad(number("critical_angle", degrees, above=0, below=90.001)))
+    sine = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
+    squared = 1 - sine**2
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+
+
+def _fade(x: Scalar) -> Scalar:
+    """From 0 at `FADES` to 1 at 1."""
+    return smoothstep((x - FADES) / (1 - FADES))
+
+
+def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
+    """Directions spread evenly over the sphere, turned at random: each alone is uniformly distributed."""
+    golden = math.pi * (1 + math.sqrt(5))
+    z = 1 - (2 * np.arange(n) + 1) / n
+    around, across = golden * np.arange(n), np.sqrt(1 - z**2)
+    even = np.stack([across * np.cos(around), across * np.sin(around), z], axis=-1)
+    q, r = jnp.linalg.qr(jax.random.normal(key, (3, 3)))
+    return jnp.asarray(even, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))).T
+
+
+def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
+    """Directions at an angle to these, anywhere around them."""
+    x, y, z = direction.T
+    # Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017
+    sign = jnp.where(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    second = jnp.stack([b, sign + y * y * a, -y], axis=-1)
+    squared = 1 - cosine**2
+    sine = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+    around = 2 * jnp.pi * u
+    turned = (sine * jnp.cos(around))[:, None] * first + (sine * jnp.sin(around))[:, None] * second
+    return turned + cosine[:, None] * direction
+
+
+def _sorted(photons: ScattererTemplate) -> ScattererTemplate:
+    """Brightest first."""
+    order = jnp.argsort(-jax.lax.stop_gradient(photons.intensity), axis=-1, stable=True)
+    return ScattererTemplate(
+        jnp.take_along_axis(photons.offset, order[..., None], axis=-2),
+        jnp.take_along_axis(photons.intensity, order, axis=-1),
+    )
+
+
+def _merged(photons: ScattererTemplate, distance: float) -> ScattererTemplate:
+    """Each photon gives its intensity to the brightest one within this distance."""
+    place = jax.lax.stop_gradient(photons.offset)
+    near = sum((place[:, None, i] - place[None, :, i]) ** 2 for i in range(3)) <= distance**2
+    # the first in order of brightness; itself, if there is none before. Its host may have one in turn.
+    host = jnp.argmax(near, axis=-1)
+    for _ in range(math.ceil(math.log2(max(host.shape[0], 2)))):
+        host = host[host]
+    intensity = jnp.zeros_like(photons.intensity).at[host].add(photons.intensity)
+    return ScattererTemplate(photons.offset, intensity)

@@ -1,0 +1,99 @@
+"""What does a loss see of the light? Each visible sample is lit again, with the derivatives of that.
+
+The counterpart of `visible.lit_colors` in the second march.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from .lighting.seam import Shading, Surroundings, lit
+from .locate import Ray
+from .march import March
+from .taps import Tapped, added, floats, scattered
+from .transfer import Classification
+from .triple import Scalar, Triple
+from .visible import Visible, Weighed
+from .wavefront import Samples
+
+
+class Lit(NamedTuple):
+    """By what the samples of an image are lit."""
+
+    shading: Shading
+    around: Surroundings
+
+    @property
+    def leaves(self) -> PyTree:
+        """What has a gradient, but for the transfer function and the voxels."""
+        return self.shading, self.around.space
+
+
+class LightTotal(NamedTuple):
+    """Gradients that all samples add to: of what lights, of the transfer function, and of the voxels."""
+
+    light: PyTree
+    transfer: PyTree
+    voxels: Float[Array, " voxels"] | None
+
+
+class Relit(NamedTuple):
+    """Samples as lit, arrays (cells, rays); and what their colour, extinction, measured values and world
+    points get of what is wanted of them. 0 for those that are not seen."""
+
+    color: Triple
+    of_color: Triple
+    of_extinction: Scalar
+    of_measured: PyTree
+    of_point: Triple
+
+
+def relit(
+    light: Lit,
+    seen: Classification,
+    march: March,
+    ray: Ray,
+    samples: Samples,
+    known: Weighed,
+    wanted: list[Triple],
+    total: LightTotal,
+) -> tuple[list[Relit], LightTotal]:
+    """A segment's samples, and the total with what they add to it. `wanted`: of each piece's colour."""
+    visible, around = Visible.of(known.weight), light.around
+    size = sum(weight.size for weight in known.weight)
+    moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
+    volume = around.volume if total.voxels is None else Tapped(around.volume, around.volume, None)
+
+    def one(places: Int[Array, " chunk"], carry: tuple[Relit, LightTotal]) -> tuple[Relit, LightTotal]:
+        found, total = carry
+        some = visible.samples(seen, march, ray, samples.cells, samples.measured, known, places)
+        moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
+
+        def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Triple, Any]:
+            (shading, space), transfer = eqx.combine(moving, fixed)
+            here = Surroundings(volume, transfer, space)
+            each = eqx.combine(moving_sample, fixed_sample)
+            return jax.vmap(lambda sample, taps: lit(shading, here, sample, taps))(each, taps)
+
+        taps = None
+        if total.voxels is not None:
+            _, asked = jax.eval_shape(lambda: colors(moving, moving_sample, []))
+            taps = [jnp.zeros(each.shape, around.volume.data.dtype) for each in asked]
+        color, pull, asked = jax.vjp(colors, moving, moving_sample, taps, has_aux=True)
+        real = places < size
+        cotangent = tuple(jnp.where(real, part, 0) for part in visible.take(wanted, places))
+        (of_light, of_transfer), of_sample, of_taps = pull(cotangent)
+        voxels = None if total.voxels is None else scattered(total.voxels, asked, of_taps)
+        total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
+        part = Relit(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
+        return visible.put(found, places, part), total
+
+    zero = jnp.zeros(size, known.weight[0].dtype)
+    measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))
+    zeros = zero, zero, zero
+    start = Relit(zeros, zeros, zero, measured, zeros)
+    found, total = visible.over(one, (start, total))
+    return visible.apart(found, len(known.weight)), total
