@@ -81,8 +81,8 @@ def render(
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
     """
-    how = _How.of(adjoint, volume, march)
-    return _render((volume, transfer, camera, march, _lighting(lighting)), how, Known.of(volume, march))
+    how, lighting = _How.of(adjoint, volume, march), _prepared(lighting, volume, transfer, march)
+    return _render((volume, transfer, camera, march, lighting), how, Known.of(volume, march))
 
 
 def render_rays(
@@ -114,9 +114,9 @@ def render_rays(
     message = "directions must not have length 0."
     directions = require(directions, lambda d: (d != 0).any(axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
-    how = _How.of(adjoint, volume, march)
+    how, lighting = _How.of(adjoint, volume, march), _prepared(lighting, volume, transfer, march)
     source = OwnRays(origins, directions)
-    return _render((volume, transfer, source, march, _lighting(lighting)), how, Known.of(volume, march))
+    return _render((volume, transfer, source, march, lighting), how, Known.of(volume, march))
 
 
 class Known(eqx.Module):
@@ -291,9 +291,7 @@ def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable
         return floats(light.leaves), light
 
     _, pull, light = jax.vjp(made, moving, has_aux=True)
-    return light._replace(
-        around=Surroundings(packed, transfer, march.locate(volume))
-    ), pull
+    return light._replace(around=Surroundings(packed, transfer, march.locate(volume))), pull
 
 
 def _survey(scene: Scene, known: Known) -> Survey | None:
@@ -319,12 +317,13 @@ def _survey(scene: Scene, known: Known) -> Survey | None:
     return march.survey(occupancy, View(source.ray, source.size, first_hit))
 
 
-def _lighting(lighting: Any) -> Lighting | None:
-    if lighting is not None and not isinstance(lighting, Lighting):
-        raise ValueError(
-            f"lighting must be a Lighting, such as ScattererTemplates, or None; got {lighting!r}."
-        )
-    return lighting
+def _prepared(lighting: Any, volume: Volume, transfer: Transfer, march: March) -> Lighting | None:
+    if lighting is None:
+        return None
+    if not isinstance(lighting, Lighting):
+        message = "lighting must be None or a Lighting, such as ScattererTemplates"
+        raise ValueError(f"{message}; got {lighting!r}.")
+    return lighting.prepared(Surroundings(volume, transfer, march.locate(volume)))
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

@@ -55,6 +55,10 @@ class Space(eqx.Module):
         """The grid coordinate of a world point."""
 
     @abstractmethod
+    def point(self, coordinate: Triple) -> Triple:
+        """The world point of a grid coordinate."""
+
+    @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
         """The blocks of the grid in which anything may be seen, as cells of the world."""
 
@@ -136,6 +140,10 @@ class Affine(Space):
 
     def coordinate(self, point: Triple) -> Triple:
         x, y, z = ((p - low) / step for p, low, step in zip(point, self.low, self.spacing, strict=True))
+        return x, y, z
+
+    def point(self, coordinate: Triple) -> Triple:
+        x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
         return x, y, z
 
     def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:

@@ -16,7 +16,7 @@ from .march import March
 from .taps import Tapped, added, floats, scattered
 from .transfer import Classification
 from .triple import Scalar, Triple
-from .visible import Visible, Weighed
+from .visible import Weighed, samples_of, visible
 from .wavefront import Samples
 
 
@@ -62,14 +62,14 @@ def relit(
     total: LightTotal,
 ) -> tuple[list[Relit], LightTotal]:
     """A segment's samples, and the total with what they add to it. `wanted`: of each piece's colour."""
-    visible, around = Visible.of(known.weight), light.around
+    chosen, around = visible(known), light.around
     size = sum(weight.size for weight in known.weight)
     moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
     volume = around.volume if total.voxels is None else Tapped(around.volume, around.volume, None)
 
     def one(places: Int[Array, " chunk"], carry: tuple[Relit, LightTotal]) -> tuple[Relit, LightTotal]:
         found, total = carry
-        some = visible.samples(seen, march, ray, samples.cells, samples.measured, known, places)
+        some = samples_of(chosen, places, seen, march, ray, samples.cells, samples.measured, known)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
         def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Triple, Any]:
@@ -84,16 +84,16 @@ def relit(
             taps = [jnp.zeros(each.shape, around.volume.data.dtype) for each in asked]
         color, pull, asked = jax.vjp(colors, moving, moving_sample, taps, has_aux=True)
         real = places < size
-        cotangent = tuple(jnp.where(real, part, 0) for part in visible.take(wanted, places))
+        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(wanted, places))
         (of_light, of_transfer), of_sample, of_taps = pull(cotangent)
         voxels = None if total.voxels is None else scattered(total.voxels, asked, of_taps)
         total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
         part = Relit(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
-        return visible.put(found, places, part), total
+        return chosen.put(found, places, part), total
 
     zero = jnp.zeros(size, known.weight[0].dtype)
     measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))
     zeros = zero, zero, zero
     start = Relit(zeros, zeros, zero, measured, zeros)
-    found, total = visible.over(one, (start, total))
-    return visible.apart(found, len(known.weight)), total
+    found, total = chosen.over(one, (start, total))
+    return chosen.apart(found, len(known.weight)), total

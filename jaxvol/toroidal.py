@@ -160,6 +160,14 @@ class _Sector(Space):
         )
         return beta, sigma, gamma
 
+    def point(self, coordinate: Triple) -> Triple:
+        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        toroidal = [
+            ends[0] + c / (n - 1) * (ends[1] - ends[0])
+            for c, ends, n in zip(coordinate, ranges, self.shape, strict=True)
+        ]
+        return apart(self.probe.to_world(jnp.stack(toroidal)))
+
     def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
         """Cubes of the world around the sector. Each asks for the blocks that the sphere around it reaches:
         no angle changes faster along a path than by the path's length over the distance to its axis."""

@@ -4,23 +4,19 @@ To light a sample costs many times as much as to take it. So those of a segment 
 are gathered from all its rays, and lit so many at a time.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Int
 
+from .chunks import Chosen
 from .lighting.seam import Sample
 from .locate import Ray
 from .march import Cell, March
 from .reference import Progress
 from .transfer import Classification, Measured
 from .triple import Scalar, Triple, along
-
-
-CHUNK = 2048
-"""Samples that are lit at a time."""
 
 
 class Weighed(NamedTuple):
@@ -47,74 +43,29 @@ def weighed(march: March, at: Progress, alphas: list[Scalar]) -> Weighed:
     return Weighed(*(list(parts) for parts in zip(*each, strict=True)))
 
 
-class Visible(NamedTuple):
-    """The visible samples of a segment.
+def visible(known: Weighed) -> Chosen:
+    """The samples that add anything."""
+    return Chosen.of([weight > 0 for weight in known.weight])
 
-    - `place`: which ones, counted through cells and rays of all pieces; in front those that are visible.
-    - `number`: how many are.
-    - `rays`: how many rays the segment has.
-    """
 
-    place: Int[Array, " samples"]
-    number: Int[Array, ""]
-    rays: int
-
-    @classmethod
-    def of(cls, weights: list[Float[Array, "cells rays"]]) -> "Visible":
-        visible = jnp.concatenate([weight > 0 for weight in weights])
-        rays = visible.shape[1]
-        missing = -visible.size % CHUNK
-        place = jnp.nonzero(visible.reshape(-1), size=visible.size, fill_value=visible.size)[0]
-        place = jnp.pad(place.astype(jnp.int32), (0, missing), constant_values=visible.size)
-        return cls(place, jnp.sum(visible, dtype=jnp.int32), rays)
-
-    def over(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
-        """`one(places, carry)` for the visible samples, a chunk after the other."""
-
-        def chunk(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
-            i, carry = state
-            return i + 1, one(jax.lax.dynamic_slice_in_dim(self.place, i * CHUNK, CHUNK), carry)
-
-        begin = jnp.zeros((), jnp.int32), start
-        return jax.lax.while_loop(lambda state: state[0] * CHUNK < self.number, chunk, begin)[1]
-
-    def take(self, pieces: list[PyTree], places: Int[Array, " chunk"]) -> PyTree:
-        """Those at these places, of arrays (cells, rays) for each piece."""
-
-        def taken(*leaves: Array) -> Array:
-            return jnp.concatenate(leaves).reshape(-1).at[places].get(mode="clip")
-
-        return jax.tree.map(taken, *pieces)
-
-    def put(self, whole: PyTree, places: Int[Array, " chunk"], part: PyTree) -> PyTree:
-        """These in their places."""
-        return jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), whole, part)
-
-    def apart(self, whole: PyTree, pieces: int) -> list[PyTree]:
-        """Arrays (cells, rays) for each piece, from those of all."""
-        leaves, tree = jax.tree.flatten(whole)
-        each = (leaf.reshape(pieces, -1, self.rays) for leaf in leaves)
-        return [jax.tree.unflatten(tree, piece) for piece in zip(*each, strict=True)]
-
-    def samples(
-        self,
-        seen: Classification,
-        march: March,
-        ray: Ray,
-        cells: list[Cell],
-        measured: list[Measured],
-        known: Weighed,
-        places: Int[Array, " chunk"],
-    ) -> Sample:
-        """Those at these places."""
-        of_ray = places % self.rays
-        entry, direction, pixel = jax.tree.map(
-            lambda leaf: leaf.at[of_ray].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
-        )
-        depths = [march.sample(cell) for cell in cells]
-        depth, read, front = self.take(list(zip(depths, measured, known.front, strict=True)), places)
-        color, extinction = jax.vmap(seen.classify)(read)
-        return Sample(along(entry, direction, depth), direction, read, color, extinction, 1 - front, pixel)
+def samples_of(
+    chosen: Chosen,
+    places: Int[Array, " chunk"],
+    seen: Classification,
+    march: March,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    known: Weighed,
+) -> Sample:
+    """The samples at these places of a segment."""
+    entry, direction, pixel = jax.tree.map(
+        lambda leaf: leaf.at[places % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
+    )
+    depths = [march.sample(cell) for cell in cells]
+    depth, read, front = chosen.take(list(zip(depths, measured, known.front, strict=True)), places)
+    color, extinction = jax.vmap(seen.classify)(read)
+    return Sample(along(entry, direction, depth), direction, read, color, extinction, 1 - front, pixel)
 
 
 def lit_colors(
@@ -128,12 +79,12 @@ def lit_colors(
 ) -> list[Triple]:
     """Colours of a segment's samples as lit; 0 for those that are not seen."""
     known, light = weighed(march, at, alphas), seen.light
-    visible = Visible.of(known.weight)
+    chosen = visible(known)
     assert light is not None
 
     def one(places: Int[Array, " chunk"], colors: Triple) -> Triple:
-        samples = visible.samples(seen, march, ray, cells, measured, known, places)
-        return visible.put(colors, places, jax.vmap(light)(samples))
+        samples = samples_of(chosen, places, seen, march, ray, cells, measured, known)
+        return chosen.put(colors, places, jax.vmap(light)(samples))
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
-    return visible.apart(visible.over(one, (none, none, none)), len(alphas))
+    return chosen.apart(chosen.over(one, (none, none, none)), len(alphas))

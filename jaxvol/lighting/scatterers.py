@@ -7,7 +7,6 @@ Lee, Kwon and Shin: Scattered light representation in accordance with the materi
 volume rendering (2016), sections 3.3 and 3.4.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -18,8 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..checks import integer, is_traced, number
+from ..kept import kept
 from ..noise import hashed_uniforms
 from ..triple import Scalar, Triple, along
+from .baked import BakedLighting, bake
 from .lights import ConstantLight, Light, LocatedLight, lights_of
 from .materials import Material, Optics, materials_of, shares, smoothstep
 from .seam import Lighting, Sample, Shading, Surroundings
@@ -66,17 +67,22 @@ class ScattererTemplates(Lighting):
     - `lights`: one or several.
     - `templates`: for each material. `blend`: use all of them for every sample, rather than one, chosen at
       random for each pixel: less noise, at as many times the cost.
-    - `photons`: keep so many of the brightest, corrected for the energy left out. By default all.
+    - `photons`: of each template keep so many of the brightest, corrected for the energy left out. By default
+      all.
     - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, by the
       trapezoidal rule over these places; materials meet in ramps, the lit side ends in one, and the image is
-      differentiable. `"hard"`: as published: a photon is hidden where at one of these places a voxel has an
-      opacity of at least a half. Its gradient with respect to λ, the light and the camera is wrong, since it
-      does not see photons that become hidden, or change their material.
+      differentiable. `"hard"`: as published: a photon is hidden where anything is seen at one of these
+      places. Its gradient with respect to λ, the light and the camera is wrong, since it does not see
+      photons that become hidden, or change their material.
     - `reach`: multiples of a photon's offset, above 1 and increasing, against thin parts before others.
     - `cutoff`: by default 0.02 under hard occlusion, as published, and 0 under soft. Above 0 the gradient
       does not see photons that are left out.
     - `seed`: of templates, and of their choice for each pixel.
     - `packets`, `threshold`, `energy`, `critical_angle`: of the templates, see `scatterer_template`.
+    - `baked`: False, or how many nodes a grid has along the volume's longest side on which the light is
+      computed once, and fetched from then on: for a volume, a transfer function and a lighting as they are.
+      All templates are blended there, and nothing is left out for the ray's transmittance. It carries no
+      gradient. Where lighting, volume or transfer function are traced, it is computed in each image.
     - `levels`: of their trees; needed where an opacity is traced.
     - `given`: templates to be used instead of grown ones, with leading axes (materials, templates); lengths
       stay as they are, so that nothing depends on the materials' mean free paths.
@@ -99,6 +105,7 @@ class ScattererTemplates(Lighting):
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
     growth: tuple[int, float, Energy, int] = eqx.field(static=True)
+    baked: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -112,6 +119,7 @@ class ScattererTemplates(Lighting):
         reach: Sequence[float] = (2.0, 4.0),
         cutoff: float | None = None,
         seed: int = 0,
+        baked: int | bool = False,
         packets: int = 4,
         threshold: float = 0.01,
         energy: Energy | Any = "conserving",
@@ -133,6 +141,8 @@ class ScattererTemplates(Lighting):
         if is_traced(cutoff) or cutoff != 0:
             self.cutoff = number("cutoff", cutoff, above=0, below=1)
         self.critical_angle = None if critical_angle is None else number("critical_angle", critical_angle)
+        # True: fine enough for what scatters over several voxels
+        self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
         self.given = given
         if given is not None:
             whole = given.intensity.shape[-1]
@@ -152,10 +162,9 @@ class ScattererTemplates(Lighting):
             else:
                 whole = max(photons_above(each, **how) for each in self.materials)
         self.growth = (packets, threshold, energy, levels)
-        whole *= self.templates if self.blend else 1
         self.photons = whole if photons is None else min(whole, integer("photons", photons, 1))
 
-    def grown(self) -> ScattererTemplate:
+    def grown(self, *, blend: bool) -> ScattererTemplate:
         """The templates as they are used: (materials, templates or 1, photons)."""
         packets, threshold, energy, levels = self.growth
         templates = self.given or scatterer_templates(
@@ -168,14 +177,50 @@ class ScattererTemplates(Lighting):
             critical_angle=self.critical_angle,
             levels=levels,
         )
-        if self.blend:
+        if blend:
             templates = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
-        return templates.brightest(self.photons)
+        return templates.brightest(self.photons * (self.templates if blend else 1))
 
-    def over(self, around: Surroundings) -> "TemplateShading":
-        h = jnp.mean(around.volume.spacing)
-        optics = jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
-        return TemplateShading(self, self.grown(), optics, jax.lax.stop_gradient(math.log(2) / h))
+    def prepared(self, around: Surroundings) -> Lighting:
+        if not self.baked:
+            return self
+        rest = eqx.tree_at(lambda a: a.volume.data, around, None)
+        leaves, tree = jax.tree.flatten((self, rest))
+        if is_traced(leaves, around.volume.data):
+            return self
+        memory = kept(around.volume.data, _memory)
+        known = memory.get(tree)
+        if known is None or not all(_same(a, b) for a, b in zip(known[0], leaves, strict=True)):
+            memory.clear()
+            memory[tree] = known = leaves, _baked(self, around)
+        return known[1]
+
+    def over(self, around: Surroundings) -> Shading:
+        if self.baked:
+            return _baked(self, around).over(around)
+        return TemplateShading(self, self.grown(blend=self.blend), self._optics, self.cutoff)
+
+    @property
+    def _optics(self) -> Optics:
+        return jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
+
+    def _bake(self, around: Surroundings) -> BakedLighting:
+        return bake(TemplateShading(self, self.grown(blend=True), self._optics, None), around, self.baked)
+
+
+def _memory(_: Array) -> dict:
+    """Light baked for a volume: the last one, under what else it was made of."""
+    return {}
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two leaves are known to be equal: large ones, such as labels, only if they are one array."""
+    return a is b or (np.shape(a) == np.shape(b) and np.size(a) <= 2**16 and bool(np.all(a == b)))
+
+
+@eqx.filter_jit
+def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
+    return lighting._bake(around)
 
 
 class _Notes(NamedTuple):
@@ -196,8 +241,7 @@ class TemplateShading(Shading):
     how: ScattererTemplates
     templates: ScattererTemplate
     optics: Optics
-    opaque: Scalar
-    """The extinction from which on a place is opaque: under which a voxel has an opacity of a half."""
+    cutoff: Float[Array, ""] | None
 
     @property
     def terms(self) -> int:
@@ -231,9 +275,9 @@ class TemplateShading(Shading):
 
     def term(self, around: Surroundings, sample: Sample, notes: _Notes, number: Int[Array, ""]) -> Any:
         offset, intensity = self._photon(notes, number)
-        if self.how.cutoff is not None:
+        if self.cutoff is not None:
             alone = intensity * (self.how.templates if self.how.blend else 1)
-            intensity = jnp.where(sample.transmittance * alone < self.how.cutoff, 0, intensity)
+            intensity = jnp.where(sample.transmittance * alone < self.cutoff, 0, intensity)
         place = around.at(_beside(sample, offset))
         there = self._shares(around, place.coordinate, place.value)
         there = tuple(place.inside * share for share in there)
@@ -284,7 +328,7 @@ class TemplateShading(Shading):
         if not self._soft:
             hidden = jnp.zeros_like(first, bool)
             for extinction in places:
-                hidden |= extinction >= self.opaque
+                hidden |= extinction > 0
             return (~hidden).astype(first.dtype)
         length, depth = _norm(offset), jnp.zeros_like(first)
         pieces = np.diff([0.0, 1.0, *self.how.reach])

@@ -80,7 +80,8 @@ class Surroundings(eqx.Module):
     def _measured(self, point: Triple) -> tuple[Scalar, Triple, Measured]:
         coordinate, seen = self.space.coordinate(point), self.transfer.over(self.volume)
         x, y, z = (
-            jnp.clip(jnp.minimum(c + 1, n - c), 0, 1) for c, n in zip(coordinate, self.volume.shape, strict=True)
+            jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
+            for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
 
         def measured(coordinate: Triple) -> Measured:
@@ -123,6 +124,10 @@ class Lighting(eqx.Module):
     @abstractmethod
     def over(self, around: Surroundings) -> Shading:
         """Ready for one image. What does not depend on the sample is computed here, once."""
+
+    def prepared(self, around: Surroundings) -> "Lighting":
+        """What is worth being computed once for several images, where nothing is traced."""
+        return self
 
 
 def classification(
