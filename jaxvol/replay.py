@@ -140,6 +140,9 @@ class Replay(Follower):
         """What the samples so far are worth; each one's weight; and how the loss changes with its optical
         depth."""
         opacity, finished = at.opacity, at.finished
+        # With no more than this left, what lies behind is lost in the rounding of the sums, which an opaque
+        # sample's extinction would blow up.
+        nothing = 2 * float(jnp.finfo(opacity.dtype).eps)
         weights: list[list[Scalar]] = [[] for _ in alphas]
         slopes: list[list[Scalar]] = [[] for _ in alphas]
         for k in range(CELLS):
@@ -148,7 +151,7 @@ class Replay(Follower):
                 opacity, front = opacity + weight, front + weight * value[k]
                 slope = (1 - opacity) * value[k] - (whole - front)
                 weights[i].append(weight)
-                slopes[i].append(jnp.where(finished, 0, slope))
+                slopes[i].append(jnp.where(finished | (1 - opacity <= nothing), 0, slope))
             finished |= jax.vmap(self.march.stop)(1 - opacity)
         return front, [jnp.stack(w) for w in weights], [jnp.stack(s) for s in slopes]
 
