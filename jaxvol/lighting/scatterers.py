@@ -69,8 +69,8 @@ class ScattererTemplates(Lighting):
       random for each pixel: less noise, at as many times the cost.
     - `photons`: of each template keep so many of the brightest, corrected for the energy left out. By default
       all.
-    - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, by the
-      trapezoidal rule over these places; materials meet in ramps, the lit side ends in one, and the image is
+    - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, were each
+      stretch of it like its far end; materials meet in ramps, the lit side ends in one, and the image is
       differentiable. `"hard"`: as published: a photon is hidden where anything is seen at one of these
       places. Its gradient with respect to λ, the light and the camera is wrong, since it does not see
       photons that become hidden, or change their material.
@@ -330,11 +330,9 @@ class TemplateShading(Shading):
             for extinction in places:
                 hidden |= extinction > 0
             return (~hidden).astype(first.dtype)
-        length, depth = _norm(offset), jnp.zeros_like(first)
         pieces = np.diff([0.0, 1.0, *self.how.reach])
-        for piece, near, far in zip(pieces, [sample.extinction, *places], places, strict=False):
-            depth = depth + piece * (near + far) / 2
-        return jnp.exp(-depth * length)
+        depth = sum(piece * extinction for piece, extinction in zip(pieces, places, strict=True))
+        return jnp.exp(-depth * _norm(offset))
 
     def _lit_side(self, offset: Triple, toward: Triple | None, distance: Scalar) -> Scalar:
         """Whether a photon is nearer to the light than the sample is."""
