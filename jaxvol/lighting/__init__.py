@@ -7,3 +7,4 @@ from .lights import (
     PointLight as PointLight,
 )
 from .materials import Material as Material, material as material
+from .path_tracing import PathTraced as PathTraced, path_trace as path_trace

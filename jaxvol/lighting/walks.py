@@ -1,0 +1,287 @@
+"""What happens to light on its way from the eye? It flies, is scattered, looks for a light, and flies on.
+
+A walk is one path, traced backwards from the camera. It is always on one flight: its own, or one from its
+last scattering towards a light, by which it learns how much of that light arrives. Both ask the same of a
+volume, so that walks at different stages run side by side, a step at a time, without waiting for each other.
+"""
+
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, UInt32
+
+from ..noise import hashed_uniforms_4
+from ..triple import Scalar, Triple, apart
+from ..volume import Volume
+from ..wavefront import in_memory
+from .lights import Arriving, ConstantLight, Light, LocatedLight
+from .majorants import Majorants
+from .medium import Medium
+from .phase import phase, scattered
+from .tracking import Candidate, Flight, fly
+
+
+ROULETTE = 0.25
+"""What a walk may still bring, or a light still sends, relative to its start. Below it chance decides whether
+to follow it: with a probability in proportion, and then as if it were this much."""
+
+MOST_STEPS = 2**24
+"""Steps after which a walk counts as exhausted, against walks that never end."""
+
+Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
+"""The key of all that is random along a path: pixel, path, seed."""
+
+
+class Walk(eqx.Module):
+    """One path, as far as it has come.
+
+    - `words`: the key of all that is random along it. `steps`: taken so far.
+    - `flight`: that which it is on, towards a light if `to_light`; else its own.
+    - `direction`: of its own flight, world, unit; the next one while it looks for a light.
+    - `throughput`: the share of light at its end that arrives at the camera; (r, g, b).
+    - `promised`: what the light will add if nothing stands between, of which `clear` is left so far.
+    - `radiance`: gathered.
+    - `met`: whether the camera's ray met anything. `scatterings`: so far.
+    - `alive`: whether it goes on. `exhausted`: whether it was cut off.
+    """
+
+    words: Words
+    steps: Int[Array, ""]
+    flight: Flight
+    to_light: Bool[Array, ""]
+    direction: Triple
+    throughput: Triple
+    promised: Triple
+    clear: Scalar
+    radiance: Triple
+    met: Bool[Array, ""]
+    scatterings: Int[Array, ""]
+    alive: Bool[Array, ""]
+    exhausted: Bool[Array, ""]
+
+    @classmethod
+    def begin(
+        cls,
+        words: Words,
+        flight: Flight,
+        direction: Triple,
+        alive: Bool[Array, ""],
+    ) -> "Walk":
+        """From the camera's side of the volume."""
+        no, none, nothing = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros_like(flight.depth)
+        black, one = (nothing, nothing, nothing), nothing + 1
+        return cls(
+            words,
+            steps=none,
+            flight=flight,
+            to_light=no,
+            direction=direction,
+            throughput=(one, one, one),
+            promised=black,
+            clear=nothing,
+            radiance=black,
+            met=no,
+            scatterings=none,
+            alive=alive,
+            exhausted=no,
+        )
+
+
+class Scene(NamedTuple):
+    """What walks walk through.
+
+    - `most`: scatterings that a walk may have.
+    """
+
+    volume: Volume
+    medium: Medium
+    majorants: Majorants
+    lights: tuple[Light, ...]
+    anisotropy: Scalar
+    most: Int[Array, ""]
+
+    @property
+    def located(self) -> tuple[LocatedLight, ...]:
+        return tuple(light for light in self.lights if isinstance(light, LocatedLight))
+
+    @property
+    def surroundings(self) -> Triple:
+        """Radiance from all around."""
+        constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
+        return apart(sum(constant, jnp.zeros(3, jnp.float32)))
+
+    @property
+    def spacing(self) -> Triple:
+        return apart(self.volume.spacing)
+
+    def flight(self, start: Triple, direction: Triple, end: Scalar) -> Flight:
+        """From a grid coordinate in a world direction."""
+        return Flight.between(self.majorants, start, direction, self.spacing, end)
+
+    def light(self, place: Triple, uniform: Scalar) -> Arriving:
+        """What arrives at a grid coordinate from one of the located lights, chosen at random, on average
+        from all of them."""
+        x, y, z = (o + c * s for o, c, s in zip(apart(self.volume.origin), place, self.spacing, strict=True))
+        count = len(self.located)
+        chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
+        each = [light.at((x, y, z)) for light in self.located]
+        one = jax.tree.map(lambda *parts: jnp.select([chosen == i for i in range(count)], parts), *each)
+        r, g, b = one.irradiance
+        return one._replace(irradiance=(r * count, g * count, b * count))
+
+
+def step(scene: Scene, walks: Walk) -> Walk:
+    """The next step of many walks, arrays of one length: a part of a flight, and what comes of it."""
+
+    def ahead(walk: Walk) -> tuple[Flight, Candidate, Triple]:
+        draw, decide, *_ = _uniforms(walk, 0)
+        flight, candidate = fly(scene.majorants, walk.flight, draw)
+        return flight, candidate, decide
+
+    live = jnp.any(walks.alive)
+    # behind branches, so that what is fetched lies in memory, and is not fetched for each of its uses
+    flight, candidate, decide = in_memory(live, jax.vmap(ahead), walks)
+    measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.place)
+    extinction, albedo = in_memory(live, jax.vmap(scene.medium.meet), measured)
+    share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
+    after = jax.vmap(lambda *of_one: _onward(scene, *of_one))(walks, flight, candidate, share, albedo, decide)
+    return jax.tree.map(lambda new, old: jnp.where(_over(walks.alive, new), new, old), after, walks)
+
+
+def _over(mask: Array, leaf: Array) -> Array:
+    return mask.reshape(mask.shape + (1,) * (leaf.ndim - mask.ndim))
+
+
+def _onward(
+    scene: Scene,
+    walk: Walk,
+    flight: Flight,
+    candidate: Candidate,
+    share: Scalar,
+    albedo: Triple,
+    decide: Scalar,
+) -> Walk:
+    """What becomes of a walk at a candidate, where a share of the majorant is extinction; or at the end of
+    its flight."""
+    walk = eqx.tree_at(lambda w: (w.flight, w.steps), walk, (flight, walk.steps + 1))
+    own = ~walk.to_light
+    walks_on = _walked(scene, walk, candidate, share, albedo, decide)
+    if scene.located:
+        sees = _looked(scene, walk, candidate, share, decide)
+        walks_on = jax.tree.map(lambda a, b: jnp.where(own, a, b), walks_on, sees)
+    spent = walks_on.alive & (walks_on.steps >= MOST_STEPS)
+    return eqx.tree_at(
+        lambda w: (w.alive, w.exhausted), walks_on, (walks_on.alive & ~spent, walks_on.exhausted | spent)
+    )
+
+
+def _walked(
+    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, albedo: Triple, decide: Scalar
+) -> Walk:
+    """A walk on its own flight: delta tracking. Its end is the light all around; a collision scatters it."""
+    collides = candidate.found & (decide < share)
+    capped = collides & (walk.scatterings >= scene.most)
+    scatters = collides & ~capped
+    escapes = candidate.over & walk.met
+    gathered = _where(escapes, _times(walk.throughput, scene.surroundings), _like(0, walk.throughput))
+    radiance = _plus(walk.radiance, gathered)
+
+    choose, turn, around, survive = _uniforms(walk, 1)
+    before = _times(walk.throughput, albedo)
+    throughput = _after_roulette(before, survive)
+    direction = scattered(walk.direction, scene.anisotropy, turn, around)
+    to_light, promised = jnp.zeros((), bool), walk.promised
+    toward, end = direction, jnp.full_like(candidate.majorant, jnp.inf)
+    if scene.located:
+        light = scene.light(candidate.place, choose)
+        density = phase(_dot(walk.direction, light.toward), scene.anisotropy)
+        promised = _scaled(_times(before, light.irradiance), density)
+        to_light = _greatest(promised) > 0
+        toward = _where(to_light, light.toward, direction)
+        end = jnp.where(to_light, light.distance, jnp.inf)
+    onward = scene.flight(candidate.place, toward, end)
+    alive = ~candidate.over & ~capped & (~scatters | to_light | (_greatest(throughput) > 0))
+    return Walk(
+        walk.words,
+        walk.steps,
+        jax.tree.map(lambda new, old: jnp.where(scatters, new, old), onward, walk.flight),
+        scatters & to_light,
+        _where(scatters, direction, walk.direction),
+        _where(scatters, throughput, walk.throughput),
+        promised,
+        jnp.ones_like(walk.clear),
+        radiance,
+        walk.met | collides,
+        walk.scatterings + scatters.astype(jnp.int32),
+        alive,
+        walk.exhausted | capped,
+    )
+
+
+def _looked(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar) -> Walk:
+    """A walk on its way to a light: ratio tracking. At its end it goes on from where it was scattered."""
+    left = walk.clear * jnp.where(candidate.found, jnp.maximum(1 - share, 0), 1)
+    kept = jnp.where(survive * ROULETTE < left, ROULETTE, 0)
+    left = jnp.where(candidate.found & (left < ROULETTE), kept, left)
+    done = candidate.over | (left == 0)
+    gathered = _scaled(walk.promised, jnp.where(candidate.over, left, 0))
+    end = jnp.full_like(walk.flight.end, jnp.inf)
+    onward = scene.flight(walk.flight.start, walk.direction, end)
+    return eqx.tree_at(
+        lambda w: (w.flight, w.to_light, w.clear, w.radiance, w.alive),
+        walk,
+        (
+            jax.tree.map(lambda new, old: jnp.where(done, new, old), onward, walk.flight),
+            ~done,
+            left,
+            _plus(walk.radiance, gathered),
+            ~done | (_greatest(walk.throughput) > 0),
+        ),
+    )
+
+
+def _after_roulette(throughput: Triple, uniform: Scalar) -> Triple:
+    """The throughput, where it is small either 0 or as much larger as this is rare."""
+    greatest = _greatest(throughput)
+    small = greatest < ROULETTE
+    followed = uniform * ROULETTE < greatest
+    more = ROULETTE / jnp.where(greatest > 0, greatest, 1)
+    return _scaled(throughput, jnp.where(small, jnp.where(followed, more, 0), 1))
+
+
+def _uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Four numbers in [0, 1) for one of the two stages of a walk's next step."""
+    pixel, path, seed = walk.words
+    return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
+
+
+def _like(value: float, triple: Triple) -> Triple:
+    x, y, z = (jnp.full_like(part, value) for part in triple)
+    return x, y, z
+
+
+def _where(condition: Bool[Array, ""], a: Triple, b: Triple) -> Triple:
+    x, y, z = (jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
+    return x, y, z
+
+
+def _times(a: Triple, b: Triple) -> Triple:
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+def _plus(a: Triple, b: Triple) -> Triple:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _scaled(a: Triple, factor: Scalar) -> Triple:
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+def _dot(a: Triple, b: Triple) -> Scalar:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _greatest(a: Triple) -> Scalar:
+    return jnp.maximum(jnp.maximum(a[0], a[1]), a[2])
