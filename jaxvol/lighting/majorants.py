@@ -5,6 +5,8 @@ interpolation never leaves the range of a block's nodes, and a piecewise linear 
 end of a range of values, or at a control point inside. Rounding is allowed for on top.
 """
 
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,19 +24,21 @@ from .materials import Material
 ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
 """By how much an interpolated extinction may exceed its bound, relative to the greatest of its table."""
 
-Block = tuple[Int[Array, "..."], Int[Array, "..."], Int[Array, "..."]]
-"""The index of a block along each axis."""
+Block: TypeAlias = Int[Array, "..."]
+"""A block of a volume: the bits of its index along x, y and z after each other, in one whole number."""
 
 
 class Majorants(eqx.Module):
     """The bound of each block, and how far empty space reaches around a block without extinction.
 
-    - `table`: in row-major order; the majorant (1/length) where there may be extinction. Elsewhere minus
-      the chessboard distance, in blocks, to the nearest block where there may be.
+    - `table`: by block; the majorant (1/length) where there may be extinction. Elsewhere minus the chessboard
+      distance, in blocks, to the nearest block where there may be. It has gaps: each axis counts to a power
+      of 2, so that a block's index is its entry's.
     - `last`: grid coordinate of the last node along each axis.
+    - `shape`: how many blocks there are along each axis.
     """
 
-    table: Float[Array, " blocks"]
+    table: Float[Array, " entries"]
     last: Triple
     shape: tuple[int, int, int] = eqx.field(static=True)
 
@@ -48,35 +52,47 @@ class Majorants(eqx.Module):
         """
         bound = greatest_extinction(transfer, blocks, materials)
         distance = Affine(volume).occupancy(bound > 0).distance().astype(bound.dtype)
+        table = jnp.where(bound > 0, bound, -distance.reshape(bound.shape))
+        table = jnp.pad(table, [(0, 2 ** _bits(n) - n) for n in bound.shape])
         x, y, z = (jnp.asarray(n - 1, bound.dtype) for n in volume.shape)
         nx, ny, nz = bound.shape
-        table = jnp.where(bound.reshape(-1) > 0, bound.reshape(-1), -distance)
-        return cls(table, (x, y, z), (nx, ny, nz))
+        return cls(table.reshape(-1), (x, y, z), (nx, ny, nz))
 
-    def at(self, block: Block) -> tuple[Scalar, Int[Array, "..."]]:
-        """The majorant of a block, and by how many blocks the box around it, on which this holds as well,
-        reaches beyond it on each side: more than none in empty space."""
-        _, ny, nz = self.shape
-        entry = self.table.at[(block[0] * ny + block[1]) * nz + block[2]].get(
-            mode="promise_in_bounds", wrap_negative_indices=False
-        )
-        return jnp.maximum(entry, 0), jnp.maximum(-entry - 1, 0).astype(jnp.int32)
+    def at(self, block: Block) -> Scalar:
+        """The entry of a block in the table."""
+        return self.table.at[block].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
-    def block(self, coordinate: Triple) -> Block:
+    def block(self, x: Array, y: Array, z: Array) -> Block:
+        """The block of these indices along the axes."""
+        _, by, bz = (_bits(n) for n in self.shape)
+        return (x << (by + bz)) | (y << bz) | z
+
+    def indices(self, block: Block) -> tuple[Array, Array, Array]:
+        """The indices of a block along the axes."""
+        _, by, bz = (_bits(n) for n in self.shape)
+        return block >> (by + bz), (block >> bz) & (2**by - 1), block & (2**bz - 1)
+
+    def holding(self, coordinate: Triple) -> Block:
         """The block that holds a grid coordinate, or the nearest one."""
-        x, y, z = (
-            jnp.clip(jnp.floor(c / BLOCK).astype(jnp.int32), 0, n - 1)
-            for c, n in zip(coordinate, self.shape, strict=True)
+        return self.block(
+            *(
+                jnp.clip(jnp.floor(c / BLOCK).astype(jnp.int32), 0, n - 1)
+                for c, n in zip(coordinate, self.shape, strict=True)
+            )
         )
-        return x, y, z
 
     def within(self, coordinate: Triple, block: Block) -> Triple:
         """The coordinate, put back into a block that rounding may have moved it out of."""
         x, y, z = (
-            jnp.clip(c, BLOCK * b.astype(c.dtype), jnp.minimum(BLOCK * (b + 1).astype(c.dtype), last))
-            for c, b, last in zip(coordinate, block, self.last, strict=True)
+            jnp.clip(c, BLOCK * i.astype(c.dtype), jnp.minimum(BLOCK * (i + 1).astype(c.dtype), last))
+            for c, i, last in zip(coordinate, self.indices(block), self.last, strict=True)
         )
         return x, y, z
+
+
+def _bits(count: int) -> int:
+    """Bits of the numbers below `count`."""
+    return (count - 1).bit_length()
 
 
 def greatest_extinction(

@@ -32,14 +32,18 @@ def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
     return jnp.clip(numerator / jnp.square(1 + g * x), -1, 1)
 
 
-def scattered(direction: Triple, anisotropy: Scalar, first: Scalar, second: Scalar) -> Triple:
-    """A unit direction drawn from `phase` around a unit direction, from two numbers in [0, 1)."""
+def scattered(anisotropy: Scalar, first: Scalar, second: Scalar) -> Triple:
+    """A unit direction drawn from `phase` around the z axis, from two numbers in [0, 1)."""
     cosine = scattered_cosine(anisotropy, first)
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0))
     angle = 2 * math.pi * second
+    return sine * jnp.cos(angle), sine * jnp.sin(angle), cosine
+
+
+def turned(around_z: Triple, direction: Triple) -> Triple:
+    """A unit direction that lies around another one as `around_z` does around the z axis."""
+    (x, y, cosine), (dx, dy, dz) = around_z, direction
     (a, b, c), (d, e, f) = _beside(direction)
-    x, y = sine * jnp.cos(angle), sine * jnp.sin(angle)
-    dx, dy, dz = direction
     return _unit((x * a + y * d + cosine * dx, x * b + y * e + cosine * dy, x * c + y * f + cosine * dz))
 
 

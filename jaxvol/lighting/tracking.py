@@ -25,13 +25,16 @@ CROSSINGS = 4
 """Borders that a flight may cross before the next look into memory: those who arrive earlier wait."""
 
 
+TINY = 1e-20
+"""Grid coordinates per world length that count as none."""
+
+
 class Flight(eqx.Module):
     """A straight way through the grid.
 
-    - `start`: grid coordinate. `rate`: its change per world length.
-    - `depth`: world length past the start, so far. `end`: that at which the flight is over; infinite where
-      it ends at the border of the grid.
-    - `block`: where it is.
+    - `start`: grid coordinate. `rate`: its change per world length, nowhere 0.
+    - `depth`: world length past the start, so far. `end`: that at which the flight is over.
+    - `block`: where it is. `entry`: that block's in the table of majorants.
     """
 
     start: Triple
@@ -39,14 +42,19 @@ class Flight(eqx.Module):
     depth: Scalar
     end: Scalar
     block: Block
+    entry: Scalar
 
     @classmethod
-    def between(
-        cls, majorants: Majorants, start: Triple, direction: Triple, spacing: Triple, end: Scalar
+    def to(
+        cls, majorants: Majorants, start: Triple, direction: Triple, spacing: Triple, distance: Scalar
     ) -> "Flight":
-        """From a grid coordinate in a world direction."""
-        x, y, z = (d / step for d, step in zip(direction, spacing, strict=True))
-        return cls(start, (x, y, z), jnp.zeros_like(end), end, majorants.block(start))
+        """From a grid coordinate in a world direction, over this distance, or to the border of the grid."""
+        x, y, z = (_not_0(d / step) for d, step in zip(direction, spacing, strict=True))
+        end = distance
+        for rate, at, last in zip((x, y, z), start, majorants.last, strict=True):
+            end = jnp.minimum(end, (jnp.where(rate > 0, last, 0) - at) / rate)
+        block = majorants.holding(start)
+        return cls(start, (x, y, z), jnp.zeros_like(end), end, block, majorants.at(block))
 
 
 class Candidate(eqx.Module):
@@ -56,8 +64,8 @@ class Candidate(eqx.Module):
     - `over`: at its end. Neither of the two: on its way.
     """
 
-    found: Bool[Array, ""]
-    over: Bool[Array, ""]
+    found: Bool[Array, "..."]
+    over: Bool[Array, "..."]
     place: Triple
     majorant: Scalar
 
@@ -79,60 +87,52 @@ def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, 
     start = flight, -jnp.log1p(-uniform), no, no
     flight, _, found, over = jax.lax.fori_loop(0, CROSSINGS, cross, start)
     place = majorants.within(along(flight.start, flight.rate, flight.depth), flight.block)
-    return flight, Candidate(found, over, place, majorants.at(flight.block)[0])
+    return flight, Candidate(found, over, place, flight.entry)
 
 
 def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Flight, Scalar, Array, Array]:
-    """To where a flight has come through this optical depth, or to the border of the box in which the
-    majorant holds. With what is left of the optical depth; whether it is spent; and whether the flight is
-    over."""
-    majorant, reach = majorants.at(flight.block)
-    walls = [
-        _wall(start, rate, block, reach, last)
-        for start, rate, block, last in zip(
-            flight.start, flight.rate, flight.block, majorants.last, strict=True
-        )
-    ]
-    border = jnp.minimum(jnp.minimum(*walls[:2]), walls[2])
+    """To where a flight has come through this optical depth; or to the border of the box in which the
+    majorant holds, a block's, or that of empty space around it. With what is left of the optical depth;
+    whether it is spent; and whether the flight is over."""
+    majorant, reach = jnp.maximum(flight.entry, 0), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
+    axes = list(zip(flight.start, flight.rate, majorants.indices(flight.block), majorants.shape, strict=True))
+    walls = [_wall(start, rate, index, reach, count) for start, rate, index, count in axes]
+    border = jnp.minimum(jnp.minimum(walls[0], walls[1]), walls[2])
     stop = jnp.minimum(border, flight.end)
     thickness = majorant * jnp.maximum(stop - flight.depth, 0)
-    collides = optical < thickness
+    collides, ends = optical < thickness, flight.end <= border
     on = flight.depth + optical / jnp.where(collides, majorant, 1)
     depth = jnp.where(collides, jnp.minimum(on, stop), jnp.maximum(stop, flight.depth))
-    arrived = majorants.block(along(flight.start, flight.rate, depth))
-    x, y, z = (
-        _next(rate, block, reach, wall <= border, to)
-        for rate, block, wall, to in zip(flight.rate, flight.block, walls, arrived, strict=True)
+    behind = majorants.block(
+        *(
+            _next(start + depth * rate, rate, index, reach, count, wall <= border)
+            for (start, rate, index, count), wall in zip(axes, walls, strict=True)
+        )
     )
-    leaves = _outside((x, y, z), majorants.shape) | (flight.end <= border)
-    x, y, z = (
-        jnp.where(collides | leaves, old, new) for new, old in zip((x, y, z), flight.block, strict=True)
-    )
-    there = Flight(flight.start, flight.rate, depth, flight.end, (x, y, z))
-    return there, optical - thickness, collides, ~collides & leaves
+    block = jnp.where(collides | ends, flight.block, behind)
+    there = Flight(flight.start, flight.rate, depth, flight.end, block, majorants.at(block))
+    return there, optical - thickness, collides, ~collides & ends
 
 
-def _wall(start: Scalar, rate: Scalar, block: Array, reach: Array, last: Scalar) -> Scalar:
-    """The depth at which a flight meets the side of the box around its block, along one axis."""
-    low = jnp.maximum(BLOCK * (block - reach).astype(start.dtype), 0)
-    high = jnp.minimum(BLOCK * (block + reach + 1).astype(start.dtype), last)
-    distance = jnp.where(rate > 0, high - start, low - start)
-    return jnp.where(rate == 0, jnp.inf, distance / jnp.where(rate == 0, 1, rate))
+def _wall(start: Scalar, rate: Scalar, index: Array, reach: Array, count: int) -> Scalar:
+    """The depth at which a flight meets the side of the box around its block, along one axis. The sides of
+    the grid are none: there flights end."""
+    side = jnp.where(rate > 0, index + reach + 1, index - reach)
+    inner = (side > 0) & (side < count)
+    return jnp.where(inner, (BLOCK * side.astype(start.dtype) - start) / rate, jnp.inf)
 
 
-def _next(rate: Scalar, block: Array, reach: Array, leaves: Array, arrived: Array) -> Array:
-    """The block behind the side of the box, along one axis; or, where another side is nearer, the one in
-    which the flight has arrived. It never turns back, so that rounding cannot keep it where it is."""
-    forward = rate > 0
-    behind = jnp.where(forward, block + reach + 1, block - reach - 1)
-    inside = jnp.where(
-        forward, jnp.clip(arrived, block, block + reach), jnp.clip(arrived, block - reach, block)
-    )
-    return jnp.where(leaves, behind, inside)
+def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: int, leaves: Array) -> Array:
+    """The index, along one axis, of the block behind the side of the box; or, where another side is nearer,
+    of that in which the flight has arrived. It never turns back, so that rounding cannot keep it where it
+    is."""
+    ahead = rate > 0
+    first, last = index - jnp.where(ahead, 0, reach), index + jnp.where(ahead, reach, 0)
+    arrived = jnp.floor(coordinate / BLOCK).astype(jnp.int32)
+    inside = jnp.clip(arrived, jnp.maximum(first, 0), jnp.minimum(last, count - 1))
+    return jnp.where(leaves, jnp.where(ahead, last + 1, first - 1), inside)
 
 
-def _outside(block: Block, shape: tuple[int, int, int]) -> Bool[Array, ""]:
-    out = jnp.zeros((), bool)
-    for b, n in zip(block, shape, strict=True):
-        out |= (b < 0) | (b >= n)
-    return out
+def _not_0(rate: Scalar) -> Scalar:
+    """The rate, or one too small to matter whose inverse is still a number."""
+    return jnp.where(jnp.abs(rate) < TINY, TINY, rate)

@@ -19,7 +19,7 @@ from ..wavefront import in_memory
 from .lights import Arriving, ConstantLight, Light, LocatedLight
 from .majorants import Majorants
 from .medium import Medium
-from .phase import phase, scattered
+from .phase import phase, scattered, turned
 from .tracking import Candidate, Flight, fly
 
 
@@ -32,6 +32,9 @@ MOST_STEPS = 2**24
 
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
 """The key of all that is random along a path: pixel, path, seed."""
+
+Uniforms: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
+"""Random numbers in [0, 1)."""
 
 
 class Walk(eqx.Module):
@@ -118,7 +121,7 @@ class Scene(NamedTuple):
 
     def flight(self, start: Triple, direction: Triple, end: Scalar) -> Flight:
         """From a grid coordinate in a world direction."""
-        return Flight.between(self.majorants, start, direction, self.spacing, end)
+        return Flight.to(self.majorants, start, direction, self.spacing, end)
 
     def light(self, place: Triple, uniform: Scalar) -> Arriving:
         """What arrives at a grid coordinate from one of the located lights, chosen at random, on average
@@ -132,90 +135,112 @@ class Scene(NamedTuple):
         return one._replace(irradiance=(r * count, g * count, b * count))
 
 
+class Scattering(NamedTuple):
+    """What a scattering makes of a walk: where it goes on to, as `Walk` has it, and where it looks first.
+
+    - `toward`, `end`: world direction, and length, of its next flight.
+    """
+
+    direction: Triple
+    throughput: Triple
+    promised: Triple
+    to_light: Bool[Array, ""]
+    toward: Triple
+    end: Scalar
+
+
 def step(scene: Scene, walks: Walk) -> Walk:
-    """The next step of many walks, arrays of one length: a part of a flight, and what comes of it."""
+    """The next step of many walks, arrays of one length: a part of a flight, and what comes of it.
 
-    def ahead(walk: Walk) -> tuple[Flight, Candidate, Triple]:
-        draw, decide, *_ = _uniforms(walk, 0)
-        flight, candidate = fly(scene.majorants, walk.flight, draw)
-        return flight, candidate, decide
-
+    XLA computes anew what several results are made of, for each of them; but not what a branch has put in
+    memory. So everything dear is behind one.
+    """
     live = jnp.any(walks.alive)
-    # behind branches, so that what is fetched lies in memory, and is not fetched for each of its uses
-    flight, candidate, decide = in_memory(live, jax.vmap(ahead), walks)
+    first, second = (in_memory(live, jax.vmap(lambda w, i=i: _uniforms(w, i)), walks) for i in (0, 1))
+    (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
+    turn = in_memory(
+        live, jax.vmap(scattered, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
+    )
+    flight, candidate = in_memory(
+        live, jax.vmap(lambda flight, draw: fly(scene.majorants, flight, draw)), walks.flight, draw
+    )
     measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.place)
     extinction, albedo = in_memory(live, jax.vmap(scene.medium.meet), measured)
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
-    after = jax.vmap(lambda *of_one: _onward(scene, *of_one))(walks, flight, candidate, share, albedo, decide)
-    return jax.tree.map(lambda new, old: jnp.where(_over(walks.alive, new), new, old), after, walks)
-
-
-def _over(mask: Array, leaf: Array) -> Array:
-    return mask.reshape(mask.shape + (1,) * (leaf.ndim - mask.ndim))
+    scattering = in_memory(
+        live,
+        jax.vmap(lambda *of_one: _scattering(scene, *of_one)),
+        walks,
+        candidate.place,
+        albedo,
+        turn,
+        choose,
+        survive,
+    )
+    found, over = candidate.found & walks.alive, candidate.over & walks.alive
+    candidate = eqx.tree_at(lambda c: (c.found, c.over), candidate, (found, over))
+    walks = eqx.tree_at(lambda w: (w.flight, w.steps), walks, (flight, walks.steps + 1))
+    return jax.vmap(lambda *of_one: _onward(scene, *of_one))(walks, candidate, share, scattering, decide)
 
 
 def _onward(
-    scene: Scene,
-    walk: Walk,
-    flight: Flight,
-    candidate: Candidate,
-    share: Scalar,
-    albedo: Triple,
-    decide: Scalar,
+    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """What becomes of a walk at a candidate, where a share of the majorant is extinction; or at the end of
     its flight."""
-    walk = eqx.tree_at(lambda w: (w.flight, w.steps), walk, (flight, walk.steps + 1))
-    own = ~walk.to_light
-    walks_on = _walked(scene, walk, candidate, share, albedo, decide)
+    onward = _walked(scene, walk, candidate, share, scattering, decide)
     if scene.located:
-        sees = _looked(scene, walk, candidate, share, decide)
-        walks_on = jax.tree.map(lambda a, b: jnp.where(own, a, b), walks_on, sees)
-    spent = walks_on.alive & (walks_on.steps >= MOST_STEPS)
+        looking = _looked(scene, walk, candidate, share, decide)
+        onward = jax.tree.map(lambda a, b: jnp.where(walk.to_light, a, b), looking, onward)
+    spent = onward.alive & (onward.steps >= MOST_STEPS)
     return eqx.tree_at(
-        lambda w: (w.alive, w.exhausted), walks_on, (walks_on.alive & ~spent, walks_on.exhausted | spent)
+        lambda w: (w.alive, w.exhausted), onward, (onward.alive & ~spent, onward.exhausted | spent)
     )
 
 
+def _scattering(
+    scene: Scene, walk: Walk, place: Triple, albedo: Triple, turn: Triple, choose: Scalar, survive: Scalar
+) -> Scattering:
+    """What comes of a walk if it is scattered here, by this turn."""
+    before = _times(walk.throughput, albedo)
+    throughput = _after_roulette(before, survive)
+    direction = turned(turn, walk.direction)
+    endless = jnp.full_like(survive, jnp.inf)
+    if not scene.located:
+        no = jnp.zeros(survive.shape, bool)
+        return Scattering(direction, throughput, walk.promised, no, direction, endless)
+    light = scene.light(place, choose)
+    density = phase(_dot(walk.direction, light.toward), scene.anisotropy)
+    promised = _scaled(_times(before, light.irradiance), density)
+    to_light = _greatest(promised) > 0
+    toward, end = _where(to_light, light.toward, direction), jnp.where(to_light, light.distance, endless)
+    return Scattering(direction, throughput, promised, to_light, toward, end)
+
+
 def _walked(
-    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, albedo: Triple, decide: Scalar
+    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """A walk on its own flight: delta tracking. Its end is the light all around; a collision scatters it."""
     collides = candidate.found & (decide < share)
     capped = collides & (walk.scatterings >= scene.most)
     scatters = collides & ~capped
-    escapes = candidate.over & walk.met
-    gathered = _where(escapes, _times(walk.throughput, scene.surroundings), _like(0, walk.throughput))
-    radiance = _plus(walk.radiance, gathered)
-
-    choose, turn, around, survive = _uniforms(walk, 1)
-    before = _times(walk.throughput, albedo)
-    throughput = _after_roulette(before, survive)
-    direction = scattered(walk.direction, scene.anisotropy, turn, around)
-    to_light, promised = jnp.zeros((), bool), walk.promised
-    toward, end = direction, jnp.full_like(candidate.majorant, jnp.inf)
-    if scene.located:
-        light = scene.light(candidate.place, choose)
-        density = phase(_dot(walk.direction, light.toward), scene.anisotropy)
-        promised = _scaled(_times(before, light.irradiance), density)
-        to_light = _greatest(promised) > 0
-        toward = _where(to_light, light.toward, direction)
-        end = jnp.where(to_light, light.distance, jnp.inf)
-    onward = scene.flight(candidate.place, toward, end)
-    alive = ~candidate.over & ~capped & (~scatters | to_light | (_greatest(throughput) > 0))
+    gathered = _times(walk.throughput, scene.surroundings)
+    gathered = _scaled(gathered, (candidate.over & walk.met).astype(share.dtype))
+    onward = scene.flight(candidate.place, scattering.toward, scattering.end)
+    goes_on = scattering.to_light | (_greatest(scattering.throughput) > 0)
     return Walk(
         walk.words,
         walk.steps,
         jax.tree.map(lambda new, old: jnp.where(scatters, new, old), onward, walk.flight),
-        scatters & to_light,
-        _where(scatters, direction, walk.direction),
-        _where(scatters, throughput, walk.throughput),
-        promised,
+        scatters & scattering.to_light,
+        _where(scatters, scattering.direction, walk.direction),
+        _where(scatters, scattering.throughput, walk.throughput),
+        _where(scatters, scattering.promised, walk.promised),
         jnp.ones_like(walk.clear),
-        radiance,
+        _plus(walk.radiance, gathered),
         walk.met | collides,
         walk.scatterings + scatters.astype(jnp.int32),
-        alive,
+        walk.alive & ~candidate.over & ~capped & (~scatters | goes_on),
         walk.exhausted | capped,
     )
 
@@ -227,8 +252,7 @@ def _looked(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survi
     left = jnp.where(candidate.found & (left < ROULETTE), kept, left)
     done = candidate.over | (left == 0)
     gathered = _scaled(walk.promised, jnp.where(candidate.over, left, 0))
-    end = jnp.full_like(walk.flight.end, jnp.inf)
-    onward = scene.flight(walk.flight.start, walk.direction, end)
+    onward = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
     return eqx.tree_at(
         lambda w: (w.flight, w.to_light, w.clear, w.radiance, w.alive),
         walk,
@@ -237,7 +261,7 @@ def _looked(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survi
             ~done,
             left,
             _plus(walk.radiance, gathered),
-            ~done | (_greatest(walk.throughput) > 0),
+            walk.alive & (~done | (_greatest(walk.throughput) > 0)),
         ),
     )
 
@@ -251,15 +275,10 @@ def _after_roulette(throughput: Triple, uniform: Scalar) -> Triple:
     return _scaled(throughput, jnp.where(small, jnp.where(followed, more, 0), 1))
 
 
-def _uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+def _uniforms(walk: Walk, stage: int) -> Uniforms:
     """Four numbers in [0, 1) for one of the two stages of a walk's next step."""
     pixel, path, seed = walk.words
     return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
-
-
-def _like(value: float, triple: Triple) -> Triple:
-    x, y, z = (jnp.full_like(part, value) for part in triple)
-    return x, y, z
 
 
 def _where(condition: Bool[Array, ""], a: Triple, b: Triple) -> Triple:
