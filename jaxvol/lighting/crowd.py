@@ -63,30 +63,30 @@ def walk_all(
     - `step`: the next step of all walks side by side.
     """
     lanes = min(lanes, count)
+    fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)
-    crowd = _Crowd(begin(none), none, jnp.zeros((), jnp.int32), Brought.nothing(count))
+    idle = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(begin, none))
+    crowd = _Crowd(idle, none, jnp.zeros((), jnp.int32), Brought.nothing(count))
 
     def refilled(crowd: _Crowd) -> _Crowd:
         free = ~crowd.walks.alive
         brought = crowd.brought.putting(jnp.where(free, crowd.number, count), crowd.walks)
         queued = crowd.begun + jnp.cumsum(free, dtype=jnp.int32) - 1
         number = jnp.where(free, jnp.minimum(queued, count), crowd.number)
-        fresh = begin(number)
-        walks = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, crowd.walks)
+        walks = jax.tree.map(lambda new, old: jnp.where(free, new, old), begin(number), crowd.walks)
         begun = jnp.minimum(crowd.begun + jnp.sum(free, dtype=jnp.int32), count)
         return _Crowd(walks, number, begun, brought)
 
-    def with_queue(crowd: _Crowd) -> _Crowd:
-        return _stepped(step, refilled(crowd), int(BUSY * lanes))
+    def turn(crowd: _Crowd) -> _Crowd:
+        crowd = refilled(crowd)
+        return _stepped(step, crowd, jnp.where(crowd.begun < count, int(BUSY * lanes), fewer))
 
-    crowd = jax.lax.while_loop(lambda crowd: crowd.begun < count, with_queue, crowd)
-    fewer = -(-lanes // FEWER)
-    crowd = _stepped(step, crowd, fewer)
-    crowd = _stepped(step, _together(crowd, fewer, count), 0)
+    crowd = jax.lax.while_loop(lambda crowd: crowd.begun < count, turn, crowd)
+    crowd = _stepped(step, _together(crowd, fewer, count), jnp.zeros((), jnp.int32))
     return crowd.brought.putting(crowd.number, crowd.walks)
 
 
-def _stepped(step: Callable[[Walk], Walk], crowd: _Crowd, keep: int) -> _Crowd:
+def _stepped(step: Callable[[Walk], Walk], crowd: _Crowd, keep: Int[Array, ""]) -> _Crowd:
     """On until no more than so many walks are alive."""
 
     def busy(walks: Walk) -> Bool[Array, ""]:

@@ -30,10 +30,10 @@ from .medium import Medium
 from .walks import Scene, Walk, Words, step
 
 
-LANES = 2**14
-"""Walks that go on side by side, by default on a CPU; sixteen times as many on a GPU."""
+LANES = 2**13
+"""Walks that go on side by side, by default on a CPU; 32 times as many on a GPU."""
 
-TURNS = 64
+TURNS = 128
 """Walks for each lane of a wave, one after the other."""
 
 UNTIL_CHANCE_ENDS_IT = 2**20
@@ -81,7 +81,7 @@ class PathTraced(eqx.Module):
     def image_error(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
         """Standard error of `image`, to which the noise of `opacity` contributes."""
         background, met = self._background(background), self.opacity[..., None]
-        # A path that meets nothing brings no radiance. So the two are anticorrelated, by as much as their means say.
+        # a path that meets nothing brings no radiance: their means tell how the two are correlated
         mixed = background * (1 - met) * (background * met - 2 * self.radiance)
         return jnp.sqrt(jnp.maximum(self._variance(self.deviations + self.paths * mixed), 0))
 
@@ -163,7 +163,7 @@ def path_trace(
     if max_scatterings is not None:
         most = min(integer("max_scatterings", max_scatterings, 1), most)
     if lanes is None:
-        lanes = LANES if jax.default_backend() == "cpu" else 16 * LANES
+        lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
     how = _How(paths, integer("lanes", lanes, 1), bool(antialias))
     seed = _seed(key)
     first = 0
@@ -262,7 +262,10 @@ class _Given(eqx.Module):
         )
 
 
-@eqx.filter_jit(compiler_options=OPTIONS)
+_OPTIONS: Any = {"compiler_options": OPTIONS}
+
+
+@eqx.filter_jit(**_OPTIONS)
 def _trace(
     given: _Given, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], how: _How
 ) -> PathTraced:

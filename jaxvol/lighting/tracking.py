@@ -21,7 +21,7 @@ from ..triple import Scalar, Triple, along
 from .majorants import Block, Majorants
 
 
-CROSSINGS = 4
+CROSSINGS = 2
 """Borders that a flight may cross before the next look into memory: those who arrive earlier wait."""
 
 

@@ -1,0 +1,318 @@
+"""Does path tracing give the light that is there, and the error that it has?
+
+Held against closed forms (absorption, a white furnace, Chandrasekhar's diffuse reflection) and quadrature in
+NumPy, by z-scores of pixels and of means over regions. Seeds are fixed, so that a test that passes stays so.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+import jaxvol as jv
+from jaxvol.lighting import ConstantLight, DirectionalLight, Light, Material, PointLight
+
+from .scenes import anisotropic_noise, around, inside, soft_transfer, uniform_transfer
+
+
+EXTINCTION = np.array([0.0, 0.0, 1.0, 4.0, 0.5, 0.0, 7.0, 7.0])
+POINTS = np.array([0.0, 0.3, 0.35, 0.5, 0.55, 0.6, 0.9, 1.0])
+COLORS = np.linspace((0.9, 0.2, 0.6), (0.3, 1.0, 0.5), 8)
+WHITE = ConstantLight()
+PAIR = (
+    DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)),
+    PointLight((1.5, -2.0, 2.0), (1.0, 4.0, 2.0)),
+)
+
+
+def spiky(factor: float = 1.0) -> jv.TransferFunction:
+    """Clear, thin and dense by turns."""
+    return jv.TransferFunction(POINTS, COLORS, factor * EXTINCTION)
+
+
+def regions(image) -> np.ndarray:
+    """Sums over blocks of 4 x 4 pixels."""
+    height, width, *rest = np.shape(image)
+    return np.asarray(image, float).reshape(height // 4, 4, width // 4, 4, *rest).sum(axis=(1, 3))
+
+
+def z_of_regions(difference, variance) -> np.ndarray:
+    """How many standard errors the regions' differences are. 0 where both are 0."""
+    return regions(difference) / np.sqrt(np.maximum(regions(variance), 1e-30))
+
+
+def absorbed(volume, transfer, camera, paths=256, lights: Light | tuple[Light, ...] = WHITE, **how):
+    """Opacities by path tracing and by marching, and the variance of the first."""
+    traced = jv.path_trace(volume, transfer, camera, lights, paths=paths, **how)
+    step = float(volume.spacing.min()) / 40
+    march = jv.March(step, (jv.AlphaCorrection(),), "midpoint")
+    opacity = np.asarray(jv.render(volume, transfer, camera, march).rgba[..., 3], float)
+    return np.asarray(traced.opacity), opacity, opacity * (1 - opacity) / paths
+
+
+@pytest.mark.parametrize("view", [around, inside])
+def test_opacity_is_that_of_absorption(view):
+    volume = anisotropic_noise()
+    traced, opacity, variance = absorbed(volume, spiky(), view(volume))
+    assert np.ptp(opacity) > 0.3
+    assert np.all(traced[opacity == 0] == 0)
+    z = z_of_regions(traced - opacity, variance)
+    assert abs(z).max() < 4
+    assert 0.5 < np.mean(z**2) < 1.7
+
+
+def test_the_opacity_of_a_constant_volume_is_its_closed_form():
+    volume, extinction = jv.Volume(np.ones((24,) * 3, np.float32), 1 / 23), 0.9
+    camera = jv.Camera((0.5, 0.5, -3.0), (0.5, 0.5, 0.5), size=(20, 16), parallel_scale=0.4)
+    traced = jv.path_trace(volume, uniform_transfer(extinction, (0, 0, 0)), camera, WHITE, paths=256)
+    expected = -np.expm1(-extinction)
+    error = np.sqrt(expected * (1 - expected) / (256 * traced.opacity.size))
+    assert abs(float(traced.opacity.mean()) - expected) < 3 * error
+    # nothing is scattered, and the constant light is seen through what is left
+    assert float(traced.radiance.max()) == 0
+    np.testing.assert_allclose(
+        traced.image((2.0, 1.0, 0.5)),
+        (1 - traced.opacity[..., None]) * jnp.asarray([2.0, 1.0, 0.5]),
+        rtol=1e-6,
+    )
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.8, -0.5])
+def test_in_a_white_furnace_nothing_is_to_be_seen(anisotropy):
+    volume = anisotropic_noise()
+    transfer = jv.TransferFunction(POINTS, np.ones((8, 3)), 10 * EXTINCTION)
+    traced = jv.path_trace(volume, transfer, around(volume), WHITE, paths=256, anisotropy=anisotropy)
+    assert float(traced.scatterings.max()) > 3
+    np.testing.assert_allclose(traced.image(), 1, atol=1e-5)
+    assert not traced.exhausted.any()
+
+
+def once_scattered(volume, transfer, camera, lights, anisotropy, samples=384, toward=96) -> np.ndarray:
+    """Light scattered a single time, by the midpoint rule along the ray and along the way to each light."""
+    data, spacing, origin = (np.asarray(a, float) for a in (volume.data, volume.spacing, volume.origin))
+    low, high = (np.asarray(corner, float) for corner in volume.corners)
+    values, colors, table = (
+        np.asarray(a, float) for a in (transfer.values, transfer.colors, transfer.extinction)
+    )
+
+    def value(points):
+        return (
+            map_coordinates(data, ((points - origin) / spacing).T.reshape(3, -1), order=1)
+            .reshape(points.shape[:-1][::-1])
+            .T
+        )
+
+    def extinction(points):
+        return np.interp(value(points), values, table)
+
+    def exits(origins, directions):
+        with np.errstate(divide="ignore"):
+            walls = np.stack([(low - origins) / directions, (high - origins) / directions])
+        return np.maximum(walls.min(axis=0).max(axis=-1), 0), walls.max(axis=0).min(axis=-1)
+
+    origins, directions = (np.asarray(a, float).reshape(-1, 3) for a in camera.rays())
+    near, far = exits(origins, directions)
+    width = np.maximum(far - near, 0) / samples
+    middles = np.arange(samples) + 0.5
+    points = origins[:, None] + (near[:, None] + middles * width[:, None])[..., None] * directions[:, None]
+    points = np.clip(points, low, high)
+    here = value(points)
+    density = np.interp(here, values, table)
+    albedo = np.stack([np.interp(here, values, colors[:, i]) for i in range(3)], axis=-1)
+    depth = np.cumsum(density, axis=1) * width[:, None] - density * width[:, None] / 2
+    gathered = np.zeros((len(origins), 3))
+    for light in lights:
+        if isinstance(light, DirectionalLight):
+            way = np.broadcast_to(-np.asarray(light.direction, float), points.shape)
+            irradiance = np.asarray(light.irradiance, float)
+            end = np.inf
+        else:
+            way = np.asarray(light.position, float) - points
+            end = np.linalg.norm(way, axis=-1)
+            irradiance = np.asarray(light.intensity, float) / end[..., None] ** 2
+        way = way / np.linalg.norm(way, axis=-1, keepdims=True)
+        step = np.minimum(exits(points, way)[1], end) / toward
+        shade = np.zeros(step.shape)
+        for i in range(toward):
+            shade += step * extinction(np.clip(points + ((i + 0.5) * step)[..., None] * way, low, high))
+        cosine = np.sum(way * directions[:, None], axis=-1)
+        g = anisotropy
+        phase = (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
+        weight = (density * width[:, None] * phase * np.exp(-depth - shade))[..., None]
+        gathered += np.sum(weight * albedo * irradiance, axis=1)
+    return gathered.reshape(*np.asarray(camera.rays()[0]).shape)
+
+
+def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_told():
+    volume, transfer, anisotropy = anisotropic_noise(), spiky(), 0.4
+    camera = around(volume)
+    how = {"paths": 256, "anisotropy": anisotropy, "max_scatterings": 1}
+    traced = jv.path_trace(volume, transfer, camera, PAIR, **how)
+    expected = once_scattered(volume, transfer, camera, PAIR, anisotropy)
+    difference, error = np.asarray(traced.radiance) - expected, np.asarray(traced.standard_error)
+    z = z_of_regions(difference, error**2)
+    assert abs(z).max() < 4
+    assert abs(difference.sum()) < 3 * np.sqrt((error**2).sum()) * np.sqrt(3)  # channels go together
+    pixels = (difference / np.maximum(error, 1e-30))[expected > 0.3 * expected.max()]
+    assert 0.8 < np.std(pixels) < 1.25
+    assert traced.exhausted.any()  # what was scattered once would have gone on
+
+    more = jv.path_trace(volume, transfer, camera, PAIR, **how, onto=traced)
+    assert more.paths == 512
+    shrunk = float(jnp.mean(more.standard_error)) / float(jnp.mean(traced.standard_error))
+    assert abs(shrunk - 0.5**0.5) < 0.03
+
+
+def chandrasekhar(albedo: np.ndarray, cosine: float) -> np.ndarray:
+    """His function H for isotropic scattering, by iterating its integral equation."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    nodes, weights = (nodes + 1) / 2, weights / 2
+    h = np.ones((len(albedo), 64))
+    root = np.sqrt(1 - albedo)[:, None]
+
+    def next_of(mu):
+        kernel = nodes / (mu[:, None] + nodes)
+        return 1 / (root + (albedo[:, None] / 2) * ((h * weights) @ kernel.T))
+
+    for _ in range(200):
+        h = next_of(nodes)
+    return next_of(np.asarray([cosine]))[:, 0]
+
+
+def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar():
+    # a half-space is a cube of 60 mean free paths, seen in the middle of a side from near by
+    albedo = np.array([0.5, 0.8, 0.95])
+    volume = jv.Volume(np.ones((24,) * 3, np.float32), 60 / 23)
+    camera = jv.Camera((30, 30, -1), (30, 30, 0), (0, 1, 0), size=(20, 16), parallel_scale=0.5)
+    cosine = 0.6
+    sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
+    traced = jv.path_trace(volume, uniform_transfer(1.0, albedo), camera, sun, paths=128)
+    expected = albedo / 4 * cosine / (1 + cosine) * chandrasekhar(albedo, 1.0) * chandrasekhar(albedo, cosine)
+    mean = np.asarray(traced.radiance, float).mean(axis=(0, 1))
+    error = np.sqrt((np.asarray(traced.standard_error, float) ** 2).sum(axis=(0, 1))) / 320
+    assert np.all(error < 0.02 * expected)
+    assert np.all(abs(mean - expected) < 3 * error)
+    assert float(traced.scatterings.mean()) > 5
+
+
+def test_lights_add_up():
+    volume, camera, transfer = anisotropic_noise(), around(anisotropic_noise()), spiky(3)
+    lit = [jv.path_trace(volume, transfer, camera, light, paths=64, key=7) for light in (PAIR, WHITE)]
+    both = jv.path_trace(volume, transfer, camera, (*PAIR, WHITE), paths=64, key=8)
+    difference = both.radiance - lit[0].radiance - lit[1].radiance
+    variance = sum(np.asarray(image.standard_error) ** 2 for image in (*lit, both))
+    z = z_of_regions(difference, variance)
+    assert abs(z).max() < 4.5
+    np.testing.assert_array_equal(lit[0].opacity, lit[1].opacity)  # the camera's rays are the same
+
+
+def test_more_paths_are_those_of_all_at_once():
+    volume, camera = anisotropic_noise(), inside(anisotropic_noise())
+    some = jv.path_trace(volume, spiky(), camera, PAIR, paths=64, key=3)
+    more = jv.path_trace(volume, spiky(), camera, PAIR, paths=64, key=3, onto=some)
+    once = jv.path_trace(volume, spiky(), camera, PAIR, paths=128, key=jax.random.key(3))
+    assert more.paths == once.paths
+    for name in ("radiance", "opacity", "standard_error", "scatterings"):
+        np.testing.assert_allclose(getattr(more, name), getattr(once, name), rtol=1e-3, atol=1e-5)
+    assert float(abs(more.radiance - some.radiance).max()) > 1e-3
+
+
+@pytest.mark.parametrize("lanes", [96, 3000])
+def test_how_many_paths_go_on_side_by_side_does_not_show(lanes):
+    volume, camera = anisotropic_noise(), around(anisotropic_noise())
+    usual = jv.path_trace(volume, spiky(), camera, PAIR, paths=64, key=3)
+    other = jv.path_trace(volume, spiky(), camera, PAIR, paths=64, key=3, lanes=lanes)
+    np.testing.assert_array_equal(usual.opacity, other.opacity)
+    np.testing.assert_allclose(usual.radiance, other.radiance, rtol=1e-4, atol=1e-6)
+
+
+def test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_its_opacity():
+    volume = anisotropic_noise()
+    materials = (
+        Material(0.25, 0.4, values=(0.4, 0.7)),
+        Material(0.5, 0.2, values=(0.6, 2.0)),
+    )
+    # the same by hand, as steps of the transfer function
+    gap = 1e-6
+    values = np.array([0.0, 0.4 - gap, 0.4, 0.7, 0.7 + gap, 1.0])
+    color = np.array([0.8, 0.9, 1.0])
+    kept = np.array([1.0, 1.0, 0.75, 0.75, 0.5, 0.5])[:, None]
+    by_hand = jv.TransferFunction(values, kept * color, [0.3, 0.3, 2.5, 2.5, 5.0, 5.0])
+    plain = jv.TransferFunction([0.0, 1.0], np.tile(color, (2, 1)), [0.3, 0.3])
+    camera = around(volume)
+    a = jv.path_trace(volume, by_hand, camera, PAIR, paths=64)
+    b = jv.path_trace(volume, plain, camera, PAIR, paths=64, materials=materials, key=1)
+    z = z_of_regions(a.radiance - b.radiance, a.standard_error**2 + b.standard_error**2)
+    assert abs(z).max() < 4.5
+    opacity = (a.opacity + b.opacity) / 2
+    z = z_of_regions(a.opacity - b.opacity, opacity * (1 - opacity) * 2 / 64)
+    assert abs(z).max() < 4.5
+
+
+def test_materials_are_found_by_label():
+    data = np.full((24,) * 3, 0.5, np.float32)
+    labels = np.zeros((24,) * 3, np.uint8)
+    labels[12:] = 2
+    volume = jv.Volume(data, 1 / 23, labels=labels)
+    camera = jv.Camera((0.5, 0.5, -3), (0.5, 0.5, 0.5), size=(20, 16), parallel_scale=0.3)
+    materials = (Material(0.9, 0.5, label=2),)
+    traced = jv.path_trace(volume, uniform_transfer(0.5), camera, WHITE, paths=256, materials=materials)
+    for half, extinction, albedo in ((np.s_[:, :9], 2.0, 0.1), (np.s_[:, 11:], 0.5, 1.0)):
+        opacity = np.asarray(traced.opacity)[half]
+        expected = -np.expm1(-extinction)
+        error = np.sqrt(expected * (1 - expected) / (256 * opacity.size))
+        assert abs(opacity.mean() - expected) < 3.5 * error
+        seen = np.asarray(traced.radiance)[half].mean() / opacity.mean()
+        assert seen < 1.02 * albedo if albedo < 1 else seen > 0.5
+
+
+def test_what_is_invisible_is_empty():
+    volume = anisotropic_noise()
+    traced = jv.path_trace(volume, uniform_transfer(0.0), around(volume), (*PAIR, WHITE), paths=64)
+    assert float(traced.opacity.max()) == 0
+    np.testing.assert_array_equal(traced.image((0.2, 0.4, 0.6))[0, 0], np.float32([0.2, 0.4, 0.6]))
+    assert float(traced.standard_error.max()) == 0
+
+
+def test_the_error_of_an_image_counts_the_noise_of_its_background():
+    volume, camera = anisotropic_noise(), around(anisotropic_noise())
+    background = (0.5, 2.0, 0.0)
+    several = [
+        jv.path_trace(volume, spiky(), camera, PAIR, paths=64, key=key, max_scatterings=2)
+        for key in range(24)
+    ]
+    images = np.stack([image.image(background) for image in several])
+    told = np.stack([image.image_error(background) for image in several])
+    bright = images.mean(axis=0)[..., 0] > np.median(images.mean(axis=0)[..., 0])
+    ratio = images.var(axis=0, ddof=1)[bright].mean(axis=0) / (told**2).mean(axis=0)[bright].mean(axis=0)
+    assert np.all(abs(ratio - 1) < 0.15)
+
+
+def test_bad_arguments_are_named():
+    volume = anisotropic_noise()
+    camera, transfer = around(volume), soft_transfer()
+    small = jv.Camera.looking_at(volume, size=(4, 4))
+
+    def fails(word: str, *args, **how):
+        with pytest.raises(ValueError, match=word):
+            jv.path_trace(*(args or (volume, transfer, camera, WHITE)), **how)
+
+    fails("lights", volume, transfer, camera, ())
+    fails("paths", paths=0)
+    fails("paths", paths=1.5)
+    fails("key", key="seed")
+    fails("key", key=-1)
+    fails("anisotropy", anisotropy=1.0)
+    fails("max_scatterings", max_scatterings=0)
+    fails("lanes", lanes=0)
+    fails("materials", materials=())
+    fails("materials", materials=Material(0.5, 1.0, label=1))
+    fails("labels", volume, jv.LabelTransferFunction([transfer]), camera, WHITE)
+    fails("onto", onto=np.zeros((16, 20, 3)))
+    shape = jnp.zeros((4, 4)), jnp.zeros((4, 4, 3))
+    earlier = jv.PathTraced(shape[1], shape[0], shape[1], shape[0], shape[0] > 0, jnp.uint32(0), 2)
+    fails("onto", onto=earlier)
+    fails("onto", volume, transfer, small, WHITE, onto=earlier)
+    with pytest.raises(ValueError, match="background"):
+        earlier.image((1.0, 2.0))
