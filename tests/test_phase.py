@@ -31,7 +31,9 @@ def test_cosines_are_drawn_by_it(g):
         below = (1 - g64**2) / (2 * g64) * (1 / np.sqrt(1 + g64**2 - 2 * g64 * drawn) - 1 / (1 + g64))
     else:
         below = (1 + drawn) / 2 + g64 * (drawn**2 - 1) * 3 / 4
-    np.testing.assert_allclose(below, uniform, atol=2e-5)
+    # a sharp peak makes more of the last digit of a float32 cosine
+    slope = (1 + abs(g)) / (2 * (1 - abs(g)) ** 2)
+    np.testing.assert_allclose(below, uniform, atol=5e-6 + 2 * slope * 1.2e-7)
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, -0.64, 0.48)])

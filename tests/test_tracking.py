@@ -95,7 +95,8 @@ def test_bounds_are_no_larger_than_need_be():
     for points in (2, 3, 8, 33):
         transfer = random_transfer(random, points)
         low, high = np.sort(random.uniform(-0.1, 1.1, (2, 200)), axis=0).astype(np.float32)
-        bound = greatest_between(transfer.values, transfer.extinction, jnp.asarray(low), jnp.asarray(high))
+        ends = jnp.asarray(low), jnp.asarray(high)
+        bound = jax.jit(greatest_between)(transfer.values, transfer.extinction, *ends)
         values, extinction = (np.asarray(a, float) for a in (transfer.values, transfer.extinction))
         for a, b, told in zip(low, high, np.asarray(bound), strict=True):
             inside = values[(values >= a) & (values <= b)]

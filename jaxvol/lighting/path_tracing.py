@@ -107,14 +107,14 @@ def path_trace(
     camera: Camera,
     lights: Light | tuple[Light, ...],
     *,
-    paths: int = 16,
+    paths: int | Any = 16,
     key: Any = 0,
     materials: Material | tuple[Material, ...] | None = None,
     anisotropy: Arrayable = 0.0,
-    max_scatterings: int | None = None,
+    max_scatterings: int | Any = None,
     antialias: bool = False,
-    onto: PathTraced | None = None,
-    lanes: int | None = None,
+    onto: PathTraced | Any = None,
+    lanes: int | Any = None,
 ) -> PathTraced:
     """The image of a volume that scatters light any number of times.
 
@@ -205,7 +205,7 @@ def _seed(key: Any) -> UInt32[Array, ""]:
         raise ValueError(f"key must be a seed, or a key of jax.random; got {key!r}.") from fault
 
 
-def _checked(onto: PathTraced, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
+def _checked(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
     if not isinstance(onto, PathTraced):
         raise ValueError(f"onto must be an earlier result of path_trace; got {onto!r}.")
     width, height = camera.size
