@@ -303,7 +303,7 @@ def _begin(scene: Scene, camera: Camera, how: _How, words: Words, wanted: Bool[A
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
     if how.antialias:
         x, y, *_ = hashed_uniforms_4(pixel, path, jnp.full_like(pixel, BEFORE_ALL), seed)
-        origin, direction = camera.ray(column + x - 0.5, row + y - 0.5)
+        origin, direction = camera.ray(column.astype(x.dtype) + x - 0.5, row.astype(y.dtype) + y - 0.5)
     else:
         origin, direction = camera.ray(column, row)
     ray = enter(Affine(scene.volume), origin, direction, (column, row))
