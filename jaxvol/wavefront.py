@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .beams import Box
+from .compiled import in_memory
 from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
@@ -282,15 +283,6 @@ def _taken(
         return jnp.full_like(left, CELLS), jnp.zeros_like(settled)
 
     return jax.lax.cond(jnp.all((settled & (left >= CELLS)) | ~live), all_, up_to, alphas)
-
-
-def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, computed once and put in memory for all who use it; or anything where none is live."""
-
-    def nothing(*arguments: Any) -> Any:
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(f, *arguments))
-
-    return jax.lax.cond(live, f, nothing, *arguments)
 
 
 def _leap(

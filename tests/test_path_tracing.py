@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, Material, PointLight
 
-from .scenes import anisotropic_noise, around, inside, soft_transfer, uniform_transfer
+from .scenes import anisotropic_noise, around, in_float64, inside, soft_transfer, uniform_transfer
 
 
 EXTINCTION = np.array([0.0, 0.0, 1.0, 4.0, 0.5, 0.0, 7.0, 7.0])
@@ -278,6 +278,23 @@ def test_materials_are_found_by_label():
     seen = np.asarray(traced.radiance)[..., 0] / np.asarray(traced.opacity)
     assert seen[right].mean() < 0.1
     assert seen[left].mean() > 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["uint8", "int16", "float16", "float64"])
+def test_the_type_of_voxels_does_not_show(kind):
+    whole = np.random.default_rng(0).integers(0, 100, (24,) * 3)
+    transfer = jv.TransferFunction(np.linspace(0, 100, 40), np.full((40, 3), 0.8), np.linspace(0, 9, 40) ** 2)
+    single, other = (
+        trace(jv.Volume(whole.astype(dtype), (1 / 23,) * 3), transfer, far(cube(), 1.2), lit(SUN, LAMP, SKY))
+        for dtype in ("float32", kind)
+    )
+    np.testing.assert_allclose(single.radiance, other.radiance, rtol=1e-3, atol=1e-4)
+    with in_float64():
+        volume = jv.Volume(whole.astype(kind), (1 / 23,) * 3)
+        double = trace(volume, transfer, far(cube(), 1.2), lit(SUN, LAMP, SKY))
+    assert double.radiance.dtype == jnp.float32
+    np.testing.assert_allclose(single.radiance.mean(), double.radiance.mean(), rtol=0.01)
 
 
 def test_what_is_invisible_is_empty():

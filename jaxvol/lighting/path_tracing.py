@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from ..camera import Camera
 from ..checks import Arrayable, integer, is_traced, number
-from ..engine import OPTIONS
+from ..compiled import compiled
 from ..locate import Affine, enter
 from ..noise import hashed_uniforms_4
 from ..occupancy import Blocks
@@ -39,7 +39,6 @@ TURNS = 128
 UNTIL_CHANCE_ENDS_IT = 2**20
 """Scatterings that a walk may have by default. A path of albedo 1 leaves a medium of optical thickness τ
 after some τ² scatterings, so this bounds none but those in media a thousand mean free paths thick."""
-
 
 BEFORE_ALL = np.uint32(2**32 - 1)
 """In place of the number of a walk's step, for what is drawn before the first."""
@@ -161,7 +160,7 @@ def path_trace(
     anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
     most = UNTIL_CHANCE_ENDS_IT
     if max_scatterings is not None:
-        most = min(integer("max_scatterings", max_scatterings, 1), most)
+        most = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
     how = _How(paths, integer("lanes", lanes, 1), bool(antialias))
@@ -262,15 +261,12 @@ class _Given(eqx.Module):
         )
 
 
-_OPTIONS: Any = {"compiler_options": OPTIONS}
-
-
-@eqx.filter_jit(**_OPTIONS)
+@compiled
 def _trace(
     given: _Given, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], how: _How
 ) -> PathTraced:
     """The pixels row by row, in waves that bound the memory."""
-    given, camera = jax.lax.stop_gradient((given, camera))
+    given, camera = jax.tree.map(_single, jax.lax.stop_gradient((given, camera)))
     scene, (width, height) = given.scene(), camera.size
     pixels = min(max(TURNS * how.lanes // how.paths, 1), width * height)
     waves = -(-width * height // pixels)
@@ -295,6 +291,11 @@ def _trace(
 
     sums = jax.tree.map(image, jax.lax.map(wave, jnp.arange(waves, dtype=jnp.int32)))
     return PathTraced(*sums, seed=seed, paths=how.paths)
+
+
+def _single(leaf: Array) -> Array:
+    """float64, where it is on, as float32: noise is larger by far than its rounding."""
+    return leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf
 
 
 def _begin(scene: Scene, camera: Camera, how: _How, words: Words, wanted: Bool[Array, ""]) -> Walk:

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
+from ..compiled import in_memory
 from ..noise import hashed_uniforms_4
 from ..triple import Scalar, Triple, apart
 from ..volume import Volume
-from ..wavefront import in_memory
 from .lights import Arriving, ConstantLight, Light, LocatedLight
 from .majorants import Majorants
 from .medium import Medium
