@@ -41,6 +41,15 @@ def trace(volume, transfer, camera, lights, **how: Any) -> jv.PathTraced:
     return jv.path_trace(volume, transfer, camera, lights, **({"paths": PATHS} | how))
 
 
+def often(times: int, *scene: Any, **how: Any) -> jv.PathTraced:
+    """So many times PATHS."""
+    traced = None
+    for _ in range(times):
+        traced = trace(*scene, **how, onto=traced)
+    assert traced is not None
+    return traced
+
+
 def cube(labels=None) -> jv.Volume:
     """The same everywhere, with sides of length 1."""
     return jv.Volume(np.full((24,) * 3, 0.5, np.float32), (1 / 23,) * 3, labels=labels)
@@ -165,8 +174,7 @@ def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_tol
     volume, transfer, anisotropy = anisotropic_noise(), spiky(), 0.4
     camera = around(volume)
     how: Any = {"anisotropy": anisotropy, "max_scatterings": 1}
-    traced = trace(volume, transfer, camera, lit(SUN, LAMP), **how)
-    traced = trace(volume, transfer, camera, lit(SUN, LAMP), **how, onto=traced)
+    traced = often(2, volume, transfer, camera, lit(SUN, LAMP), **how)
     assert traced.exhausted.any()  # what was scattered once would have gone on
     expected = once_scattered(volume, transfer, camera, (SUN, LAMP), anisotropy)
     difference, error = np.asarray(traced.radiance) - expected, np.asarray(traced.standard_error)
@@ -175,9 +183,7 @@ def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_tol
     bright = expected > 0.3 * expected.max(axis=(0, 1))
     assert 0.85 < np.std((difference / np.maximum(error, 1e-30))[bright]) < 1.15
 
-    more = traced
-    for _ in range(6):
-        more = trace(volume, transfer, camera, lit(SUN, LAMP), **how, onto=more)
+    more = often(8, volume, transfer, camera, lit(SUN, LAMP), **how)
     assert more.paths == 4 * traced.paths
     fallen = float(jnp.mean(more.standard_error)) / float(jnp.mean(traced.standard_error))
     assert abs(fallen - 0.5) < 0.02
@@ -200,17 +206,17 @@ def chandrasekhar(albedo: np.ndarray, cosine: float) -> np.ndarray:
     return next_of(np.asarray([cosine]))[:, 0]
 
 
-@pytest.mark.parametrize("albedo", [(0.3, 0.3, 0.3), (0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
+@pytest.mark.parametrize("albedo", [(0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
 def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(albedo):
     # a half-space is a cube of 60 mean free paths, seen in the middle of a side
     albedo, cosine, volume = np.array(albedo), 0.6, cube()
     sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
-    traced = trace(volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lit(sun))
+    traced = often(8, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lit(sun))
     h = chandrasekhar(albedo, 1.0) * chandrasekhar(albedo, cosine)
     expected = albedo / 4 * cosine / (1 + cosine) * h
     mean = np.asarray(traced.radiance, float).mean(axis=(0, 1))
     error = np.sqrt((np.asarray(traced.standard_error, float) ** 2).sum(axis=(0, 1))) / 320
-    assert np.all(error < 0.01 * expected)
+    assert np.all(error < 0.005 * expected)
     assert np.all(abs(mean - expected) < 3 * error)
 
 
