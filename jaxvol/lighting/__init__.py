@@ -7,4 +7,5 @@ from .lights import (
     PointLight as PointLight,
 )
 from .materials import Material as Material, material as material
-from .path_tracing import PathTraced as PathTraced, path_trace as path_trace
+from .path_traced import PathTraced as PathTraced
+from .path_tracing import path_trace as path_trace

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
 from ..camera import Camera
 from ..checks import Arrayable, integer, is_traced, number
@@ -27,6 +27,7 @@ from .lights import Light, lights_of
 from .majorants import Majorants
 from .materials import Material, materials_of
 from .medium import Medium
+from .path_traced import PathTraced
 from .walks import Scene, Walk, Words, step
 
 
@@ -42,62 +43,6 @@ after some τ² scatterings, so this bounds none but those in media a thousand m
 
 BEFORE_ALL = np.uint32(2**32 - 1)
 """In place of the number of a walk's step, for what is drawn before the first."""
-
-
-class PathTraced(eqx.Module):
-    """An image by path tracing, so far.
-
-    - `radiance`: linear RGB of the light that the volume scatters into the camera, mean over all paths,
-      without what is seen behind it.
-    - `opacity`: the share of camera rays that met anything.
-    - `deviations`: sums of the squared deviations of each path's radiance from the mean.
-    - `scatterings`: how often a path was scattered, on average.
-    - `exhausted`: whether any path was cut off by `max_scatterings`: the pixel lacks what it would have
-      brought.
-    - `paths`: for each pixel. `seed`: of all that was random.
-    """
-
-    radiance: Float[Array, "height width 3"]
-    opacity: Float[Array, "height width"]
-    deviations: Float[Array, "height width 3"]
-    scatterings: Float[Array, "height width"]
-    exhausted: Bool[Array, "height width"]
-    seed: UInt32[Array, ""]
-    paths: int = eqx.field(static=True)
-
-    @property
-    def standard_error(self) -> Float[Array, "height width 3"]:
-        """Of `radiance`, from the variance of the pixel's paths; infinite for a single path.
-
-        A pixel in whose few paths a rare bright one is missing is too dark, and tells too small an error.
-        """
-        return jnp.sqrt(self._variance(self.deviations))
-
-    def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
-        """Linear RGB over a background: one colour (3,), or an image of the same shape."""
-        return self.radiance + (1 - self.opacity[..., None]) * self._background(background)
-
-    def image_error(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
-        """Standard error of `image`, to which the noise of `opacity` contributes."""
-        background, met = self._background(background), self.opacity[..., None]
-        # a path that meets nothing brings no radiance: their means tell how the two are correlated
-        mixed = background * (1 - met) * (background * met - 2 * self.radiance)
-        return jnp.sqrt(jnp.maximum(self._variance(self.deviations + self.paths * mixed), 0))
-
-    def _variance(self, deviations: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
-        """Of a mean, from the squared deviations of all paths."""
-        if self.paths < 2:
-            return jnp.full_like(deviations, jnp.inf)
-        return deviations / (self.paths * (self.paths - 1))
-
-    def _background(self, background: Any) -> Float[Array, "height width 3"]:
-        background = jnp.asarray(background, self.radiance.dtype)
-        if background.shape not in ((3,), self.radiance.shape):
-            raise ValueError(
-                f"background must be one colour (3,) or an image {self.radiance.shape}; "
-                f"got shape {background.shape}."
-            )
-        return jnp.broadcast_to(background, self.radiance.shape)
 
 
 def path_trace(
@@ -179,7 +124,7 @@ def path_trace(
         jnp.asarray(most, jnp.int32),
     )
     traced = _trace(given, camera, seed, jnp.asarray(first, jnp.uint32), how)
-    return traced if onto is None else _joined(onto, traced)
+    return traced if onto is None else onto.joined(traced)
 
 
 class _How(eqx.Module):
@@ -215,26 +160,6 @@ def _checked(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
     if not is_traced(onto.seed, seed) and onto.seed != seed:
         raise ValueError("onto must be of the same key: other paths would be drawn again.")
     return onto
-
-
-def _joined(one: PathTraced, other: PathTraced) -> PathTraced:
-    """All paths of two results. Source: Chan, Golub and LeVeque 1983."""
-    paths = one.paths + other.paths
-    part = other.paths / paths
-
-    def mean(a: Array, b: Array) -> Array:
-        return a + (b - a) * part
-
-    apart = jnp.square(other.radiance - one.radiance) * (one.paths * part)
-    return PathTraced(
-        radiance=mean(one.radiance, other.radiance),
-        opacity=mean(one.opacity, other.opacity),
-        deviations=one.deviations + other.deviations + apart,
-        scatterings=mean(one.scatterings, other.scatterings),
-        exhausted=one.exhausted | other.exhausted,
-        seed=one.seed,
-        paths=paths,
-    )
 
 
 class _Given(eqx.Module):
