@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Num
 
 from .checks import Arrayable, finite_array, number, require
 from .triple import Triple, along, apart
@@ -131,8 +131,8 @@ class Camera(eqx.Module):
         factor = number("zoom factor", factor, above=0)
         return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
-    def ray(self, column: Int[Array, ""], row: Int[Array, ""]) -> tuple[Triple, Triple]:
-        """Origin and unit direction of one pixel's ray."""
+    def ray(self, column: Num[Array, ""], row: Num[Array, ""]) -> tuple[Triple, Triple]:
+        """Origin and unit direction of one pixel's ray; between whole numbers, of a ray between pixels'."""
         dtype = self.position.dtype
         x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)
         right, up, forward = (apart(axis) for axis in self._axes())
