@@ -127,14 +127,12 @@ def one_ball(
     rows = []
     for thickness in thicknesses:
         path = 2 * RADIUS / thickness
-        # whoever lights by templates chooses how dense matter is to look: here as dense as it is, down to what
-        # can be seen at all
+        # whoever lights by templates chooses how dense matter is to look: here as it is, down to what can be
+        # seen at all
         extinction = max(1 / path, 2.0)
 
-        def start(
-            off: float, tied: float, path: float = path, extinction: float = extinction
-        ) -> dict[str, Any]:
-            known = {"tied": jnp.float32(tied), "extinction": jnp.float32(extinction)}
+        def start(off: float, tied: float, path: float = path, dense: float = extinction) -> dict[str, Any]:
+            known = {"tied": jnp.float32(tied), "extinction": jnp.float32(dense)}
             return {"material": material(path * off), "brightness": jnp.float32(1.0), **known}
 
         own, traced = [], []
@@ -151,7 +149,7 @@ def one_ball(
             residual = jv.ImageResidual(scene, views, background=(0, 0, 0))
             found = jv.fit(
                 residual,
-                start(3.0 if thickness < 8 else 1 / 3, tied),
+                start(1 / 3, tied),
                 constraints=constraints,
                 max_steps=STEPS,
             )
@@ -218,9 +216,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         "one ball": one_ball(chosen.size, chosen.resolution, chosen.paths, thicknesses, chosen.seed),
     }
     worst = max(abs(ratio - 1) for ratio in result["three materials"]["found"])
-    print(
-        f"three materials: within {worst:.2%} (goal {GOAL:.0%}), {len(result['three materials']['losses'])} steps"
-    )
+    steps = len(result["three materials"]["losses"])
+    print(f"three materials: within {worst:.2%} (goal {GOAL:.0%}), {steps} steps")
     path = record.write(
         chosen.output / "mean_free_path.json",
         "Are mean free paths found back from images, of templates and path-traced?",

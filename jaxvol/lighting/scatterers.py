@@ -109,8 +109,8 @@ class ScattererTemplates(Lighting):
 
     def __init__(
         self,
-        materials: Material | Sequence[Material],
-        lights: Light | tuple[Light, ...],
+        materials: Material | Sequence[Any],
+        lights: Light | tuple[Light, ...] | Any,
         *,
         templates: int = 8,
         blend: bool = False,
@@ -265,7 +265,7 @@ class TemplateShading(Shading):
         for light in self.how.lights:
             if isinstance(light, ConstantLight):
                 r, g, b = (jnp.pi * radiance for radiance in light.radiance)
-                lights.append((None, jnp.inf, (r, g, b)))
+                lights.append((None, jnp.full_like(found[0], jnp.inf), (r, g, b)))
             elif isinstance(light, LocatedLight):
                 lights.append(tuple(light.at(sample.point)))
         whole = sum(found)
