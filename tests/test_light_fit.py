@@ -36,4 +36,4 @@ def test_a_mean_free_path_much_longer_than_the_object_is_said_to_be_undetermined
     assert known.uncertainty.undetermined == []
     assert jnp.allclose(known.parameters.mean_free_path, 0.1, rtol=GOAL)
     with pytest.warns(UserWarning, match="mean_free_path"):
-        assert fitted(3e4).uncertainty.undetermined == [[".mean_free_path"]]
+        assert fitted(300.0).uncertainty.undetermined == [[".mean_free_path"]]

@@ -328,7 +328,8 @@ def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
 def _told(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     known = None
     if run.triangle is not None:
-        known = uncertainty(np.asarray(run.triangle), problem.residual.count(), problem.free, run.best)
+        residual, triangle = problem.residual, np.asarray(run.triangle)
+        known = uncertainty(triangle, residual.count(), problem.free, run.best, residual.scale())
         if known.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in known.undetermined[:6])
             warnings.warn(

@@ -55,6 +55,11 @@ class Residual(eqx.Module):
     def count(self) -> int:
         """Entries of the whole."""
 
+    def scale(self) -> float:
+        """Norm of what is compared: a change of the residual within its rounding tells nothing. 0 where it is
+        not known."""
+        return 0.0
+
 
 class OwnResidual(Residual):
     """A function from parameters to arrays, in one piece."""
@@ -149,6 +154,10 @@ class ImageResidual(Residual):
 
     def count(self) -> int:
         return sum(group.images.size for group in self.groups)
+
+    def scale(self) -> float:
+        squares = sum(float(jnp.sum(group.images**2)) for group in self.groups)
+        return math.sqrt(squares / self.count())
 
     def tiles(self, most: int) -> list[Tiles]:
         return [self._tiles(group, most) for group in self.groups]
