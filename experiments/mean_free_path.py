@@ -191,7 +191,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
     if lost:
         right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label="said to be undetermined")
     right.axhline(1, color="k", linewidth=0.8)
-    right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true", title="one ball, in two views")
+    right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
+    right.set_title("one ball, in two views")
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     common.save(figure, path)
 

@@ -17,6 +17,7 @@ from experiments import (
     mean_free_path,
     minimum_distance,
     overhead,
+    path_traced,
     record,
     speed,
     tomography,
@@ -41,6 +42,7 @@ MEASURES = {
         mean_free_path,
         minimum_distance,
         overhead,
+        path_traced,
         speed,
         tomography,
     )
