@@ -109,8 +109,8 @@ class ScattererTemplates(Lighting):
 
     def __init__(
         self,
-        materials: Material | Sequence[Material],
-        lights: Light | tuple[Light, ...],
+        materials: Material | Sequence[Any],
+        lights: Light | tuple[Light, ...] | Any,
         *,
         templates: int = 8,
         blend: bool = False,

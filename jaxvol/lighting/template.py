@@ -84,7 +84,7 @@ def scatterer_template(
     *,
     packets: int = 4,
     threshold: float = 0.01,
-    energy: Energy = "conserving",
+    energy: Energy | Any = "conserving",
     flights: bool = True,
     critical_angle: float | Any | None = None,
     merge: float = 0.01,
@@ -302,7 +302,7 @@ def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
     around, across = golden * np.arange(n), np.sqrt(1 - z**2)
     even = np.stack([across * np.cos(around), across * np.sin(around), z], axis=-1)
     q, r = jnp.linalg.qr(jax.random.normal(key, (3, 3)))
-    return jnp.asarray(even, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))).T
+    return jnp.asarray(even, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
 
 
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
