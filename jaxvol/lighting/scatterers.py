@@ -29,6 +29,7 @@ from .template import (
     ScattererTemplate,
     photons_above,
     scatterer_templates,
+    settings,
     template_levels,
 )
 
@@ -140,7 +141,10 @@ class ScattererTemplates(Lighting):
         self.cutoff = None
         if is_traced(cutoff) or cutoff != 0:
             self.cutoff = number("cutoff", cutoff, above=0, below=1)
-        self.critical_angle = None if critical_angle is None else number("critical_angle", critical_angle)
+        self.critical_angle = None
+        if critical_angle is not None:
+            self.critical_angle = number("critical_angle", critical_angle, above=0, below=90.001)
+        packets, threshold, energy = settings(packets, threshold, energy)
         # True: fine enough for what scatters over several voxels
         self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
         self.given = given
@@ -265,7 +269,7 @@ class TemplateShading(Shading):
         for light in self.how.lights:
             if isinstance(light, ConstantLight):
                 r, g, b = (jnp.pi * radiance for radiance in light.radiance)
-                lights.append((None, jnp.full_like(found[0], jnp.inf), (r, g, b)))
+                lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
             elif isinstance(light, LocatedLight):
                 lights.append(tuple(light.at(sample.point)))
         whole = sum(found)
