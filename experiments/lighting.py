@@ -124,7 +124,7 @@ def noise(counts: Sequence[int], trials: int, seed: int) -> dict[str, Any]:
     rows = []
     for count in counts:
         # the others dark, so that one program does for any number of templates
-        some = jnp.where(jnp.arange(most)[:, None] < count, most / count, 0.0)
+        some = jnp.where(jnp.arange(most)[None, :, None] < count, most / count, 0.0)
         means = [face(replace(t, intensity=t.intensity * some), True).mean() for t in drawn]
         rows.append({"templates": count, "deviation": float(np.std(means, ddof=1) / np.mean(means))})
     chosen = face(drawn[0], False)

@@ -302,7 +302,7 @@ def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
     around, across = golden * np.arange(n), np.sqrt(1 - z**2)
     even = np.stack([across * np.cos(around), across * np.sin(around), z], axis=-1)
     q, r = jnp.linalg.qr(jax.random.normal(key, (3, 3)))
-    return jnp.asarray(even, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))).T
+    return jnp.asarray(even, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
 
 
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
