@@ -24,6 +24,17 @@ VESSELS = [
 """Contrast agent in 8-bit angiography: the vessels alone."""
 
 
+SKIN = [
+    (40, (0.10, 0.04, 0.03), 0.0),
+    (78, (0.85, 0.50, 0.35), 0.9),
+    (100, (0.75, 0.30, 0.22), 0.9),
+    (130, (0.90, 0.75, 0.60), 0.9),
+    (185, (1.00, 0.95, 0.85), 0.95),
+    (255, (1.00, 1.00, 1.00), 0.95),
+]
+"""The head phantom under opaque skin: all but air is next to opaque."""
+
+
 def head(folder: Path | None, size: int, resolution: int = 192) -> Scene:
     return seen_head(jv.phantom("head", resolution), size)
 
@@ -32,6 +43,14 @@ def seen_head(volume: jv.Volume, size: int) -> Scene:
     """The head phantom, however it was made."""
     camera = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.45)
     return Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
+
+
+def skin_head(size: int, resolution: int) -> Scene:
+    """The head phantom under skin that light may enter; steps of half a voxel."""
+    volume = jv.phantom("head", resolution)
+    transfer = jv.TransferFunction.from_points(SKIN, unit_distance=0.05)
+    camera = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(2)
+    return Scene(volume, transfer, camera, float(volume.spacing[0]) / 2)
 
 
 def engine(folder: Path, size: int) -> Scene:

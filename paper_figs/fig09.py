@@ -4,19 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jaxvol as jv
+from experiments.scenes import SKIN
 
 from .common import View, comparison, cropped, options
-
-
-SKIN = [
-    (40, (0.10, 0.04, 0.03), 0.0),
-    (78, (0.85, 0.50, 0.35), 0.9),
-    (100, (0.75, 0.30, 0.22), 0.9),
-    (130, (0.90, 0.75, 0.60), 0.9),
-    (185, (1.00, 0.95, 0.85), 0.95),
-    (255, (1.00, 1.00, 1.00), 0.95),
-]
-"""All but air is next to opaque."""
 
 
 def phantom(resolution: int, size: int) -> View:

@@ -14,6 +14,7 @@ from experiments import (
     growth,
     jitter_accuracy,
     kisti,
+    lighting,
     mean_free_path,
     minimum_distance,
     overhead,
@@ -24,7 +25,7 @@ from experiments import (
 )
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.scenes import PHANTOM
-from paper_figs import chae_fig5, common, kisti_table, table1
+from paper_figs import chae_fig5, common, kisti_table, lee_tables, table1
 
 
 ROOT = Path(__file__).parent.parent
@@ -39,6 +40,7 @@ MEASURES = {
         growth,
         jitter_accuracy,
         kisti,
+        lighting,
         mean_free_path,
         minimum_distance,
         overhead,
@@ -72,7 +74,8 @@ def test_figure_is_drawn(name, tmp_path):
 
 def test_every_figure_that_is_told_of_is_there():
     told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
-    assert FIGURES == ["chae_fig6", "fig01", "fig09", "fig10", "fig11", "fig12", "fig13"]
+    lee = ["lee_fig1", "lee_fig4", "lee_fig6"]
+    assert ["chae_fig6", "fig01", "fig09", "fig10", "fig11", "fig12", "fig13", *lee] == FIGURES
     for name in FIGURES:
         assert f"output/{name}.png" in told
         assert (common.OUTPUT / f"{name}.png").stat().st_size < 300_000
@@ -141,6 +144,16 @@ def test_speed_tells_which_peers_there_are_and_an_error_beside_each_time(measure
 
 
 @pytest.mark.slow
+def test_light_costs_time_and_more_of_it_is_nearer_to_many_templates(measured):
+    result = record.read(measured / "lighting.json")["result"]
+    few, whole = result["frames"][lighting.PHOTONS]
+    (blended,) = result["frames"][lighting.BLENDED]
+    assert blended["rmse"] < whole["rmse"] < few["rmse"]
+    forms = result["energy"]["forms"]
+    assert max(forms["conserving"]) <= 1 < max(forms["printed, without its factors of flight"])
+
+
+@pytest.mark.slow
 def test_fits_recover_what_was_hidden(measured):
     scenes = record.read(measured / "fit_transfer.json")["result"]["scenes"]
     for rows in scenes.values():
@@ -199,6 +212,11 @@ def test_table_1_is_told_from_the_record(measured, tmp_path):
 def test_the_table_in_the_readme_is_that_of_the_kept_record():
     told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     assert table1.table(record.read(record.RESULTS / "overhead.json")) in told
+
+
+def test_the_templates_in_the_readme_are_those_that_grow():
+    told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
+    assert lee_tables.table() in told
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..camera import Camera
 from ..checks import Arrayable, finite, finite_array
 from ..engine import Adjoint, render
-from ..lighting import Lighting
+from ..lighting.seam import Lighting
 from ..march import March
 from ..transfer import Transfer
 from ..volume import Volume
@@ -103,7 +103,8 @@ class _Group(eqx.Module):
     images: Float[Array, "views height width channels"]
 
 
-Scene = Callable[[Any, Camera], tuple]
+Made = tuple[Volume, Transfer, Camera, March] | tuple[Volume, Transfer, Camera, March, Lighting | None]
+Scene = Callable[[Any, Camera], Made]
 
 
 class ImageResidual(Residual):
@@ -112,8 +113,8 @@ class ImageResidual(Residual):
     **Arguments:**
 
     - `scene`: `scene(parameters, camera)` returns what is to be rendered, `(volume, transfer, camera,
-      march)` or `(volume, transfer, camera, march, lighting)`, from the parameters and a view's camera. The
-      solver decides by which adjoint it is differentiated.
+      march)` and, if it is lit, `lighting` as a fifth, from the parameters and a view's camera. The solver
+      decides by which adjoint it is differentiated.
     - `views`: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
       `background`, or (height, width, 4), as `Rendering.rgba`.
     - `background`: linear RGB behind the volume, for images of three channels.
@@ -175,10 +176,9 @@ class ImageResidual(Residual):
 
         def of(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
-            volume, transfer, camera, march, *lit = self._scene(parameters, group, view)
+            volume, transfer, camera, march, lighting = self._scene(parameters, group, view)
             if pieces > 1:
                 camera = _rows_of(camera, first, rows)
-            lighting = lit[0] if lit else None
             rendering = render(volume, transfer, camera, march, lighting=lighting, adjoint=adjoint)
             seen = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
@@ -190,10 +190,12 @@ class ImageResidual(Residual):
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return Tiles(of, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
 
-    def _scene(self, parameters: PyTree, group: _Group, view: Int[Array, ""]) -> tuple:
+    def _scene(
+        self, parameters: PyTree, group: _Group, view: Int[Array, ""]
+    ) -> tuple[Volume, Transfer, Camera, March, Lighting | None]:
         of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
         made = self.scene(parameters, of_view)
-        kinds = Volume, Transfer, Camera, March, Lighting
+        kinds = Volume, Transfer, Camera, March, Lighting | None
         if not (
             isinstance(made, tuple)
             and len(made) in (4, 5)
@@ -203,13 +205,14 @@ class ImageResidual(Residual):
                 [type(thing).__name__ for thing in made] if isinstance(made, tuple) else type(made).__name__
             )
             raise ValueError(
-                f"scene must return (volume, transfer, camera, march) or these and a lighting; got {found}."
+                "scene must return (volume, transfer, camera, march), and lighting if it is lit; "
+                f"got {found}."
             )
         if made[2].size != of_view.size:
             raise ValueError(
                 f"scene must return a camera of its view's size {of_view.size}; got {made[2].size}."
             )
-        return made
+        return (*made, None) if len(made) == 4 else made
 
 
 def _pairs(views: Any) -> list[tuple[Any, Any]]:

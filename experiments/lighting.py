@@ -1,0 +1,230 @@
+"""What do photons, templates, occlusion and baking cost, and what do they buy?
+
+The head phantom under opaque skin, lit from the side, by so many photons of a template, by so many templates
+blended, under either occlusion, and by light that was baked before. Each frame is rendered in turn with that
+of the unlit head, and told as the median of their ratios; beside it stands the image's RMSE against one
+that blends many templates under soft occlusion. Lee, Kwon and Shin report 20-24 frames per second lit and
+42-56 unlit, which is 2.2 times the time; the goal for baked light is 1.2 times.
+
+Beside that: the noise of a flat face, seen and lit obliquely, against the number of templates blended; and
+the energy of a template against the material's opacity, for the form that conserves it and the printed one.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
+
+import jaxvol as jv
+from jaxvol.lighting import (
+    ConstantLight,
+    DirectionalLight,
+    Lighting,
+    ScattererTemplate,
+    ScattererTemplates,
+    scatterer_templates,
+)
+from jaxvol.metrics import rmse
+
+from . import common, record, timing
+from .common import plt
+from .scenes import Scene, skin_head
+
+
+GOALS = {"templates": 2.2, "baked": 1.2}
+FLESH = jv.Material(0.5, 0.05, 1.4)
+LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (4.0, 4.0, 4.0)), ConstantLight((0.1, 0.1, 0.1))
+UNLIT = "unlit"
+PHOTONS, BLENDED, BAKED, HARD = "photons", "templates blended", "baked", "hard occlusion"
+ENERGIES: dict[str, dict[str, Any]] = {
+    "conserving": {"energy": "conserving"},
+    "printed": {"energy": "printed"},
+    "printed, without its factors of flight": {"energy": "printed", "flights": False},
+}
+NOTE = "Measured on a machine with other work on it: ratios of times are indicative."
+
+
+def march(scene: Scene, seed: int = 0) -> jv.March:
+    """What makes a picture of opaque skin smooth, and takes few samples behind it."""
+    how = jv.EmptySpaceJitter(seed), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination()
+    return jv.March(scene.step, how)
+
+
+def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int]) -> dict[str, list[Any]]:
+    """Lightings by what is varied in them, each with its number."""
+    of = partial(ScattererTemplates, FLESH, LIGHTS)
+    whole = of().photons
+    return {
+        PHOTONS: [(n, of(photons=n)) for n in (*(n for n in photons if n < whole), whole)],
+        BLENDED: [(n, of(templates=n, blend=True)) for n in blended],
+        HARD: [(whole, of(occlusion="hard"))],
+        BAKED: [(n, of(baked=n)) for n in baked],
+    }
+
+
+def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
+    return jv.render(scene.volume, scene.transfer, scene.camera, march(scene, seed), lighting=lighting)
+
+
+def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetitions: int, seed: int) -> Any:
+    """Time and error of each lighting, one after the other: a volume keeps the light of one baking alone."""
+    truth = frame(scene, ScattererTemplates(FLESH, LIGHTS, templates=many, blend=True), seed).rgba
+    found: dict[str, list[dict[str, Any]]] = {}
+    for kind, each in lightings.items():
+        found[kind] = []
+        for number, lighting in each:
+            programs = {UNLIT: None, kind: lighting}
+            seconds = timing.interleaved(
+                {n: lambda how=how: frame(scene, how, seed).rgba for n, how in programs.items()}, repetitions
+            )
+            error = rmse(frame(scene, lighting, seed).rgba, truth)
+            row = {"number": number, **common.row(seconds[kind], seconds[UNLIT], error)}
+            if kind == BAKED:
+                row["seconds to bake"] = round(baking(scene, lighting, seed) - row["seconds"], 4)
+            found[kind].append(row)
+            print(
+                f"{kind:18} {number:4} {row['seconds']:8.3f} s  {row['ratio']['median']:7.2f} x unlit"
+                f"  RMSE {error:.5f}",
+                flush=True,
+            )
+    return found
+
+
+def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
+    """Seconds of a frame whose light must be baked: another one than before, of the same program."""
+    dimmed = eqx.tree_at(lambda how: how.lights[0].irradiance, lighting, replace_fn=lambda e: e * 0.99)
+    start = time.perf_counter()
+    jax.block_until_ready(frame(scene, dimmed, seed).rgba)
+    return time.perf_counter() - start
+
+
+def noise(counts: Sequence[int], trials: int, seed: int) -> dict[str, Any]:
+    """How brightness varies from one set of templates to another, over its mean, on the face of a cube."""
+    volume = jv.phantom("constant", 16)
+    transfer = jv.TransferFunction([0.0, 1.0], [[0.7, 0.5, 0.4]] * 2, [40.0, 40.0])
+    step = 0.01
+    size = 16
+    camera = jv.Camera.looking_at(volume, (0, -1, 0), size=(size, size)).zoom(6)
+    most = max(counts)
+    ways = jv.March(step, (jv.AlphaCorrection(), jv.EarlyTermination()))
+
+    def face(templates: ScattererTemplate, blend: bool) -> np.ndarray:
+        lighting = ScattererTemplates(FLESH, LIGHTS, given=templates, blend=blend)
+        return np.asarray(jv.render(volume, transfer, camera, ways, lighting=lighting).rgba[..., 0])
+
+    drawn = [scatterer_templates(FLESH, seed + trial, count=most) for trial in range(trials)]
+    rows = []
+    for count in counts:
+        # the others dark, so that one program does for any number of templates
+        some = jnp.where(jnp.arange(most)[None, :, None] < count, most / count, 0.0)
+        means = [face(replace(t, intensity=t.intensity * some), True).mean() for t in drawn]
+        rows.append({"templates": count, "deviation": float(np.std(means, ddof=1) / np.mean(means))})
+    chosen = face(drawn[0], False)
+    return {"blended": rows, "one for each pixel": float(chosen.std() / chosen.mean()), "trials": trials}
+
+
+def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str, list[float]]:
+    """Mean energy of templates, for each form and opacity."""
+    found: dict[str, list[float]] = {}
+    for name, how in ENERGIES.items():
+        several = (scatterer_templates(jv.Material(a, 1.0, 1.4), seed, count=count, **how) for a in opacities)
+        found[name] = [float(t.intensity.sum(-1).mean()) for t in several]
+    return found
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    figure, (cost, spread, energy) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    for (kind, rows), style in zip(result["frames"].items(), ("C0o-", "C1s-", "C3D", "C2^-"), strict=True):
+        error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
+        cost.plot(error, ratio, style, label=kind)
+        for row, x, y in zip(rows, error, ratio, strict=True):
+            cost.annotate(str(row["number"]), (x, y), (4, 4), textcoords="offset points", fontsize=7)
+    for name, goal in GOALS.items():
+        cost.axhline(goal, color="k", linewidth=0.8, linestyle=":")
+        cost.text(
+            1,
+            goal,
+            f"goal, {name}",
+            fontsize=7,
+            ha="right",
+            va="bottom",
+            transform=cost.get_yaxis_transform(),
+        )
+    cost.set(xscale="log", yscale="log", xlabel="RMSE against many templates blended", ylabel="time / unlit")
+    cost.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+    cost.xaxis.set_major_formatter("{x:g}")
+    cost.xaxis.set_minor_formatter(NullFormatter())
+    cost.legend(fontsize=8)
+
+    rows = result["noise"]["blended"]
+    count, deviation = [row["templates"] for row in rows], [row["deviation"] for row in rows]
+    spread.plot(count, deviation, "C1s-", label="blended, between sets")
+    spread.plot(count, deviation[0] / np.sqrt(count), "k:", label="1 / √templates")
+    spread.axhline(
+        result["noise"]["one for each pixel"], color="C0", label="one for each pixel, between pixels"
+    )
+    spread.set_xscale("log", base=2)
+    spread.set(yscale="log", xlabel="templates", ylabel="deviation / mean, on a flat face")
+    spread.yaxis.set_major_formatter("{x:g}")
+    spread.yaxis.set_minor_formatter("{x:g}")
+    spread.legend(fontsize=8)
+
+    alpha = np.array(result["energy"]["opacity"])
+    for (name, found), style in zip(result["energy"]["forms"].items(), ("C0o-", "C3s-", "C1^-"), strict=True):
+        energy.plot(alpha, found, style, label=name)
+    energy.plot(alpha, alpha / (1 - alpha), "k:", label="α / (1 - α)")
+    energy.axhline(1, color="k", linewidth=0.8)
+    energy.set(yscale="log", xlabel="opacity α", ylabel="energy of a template")
+    energy.legend(fontsize=8)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=5)
+    parser.add_argument("--size", type=int, default=256, help="pixels along a side")
+    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    photons, blended, baked, many, trials = (1, 4, 8, 16), (1, 2, 4, 8), (32, 64, 128), 32, 24
+    opacities = [round(0.1 * i, 1) for i in range(1, 10)]
+    if chosen.quick:
+        chosen.size, chosen.resolution, chosen.repetitions = 24, 24, 2
+        photons, blended, baked, many, trials, opacities = (2,), (2,), (16,), 4, 3, [0.3, 0.7]
+
+    scene = skin_head(chosen.size, chosen.resolution)
+    result = {
+        "note": NOTE,
+        "goals": GOALS,
+        "image": [chosen.size, chosen.size],
+        "resolution": chosen.resolution,
+        "repetitions": chosen.repetitions,
+        "templates blended in the reference": many,
+        "frames": measure(scene, variants(photons, blended, baked), many, chosen.repetitions, chosen.seed),
+        "noise": noise(blended, trials, chosen.seed),
+        "energy": {"opacity": opacities, "forms": energies(opacities, chosen.seed)},
+    }
+    path = record.write(
+        chosen.output / "lighting.json",
+        "What do photons, templates, occlusion and baking cost, and what do they buy?",
+        result,
+        seed=chosen.seed,
+        command=["experiments.lighting", *given],
+    )
+    draw(result, path.with_suffix(".png"))
+    for row in result["noise"]["blended"]:
+        print(f"{row['templates']} templates blended: {row['deviation']:.2%} between sets")
+    print(f"one template for each pixel: {result['noise']['one for each pixel']:.2%} between pixels")
+    for name, found in result["energy"]["forms"].items():
+        print(f"energy, {name}: " + ", ".join(f"{a} {e:.3f}" for a, e in zip(opacities, found, strict=True)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Lee, Kwon and Shin, Fig. 4: the exceptional case. An ear before a head that keeps all light from it.
+
+The light comes from behind the head. Photons of a template reach through the thin ear into the gap before
+the head, where nothing hides them, so that the ear shines; tested further on as well, they are hidden.
+Under each image stands the mean brightness of the ear's pixels.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import jaxvol as jv
+from experiments.lighting import march
+from experiments.scenes import Scene
+from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
+
+from .common import BLACK, Page, options
+
+
+GAP, THICK, RADIUS = 0.15, 0.06, 0.75
+"""Between ear and head, of the ear, of the head; the cube is 2 wide."""
+FLESH = jv.Material(0.5, 0.045, 1.4)
+LIGHTS = DirectionalLight((0.0, -1.0, 0.0), (4.0, 4.0, 4.0)), ConstantLight((0.03, 0.03, 0.03))
+HOW: dict[str, Any] = {"occlusion": "hard", "templates": 8, "blend": True, "packets": 8, "cutoff": 0.001}
+REACHES: dict[str, tuple[float, ...]] = {"photons alone": (), "tested at 2, 4, 8 times": (2, 4, 8)}
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def volume(resolution: int, *, head: bool) -> jv.Volume:
+    """An ear at the side of -y of a head, or without one."""
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
+    side = -0.35  # of the head, towards the ear
+    ear = np.maximum(np.hypot(x, 0.7 * z) - 0.22, abs(y - side + GAP + THICK / 2) - THICK / 2)
+    skull = np.sqrt(x**2 + (y - side - RADIUS) ** 2 + z**2) - RADIUS
+    inside = np.minimum(ear, skull) if head else ear
+    spacing = 2 / (resolution - 1)
+    return jv.Volume(np.clip(0.5 - inside / spacing / 2, 0, 1), (spacing,) * 3, (-1.0,) * 3)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    chosen = options(argv, str(__doc__), resolution=96)
+    whole, alone = (volume(chosen.resolution, head=head) for head in (True, False))
+    points = [(0.1, (0.8, 0.5, 0.38), 0.0), (0.9, (0.8, 0.5, 0.38), 0.9)]
+    transfer = jv.TransferFunction.from_points(points, unit_distance=0.05)
+    camera = jv.Camera.looking_at(whole, (-0.35, -1, 0.2), size=(chosen.size,) * 2).zoom(1.9)
+    scene = Scene(whole, transfer, camera, float(whole.spacing[0]) / 2)
+    ear = np.asarray(jv.render(alone, transfer, camera, march(scene)).rgba[..., 3] > 0.9)
+
+    page = Page(
+        1 + len(REACHES), 1, chosen.size, "Lee, Kwon and Shin, Fig. 4: an ear, light from behind the head"
+    )
+    for column, (title, reach) in enumerate({"no light": None, **REACHES}.items()):
+        lighting = None if reach is None else ScattererTemplates(FLESH, LIGHTS, reach=reach, **HOW)
+        rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
+        image = np.asarray(rendering.image(BLACK))
+        told = f"brightness of the ear {(image[ear] @ LUMINANCE).mean():.3f}"
+        page.draw(0, column, image, told, title)
+        print(f"lee_fig4 {title}: {told}")
+    page.save(chosen.output / "lee_fig4.png")
+
+
+if __name__ == "__main__":
+    main()
