@@ -91,7 +91,7 @@ def reached(rows: list[dict[str, Any]]) -> float:
 
 
 def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
     for (name, rows), color in zip(result.items(), ("C0", "C3"), strict=True):
         label = f"{name}: {reached(rows):.0%} of starts lead back"
         for number, row in enumerate(rows):
@@ -99,8 +99,8 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
             left.semilogy(range(1, len(losses) + 1), losses, color=color, alpha=0.5, label=label)
         degrees, shift = ([row[key] for row in rows] for key in GOALS)
         right.loglog(degrees, shift, "o", color=color, alpha=0.6)
-    left.set(xlabel="step", ylabel="half the mean square of the (blurred) difference")
-    left.legend(fontsize=8)
+    left.set(xlabel="step, those of all stages together", ylabel="loss (of blurred images, if blurred)")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     right.plot(ANGLE, SHIFT, "k*", markersize=10)
     right.axvline(GOALS["degrees"], color="k", linestyle=":", linewidth=0.8)
     right.axhline(GOALS["shift"], color="k", linestyle=":", linewidth=0.8)

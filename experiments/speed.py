@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol import engine
+from jaxvol.compiled import OPTIONS
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks, Sums
 
@@ -115,7 +115,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
         return np.column_stack([gradient.colors, gradient.extinction])
 
     # a program of its own, as the image is
-    both_of = jax.jit(jax.value_and_grad(loss), compiler_options=engine.OPTIONS)
+    both_of = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
     ours = entries(march)
     programs: dict[str, Any] = {
         "image": lambda: common.frame(scene, march),

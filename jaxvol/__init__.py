@@ -28,7 +28,12 @@ from .formats import load as load
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .leaping import SpaceLeaping as SpaceLeaping
-from .lighting import Material as Material, scatterer_template as scatterer_template
+from .lighting import (
+    Material as Material,
+    PathTraced as PathTraced,
+    path_trace as path_trace,
+    scatterer_template as scatterer_template,
+)
 from .march import March as March, Transform as Transform
 from .phantoms import (
     colon_path as colon_path,

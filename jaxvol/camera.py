@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
 from .checks import Arrayable, finite_array, number, require
 from .triple import Triple, along, apart
@@ -42,6 +42,9 @@ class Camera(eqx.Module):
     view_angle: Float[Array, ""]
     parallel_scale: Float[Array, ""] | None
     window: Float[Array, "4"]
+    corner: Int[Array, "2"]
+    """Column and row of the first pixel in the image that this one was cropped from: what is random along a
+    ray is keyed by its pixel there."""
     size: tuple[int, int] = eqx.field(static=True)
 
     def __init__(
@@ -78,6 +81,8 @@ class Camera(eqx.Module):
         aspect = width / height
         window = (-aspect, aspect, -1.0, 1.0) if window is None else window
         self.window = finite_array("window", window, (4,))
+        with jax.ensure_compile_time_eval():
+            self.corner = jnp.zeros(2, jnp.int32)
 
     @classmethod
     def looking_at(
@@ -101,8 +106,8 @@ class Camera(eqx.Module):
         return cls(position, center, view_up, view_angle, size=size)
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """The camera that renders just this rectangle of the image: the same pixels, in an image of
-        their own. `left` and `top` are the column and row of its first pixel.
+        """The camera that renders just this rectangle of the image: the same pixels, jitter included, in an
+        image of their own. `left` and `top` are the column and row of its first pixel.
 
         **Raises:** `ValueError` for a rectangle that is empty or leaves the image.
         """
@@ -115,7 +120,7 @@ class Camera(eqx.Module):
             )
         x = [self._column(edge) for edge in (left, left + width)]
         y = [self._row(edge) for edge in (top + height, top)]
-        return self._showing(jnp.stack([*x, *y]), (width, height))
+        return self._showing(jnp.stack([*x, *y]), (width, height), self.corner + jnp.asarray([left, top]))
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
         """The camera that shows 1/`factor` of the image in an image of the same size, around
@@ -126,8 +131,8 @@ class Camera(eqx.Module):
         factor = number("zoom factor", factor, above=0)
         return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
-    def ray(self, column: Int[Array, ""], row: Int[Array, ""]) -> tuple[Triple, Triple]:
-        """Origin and unit direction of one pixel's ray."""
+    def ray(self, column: Num[Array, ""], row: Num[Array, ""]) -> tuple[Triple, Triple]:
+        """Origin and unit direction of one pixel's ray; between whole numbers, of a ray between pixels'."""
         dtype = self.position.dtype
         x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)
         right, up, forward = (apart(axis) for axis in self._axes())
@@ -148,8 +153,10 @@ class Camera(eqx.Module):
         origin, direction = jax.vmap(over_row, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
         return jnp.stack(origin, axis=-1), jnp.stack(direction, axis=-1)
 
-    def _showing(self, window: Float[Array, "4"], size: tuple[int, int]) -> "Camera":
-        return Camera(
+    def _showing(
+        self, window: Float[Array, "4"], size: tuple[int, int], corner: Int[Array, "2"] | None = None
+    ) -> "Camera":
+        shown = Camera(
             self.position,
             self.focal_point,
             self.view_up,
@@ -158,6 +165,7 @@ class Camera(eqx.Module):
             parallel_scale=self.parallel_scale,
             window=window,
         )
+        return shown if corner is None else eqx.tree_at(lambda camera: camera.corner, shown, corner)
 
     def _axes(self) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
         forward = self.focal_point - self.position

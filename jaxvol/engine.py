@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from .camera import Camera
-from .checks import Arrayable, finite, is_traced, require
+from .checks import Arrayable, finite, require
+from .compiled import compiled
 from .leaping import FirstHit
 from .lighting.seam import Lighting, Surroundings, classification
 from .locate import Ray
@@ -38,14 +39,6 @@ WAVE = 4096
 
 DIRECT_WAVE = 64
 """Beams in a wave of `"direct"`, which keeps all its states to be differentiated."""
-
-OPTIONS = {
-    # 16 lanes at once where the processor has them: XLA prefers 8
-    "xla_cpu_prefer_vector_width": 512,
-    # kernels one after the other, each on all threads, rather than several on one thread each
-    "xla_cpu_enable_concurrency_optimized_scheduler": False,
-}
-"""How XLA compiles: 20 % faster on CPU, and of no meaning elsewhere."""
 
 
 def render(
@@ -151,15 +144,7 @@ class _How(eqx.Module):
 Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
 
 
-def _compiled(function: Callable[..., Rendering]) -> Callable[..., Rendering]:
-    """The function under jit, compiled with `OPTIONS` where it is a program of its own."""
-    options: Any = {"compiler_options": OPTIONS}
-    inner, alone = eqx.filter_jit(function), eqx.filter_jit(function, **options)
-    # a program within another one, or within a transformation, cannot have options of its own
-    return lambda *args: (inner if is_traced(args, jnp.zeros(())) else alone)(*args)
-
-
-@_compiled
+@compiled
 def _render(scene: Scene, how: _How, known: Known) -> Rendering:
     return _replayed(scene, known) if how.adjoint == "replay" else _image(scene, how, known)
 

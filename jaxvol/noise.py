@@ -30,11 +30,33 @@ def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""
     return unit(a), unit(b), unit(c)
 
 
+def hashed_uniforms_4(
+    a: UInt32[Array, "..."], b: UInt32[Array, "..."], c: UInt32[Array, "..."], d: UInt32[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Four float32 numbers in [0, 1), independent of each other and from key to key of four words.
+
+    Source: pcg4d of Jarzynski and Olano, as above.
+    """
+    a, b, c, d = (key * np.uint32(1664525) + np.uint32(1013904223) for key in (a, b, c, d))
+    a, b, c, d = _stir_4(a, b, c, d)
+    a, b, c, d = (word ^ (word >> np.uint32(16)) for word in (a, b, c, d))
+    a, b, c, d = ((word >> np.uint32(8)).astype(jnp.float32) * (2.0**-24) for word in _stir_4(a, b, c, d))
+    return a, b, c, d
+
+
 def _stir(a, b, c):
     a = a + b * c
     b = b + c * a
     c = c + a * b
     return a, b, c
+
+
+def _stir_4(a, b, c, d):
+    a = a + b * d
+    b = b + c * a
+    c = c + a * b
+    d = d + b * c
+    return a, b, c, d
 
 
 @cache

@@ -160,7 +160,10 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
 def end(ray: Ray, at: Progress) -> Rendering:
     """What the ray has seen."""
     seen = at.opacity > 0
-    depth = ray.t_in + at.moment / jnp.where(seen, at.opacity, 1)
+    # Of moment and opacity as parts of the opacity, which is so divided by 1: the derivative of a quotient
+    # divides by the square, and that of the opacity of a veil is 0 in float32.
+    whole = jax.lax.stop_gradient(jnp.where(seen, at.opacity, 1))
+    depth = ray.t_in + (at.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
     return Rendering(
         rgba=jnp.stack([*at.color, at.opacity]),
         depth=jnp.where(seen, depth, jnp.inf),

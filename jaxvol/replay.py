@@ -190,10 +190,13 @@ class Replay(Follower):
 
 def _slopes(known: Weighed, worth: list[Scalar], whole: Scalar, front: Scalar) -> tuple[Scalar, list[Scalar]]:
     """What the samples so far are worth, and how the loss changes with each one's optical depth."""
+    # With no more than this left, what lies behind is lost in the rounding of the sums, which an opaque
+    # sample's extinction would blow up.
+    nothing = 2 * float(jnp.finfo(whole.dtype).eps)
     slopes: list[list[Scalar]] = [[] for _ in worth]
     for k in range(CELLS):
         for i, value in enumerate(worth):
-            front = front + known.weight[i][k] * value[k]
-            slope = (1 - known.behind[i][k]) * value[k] - (whole - front)
-            slopes[i].append(jnp.where(known.finished[i][k], 0, slope))
+            front, left = front + known.weight[i][k] * value[k], 1 - known.behind[i][k]
+            slope = left * value[k] - (whole - front)
+            slopes[i].append(jnp.where(known.finished[i][k] | (left <= nothing), 0, slope))
     return front, [jnp.stack(each) for each in slopes]

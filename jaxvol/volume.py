@@ -134,7 +134,7 @@ class Volume(eqx.Module):
         for x, y, z in itertools.product((0, 1), repeat=3):
             node = _fetch(self.labels, ((i + x) * ny + j + y) * nz + k + z)
             sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
-            share = share + math.prod(sides) * (node == label)
+            share = share + math.prod(sides) * (node == label).astype(share.dtype)
         return share
 
     def _cube(self, coordinate: Triple) -> tuple[Cube, Triple]:

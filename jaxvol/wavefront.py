@@ -24,9 +24,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .beams import Box
+from .compiled import in_memory
 from .locate import Ray
 from .march import Cell, March, Survey
-from .memory import in_memory
 from .occupancy import Occupancy
 from .reference import Progress, begin, blend, front, move, opacity, pieces
 from .transfer import Classification, Measured

@@ -90,7 +90,8 @@ class _OfPixels(Waves):
         column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
         width, height = self.size
         origin, direction = each_ray(source.ray)(column, row)
-        return entering(space, origin, direction, (column, row), (column < width) & (row < height))
+        pixel = column + source.corner[0], row + source.corner[1]
+        return entering(space, origin, direction, pixel, (column < width) & (row < height))
 
     def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)

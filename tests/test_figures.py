@@ -10,14 +10,18 @@ from skimage.io import imread
 from experiments import (
     fit_pose,
     fit_transfer,
+    gradient_errors,
     growth,
     jitter_accuracy,
     kisti,
     lighting,
+    mean_free_path,
     minimum_distance,
     overhead,
+    path_traced,
     record,
     speed,
+    tomography,
 )
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.scenes import PHANTOM
@@ -32,13 +36,17 @@ MEASURES = {
     for module in (
         fit_pose,
         fit_transfer,
+        gradient_errors,
         growth,
         jitter_accuracy,
         kisti,
         lighting,
+        mean_free_path,
         minimum_distance,
         overhead,
+        path_traced,
         speed,
+        tomography,
     )
 }
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
@@ -159,6 +167,25 @@ def test_fits_recover_what_was_hidden(measured):
     # on a volume and an image as coarse as these, not every start leads back
     reached = record.read(measured / "fit_pose.json")["result"]["reached"]
     assert reached["from coarse to fine"] >= max(0.5, reached["as they are"])
+
+
+@pytest.mark.slow
+def test_a_gradient_misses_jumps_at_the_exit_alone(measured):
+    rows = record.read(measured / "gradient_errors.json")["result"]["relative errors"]["left"]
+    plain, aligned = rows["ray casting"], rows["ray casting" + gradient_errors.CUT]
+    assert plain["position"][0] < 1e-6  # a short difference meets no jump
+    assert aligned["position"][-1] < 0.05 < 0.5 < plain["position"][-1]
+    assert plain["colours"][-1] < 1e-6
+
+
+@pytest.mark.slow
+def test_a_density_is_recovered_from_its_line_integrals(measured):
+    result = record.read(measured / "tomography.json")["result"]["photons"]
+    for rows in result.values():
+        errors = [row["rmse"] for row in rows[tomography.OURS]["all"]]
+        assert min(errors) < errors[0] / 4
+    clean = result["no noise"]
+    assert clean[tomography.OURS]["rmse"] < clean[tomography.FBP]["rmse"]
 
 
 @pytest.mark.slow

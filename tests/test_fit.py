@@ -284,7 +284,7 @@ BAD = {
     "scene": (lambda: jv.ImageResidual(3, VIEWS), "scene must be a function"),
     "scene's result": (
         lambda: jv.fit(jv.ImageResidual(lambda t, c: (HEAD, t, c), VIEWS), GREY),
-        r"scene must return \(volume, transfer, camera, march\), and lighting if it is lit; got \['Volume'",
+        r"scene must return \(volume, transfer, camera, march\) or these and a lighting; got \['Volume'",
     ),
     "scene's camera": (
         lambda: jv.fit(jv.ImageResidual(lambda t, c: seen(t, c.crop(0, 0, 2, 2)), VIEWS), GREY),

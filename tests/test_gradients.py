@@ -26,10 +26,19 @@ SETS = {
 FAST = {"leapt", "aligned"}
 """The other sets' programs are compiled by the slow run."""
 
-MOVED = ("position", "focal_point", "view_up", "view_angle", "window", "spacing", "origin", "step")
-"""What moves the samples, or the exit."""
+WAYS = {
+    "position": 0.04,
+    "focal_point": 0.04,
+    "view_up": 0.2,
+    "view_angle": 4.0,
+    "window": 0.1,
+    "spacing": 0.02,
+    "origin": 0.04,
+    "step": 0.01,
+}
+"""What moves the samples, or the exit, and by how much, so that many cross it."""
 
-JUMPS = {("plain", leaf) for leaf in MOVED}
+JUMPS = {("plain", leaf) for leaf in WAYS}
 """Where the gradient is wrong by nature: the image jumps whenever a sample crosses the exit."""
 
 
@@ -139,35 +148,36 @@ def test_float32_gradients_are_those_of_float64(name):
         np.testing.assert_allclose(single[leaf], exact, atol=1e-3 * np.abs(exact).max(), rtol=0, err_msg=leaf)
 
 
+def summed_and_true(name):
+    """How a loss changes along the way of each leaf in `WAYS`: by its gradients, summed up, and in truth."""
+    scene, background, loss = scene_of(name), jnp.zeros(3), loss_of("replay", depths=0.0)
+    volume = jv.Volume(jnp.full((6, 5, 7), 0.2), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1))
+    # all rays hit: those that graze an edge change too steeply to be summed up
+    scene = (volume, scene[1], scene[2].zoom(3), scene[3])
+    gradient = eqx.filter_jit(eqx.filter_grad(lambda scene: loss(scene, background)))
+    found = {}
+    for leaf, length in WAYS.items():
+        where = LEAVES[leaf]
+        way = jnp.full(where(scene).shape, length)
+
+        def at(part, where=where, way=way):
+            return eqx.tree_at(where, scene, where(scene) + part * way)
+
+        slopes = [jnp.vdot(where(gradient(at((i + 0.5) / 40))), way) for i in range(40)]
+        found[leaf] = float(np.mean(slopes)), float(loss(at(1.0), background) - loss(at(0.0), background))
+    return found
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("leaf", ["position", "step"])
-def test_gradients_that_are_wrong_by_nature_are(leaf):
+def test_gradients_that_are_wrong_by_nature_are():
     """Over a distance at which samples cross the exit, the image changes by more than its gradient says;
     and does not, once cells end at the exit."""
-
-    def off(name):
-        """How far the mean of many derivatives is from the difference that they add up to; and that one."""
-        scene, background = scene_of(name), jnp.zeros(3)
-        scene = (jv.Volume(jnp.ones((6, 5, 7)), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1)), *scene[1:])
-        loss, where = loss_of("forward", depths=0.0), LEAVES[leaf]  # a depth jumps where a ray first hits
-        direction = jnp.full(where(scene).shape, 0.04)
-        still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
-        tangent = eqx.tree_at(where, still, direction)
-
-        def at(part):
-            return eqx.tree_at(where, scene, where(scene) + part * direction)
-
-        slopes = [
-            eqx.filter_jvp(lambda s: loss(s, background), (at((i + 0.5) / 40),), (tangent,))[1]
-            for i in range(40)
-        ]
-        change = loss(at(1.0), background) - loss(at(0.0), background)
-        return abs(float(np.mean(slopes) - change)), abs(float(change))
-
-    assert ("plain", leaf) in JUMPS
-    wrong, change = off("plain")
-    assert wrong > 0.1 * change
-    assert off("aligned")[0] < 0.02 * change
+    found = {name: summed_and_true(name) for name in ("plain", "aligned")}
+    for leaf in WAYS:
+        change = abs(found["plain"][leaf][1])
+        for name, (told, true) in ((name, leaves[leaf]) for name, leaves in found.items()):
+            error = abs(told - true) / change
+            assert error > 0.5 if (name, leaf) in JUMPS else error < 0.02, (name, leaf)
 
 
 @pytest.mark.slow
@@ -251,6 +261,91 @@ def test_functions_by_label_match_central_differences(adjoint):
             else:
                 slope = jnp.vdot(where(eqx.filter_grad(loss)(functions)), along)
             np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-8)
+
+
+# the extremes
+
+BOX = (-2.0, -2.0, -2.0)
+"""Where a box of width 2 begins: it ends at 0, near which float32 resolves the thinnest cells."""
+
+RAYS = {
+    "along an axis": ((-3, -1, -1), (1, 0, 0)),
+    "oblique": ((-3, -2.7, -1.9), (0.8, 0.55, 0.3)),
+    "misses": ((-3, 5, -1), (1, 0, 0)),
+    "looks away": ((-3, -1, -1), (-1, 0, 0)),
+    "starts inside": ((-1, -1, -1), (0.6, 0.8, 0)),
+    "starts at the exit": ((0, -1, -1), (1, 0, 0)),
+    "in a face": ((-3, -2, -1.3), (1, 0, 0)),
+    "along an edge": ((-3, -2, -2), (1, 0, 0)),
+    "through two corners": ((-3, -3, -3), (1, 1, 1)),
+    "touches a corner": ((-3, -2, 1), (1, 0, -1)),
+    "leaves after 1e-7": ((-1e-7, -1, -1), (1, 0, 0)),
+}
+
+TABLE = np.linspace(0, 1, 8)
+RAMP = np.where(TABLE > 0.2, TABLE, 0)
+CLEAR, SPECK, NOISE = np.zeros((5, 5, 5)), np.zeros((5, 5, 5)), np.random.default_rng(0).random((5, 5, 5))
+SPECK[2, 2, 2] = 0.9
+
+EXTREMES = {
+    **{f"{e:g} everywhere": (NOISE, np.full(8, e), 0.3) for e in (0, 1e-20, 1e-6, 1, 1e6, 1e30)},
+    **{f"up to {e:g}": (NOISE, e * RAMP, 0.3) for e in (1, 1e6)},
+    "an opacity of 1": (NOISE, jv.transfer.extinction_of(np.round(TABLE), 1e-3), 0.3),
+    "nothing": (CLEAR, RAMP, 0.3),
+    "one voxel": (SPECK, RAMP, 0.3),
+    "one opaque voxel": (SPECK, 1e6 * RAMP, 0.3),
+    "values beyond the table": (3 * NOISE + 1, RAMP, 0.3),
+    "steps of 1e-7": (NOISE, np.ones(8), 1e-7),
+    "a step through everything": (NOISE, np.ones(8), 1e3),
+}
+"""Voxels, extinction, and step."""
+
+OF_RAYS = {
+    **{leaf: LEAVES[leaf] for leaf in ("data", "spacing", "origin", "colors", "extinction")},
+    "origins": lambda s: s[2],
+    "directions": lambda s: s[3],
+    "step": lambda s: s[4].step,
+}
+
+
+@pytest.mark.parametrize(
+    "name", [n if n == "leapt" else pytest.param(n, marks=pytest.mark.slow) for n in SETS]
+)
+def test_values_and_gradients_are_finite_and_agree_at_the_extremes(name):
+    quadrature, transforms = SETS[name]
+    origins, directions = (jnp.asarray(ends, jnp.float32) for ends in zip(*RAYS.values(), strict=True))
+    colors = np.random.default_rng(1).random((8, 3))
+
+    def loss_of(adjoint):
+        def loss(scene):
+            rendering = jv.render_rays(*scene, adjoint=adjoint)
+            depth = jnp.where(rendering.rgba[:, 3] > 0, rendering.depth, 0)
+            return jnp.sum(rendering.rgba**2) + 0.1 * jnp.sum(depth)
+
+        return loss
+
+    def pushed(scene, tangent):
+        return eqx.filter_jvp(loss_of("forward"), (scene,), (tangent,))
+
+    pulled, pushed = eqx.filter_jit(eqx.filter_value_and_grad(loss_of("replay"))), eqx.filter_jit(pushed)
+    for case, (data, extinction, step) in EXTREMES.items():
+        volume = jv.Volume(np.asarray(data, np.float32), (0.5, 0.5, 0.5), BOX)
+        march = jv.March(step, transforms, quadrature, max_samples=128)
+        scene = (volume, jv.TransferFunction(TABLE, colors, extinction), origins, directions, march)
+        value, gradient = pulled(scene)
+        assert np.isfinite(value), case
+        for leaf, where in OF_RAYS.items():
+            of_leaf, random = where(gradient), np.random.default_rng(2)
+            assert np.isfinite(of_leaf).all(), (case, leaf)
+            along = jnp.asarray(random.normal(size=of_leaf.shape), jnp.float32)
+            still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
+            again, slope = pushed(scene, eqx.tree_at(where, still, along))
+            np.testing.assert_allclose(again, value, rtol=1e-6, err_msg=case)
+            # steps of 1e-7 leave a depth few digits past its entry
+            largest = float(jnp.sum(jnp.abs(of_leaf * along)))
+            np.testing.assert_allclose(
+                slope, jnp.vdot(of_leaf, along), rtol=0, atol=1e-2 * largest + 1e-6, err_msg=f"{case}, {leaf}"
+            )
 
 
 def test_tables_pull_as_jax_does():

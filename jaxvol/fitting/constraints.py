@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..camera import Camera
+from ..lighting import Material
 from ..march import March
 from ..transfer import TransferFunction
 from ..volume import Volume
@@ -122,6 +123,10 @@ def _of_volume(volume: Volume) -> PyTree:
     return eqx.tree_at(lambda v: v.data, _fixed(volume), data)
 
 
+def _of_material(material: Material) -> PyTree:
+    return eqx.tree_at(lambda m: m.mean_free_path, _fixed(material), Positive(material.mean_free_path))
+
+
 def _fixed(node: Any) -> PyTree:
     return jax.tree.map(lambda _: Fixed(), node)
 
@@ -131,6 +136,7 @@ _USUAL: dict[type, Callable[[Any], PyTree]] = {
     Camera: Pose,
     Volume: _of_volume,
     March: _fixed,
+    Material: _of_material,
 }
 """How things are fitted unless one says otherwise."""
 

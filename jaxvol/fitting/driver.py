@@ -106,8 +106,8 @@ def fit(
     - `constraints`: a tree like the parameters, or the beginning of one, with a bijection at each end: None
       for what is usual, `Fixed()`, `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`. Usual
       are, for a transfer function, positive extinction, colours in [0, 1] and fixed values; for a
-      camera, its pose; for a volume, unconstrained data where they are float; a march stays fixed; any other
-      float array is unconstrained.
+      camera, its pose; for a volume, unconstrained data where they are float; for a material, a positive mean
+      free path, and all else fixed; a march stays fixed; any other float array is unconstrained.
     - `where`: the parts that are free, `where(parameters)` as for `equinox.tree_at`: all else stays
       fixed. `lambda transfer: transfer.extinction`, or a tuple of parts.
     - `rtol`, `atol`: a fit has converged when in a step neither the free numbers nor the residual change by
@@ -328,7 +328,8 @@ def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
 def _told(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     known = None
     if run.triangle is not None:
-        known = uncertainty(np.asarray(run.triangle), problem.residual.count(), problem.free, run.best)
+        residual, triangle = problem.residual, np.asarray(run.triangle)
+        known = uncertainty(triangle, residual.count(), problem.free, run.best, residual.scale())
         if known.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in known.undetermined[:6])
             warnings.warn(

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..camera import Camera
 from ..checks import Arrayable, finite, finite_array
 from ..engine import Adjoint, render
-from ..lighting.seam import Lighting
+from ..lighting import Lighting
 from ..march import March
 from ..transfer import Transfer
 from ..volume import Volume
@@ -54,6 +54,11 @@ class Residual(eqx.Module):
     @abstractmethod
     def count(self) -> int:
         """Entries of the whole."""
+
+    def scale(self) -> float:
+        """Norm of what is compared: a change of the residual within its rounding tells nothing. 0 where it is
+        not known."""
+        return 0.0
 
 
 class OwnResidual(Residual):
@@ -98,8 +103,7 @@ class _Group(eqx.Module):
     images: Float[Array, "views height width channels"]
 
 
-Made = tuple[Volume, Transfer, Camera, March] | tuple[Volume, Transfer, Camera, March, Lighting | None]
-Scene = Callable[[Any, Camera], Made]
+Scene = Callable[[Any, Camera], tuple]
 
 
 class ImageResidual(Residual):
@@ -108,8 +112,8 @@ class ImageResidual(Residual):
     **Arguments:**
 
     - `scene`: `scene(parameters, camera)` returns what is to be rendered, `(volume, transfer, camera,
-      march)` and, if it is lit, `lighting` as a fifth, from the parameters and a view's camera. The solver
-      decides by which adjoint it is differentiated.
+      march)` or `(volume, transfer, camera, march, lighting)`, from the parameters and a view's camera. The
+      solver decides by which adjoint it is differentiated.
     - `views`: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
       `background`, or (height, width, 4), as `Rendering.rgba`.
     - `background`: linear RGB behind the volume, for images of three channels.
@@ -117,8 +121,7 @@ class ImageResidual(Residual):
     The residual is divided by the square root of the number of its entries, so that the loss, half the
     sum of squares, is half the mean square error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
 
-    A Jacobian that is too large is made in tiles of whole rows of an image. What is random along a ray is
-    keyed by its pixel in the tile: with `Jitter`, an image in tiles is jittered otherwise than in one piece.
+    A Jacobian that is too large is made in tiles of whole rows of an image.
 
     **Raises:** `ValueError` for no views, an image of another size than its camera's, NaN or infinite
     pixels, and a scene that returns something else.
@@ -152,6 +155,10 @@ class ImageResidual(Residual):
     def count(self) -> int:
         return sum(group.images.size for group in self.groups)
 
+    def scale(self) -> float:
+        squares = sum(float(jnp.sum(group.images**2)) for group in self.groups)
+        return math.sqrt(squares / self.count())
+
     def tiles(self, most: int) -> list[Tiles]:
         return [self._tiles(group, most) for group in self.groups]
 
@@ -168,9 +175,10 @@ class ImageResidual(Residual):
 
         def of(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
-            volume, transfer, camera, march, lighting = self._scene(parameters, group, view)
+            volume, transfer, camera, march, *lit = self._scene(parameters, group, view)
             if pieces > 1:
                 camera = _rows_of(camera, first, rows)
+            lighting = lit[0] if lit else None
             rendering = render(volume, transfer, camera, march, lighting=lighting, adjoint=adjoint)
             seen = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
@@ -182,12 +190,10 @@ class ImageResidual(Residual):
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return Tiles(of, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
 
-    def _scene(
-        self, parameters: PyTree, group: _Group, view: Int[Array, ""]
-    ) -> tuple[Volume, Transfer, Camera, March, Lighting | None]:
+    def _scene(self, parameters: PyTree, group: _Group, view: Int[Array, ""]) -> tuple:
         of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
         made = self.scene(parameters, of_view)
-        kinds = Volume, Transfer, Camera, March, Lighting | None
+        kinds = Volume, Transfer, Camera, March, Lighting
         if not (
             isinstance(made, tuple)
             and len(made) in (4, 5)
@@ -197,14 +203,13 @@ class ImageResidual(Residual):
                 [type(thing).__name__ for thing in made] if isinstance(made, tuple) else type(made).__name__
             )
             raise ValueError(
-                "scene must return (volume, transfer, camera, march), and lighting if it is lit; "
-                f"got {found}."
+                f"scene must return (volume, transfer, camera, march) or these and a lighting; got {found}."
             )
         if made[2].size != of_view.size:
             raise ValueError(
                 f"scene must return a camera of its view's size {of_view.size}; got {made[2].size}."
             )
-        return (*made, None) if len(made) == 4 else made
+        return made
 
 
 def _pairs(views: Any) -> list[tuple[Any, Any]]:
@@ -244,7 +249,8 @@ def _rows_of(camera: Camera, first: Int[Array, ""], rows: int) -> Camera:
     width, height = camera.size
     edges = jnp.stack([first + rows, first]).astype(top.dtype) / height
     below, above = top - (top - bottom) * edges
-    return camera._showing(jnp.stack([left, right, below, above]), (width, rows))
+    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
+    return camera._showing(jnp.stack([left, right, below, above]), (width, rows), corner)
 
 
 class Problem(eqx.Module):

@@ -42,12 +42,13 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty(
-    triangle: Float[np.ndarray, "numbers numbers"], count: int, free: Free, at: tuple
+    triangle: Float[np.ndarray, "numbers numbers"], count: int, free: Free, at: tuple, scale: float = 0.0
 ) -> Uncertainty:
-    """Of parameters `free.forward(at)`, from the triangle R c; 0 ρ at them and the number of residuals.
+    """Of parameters `free.forward(at)`, from the triangle R c; 0 ρ at them, the number of residuals, and the
+    norm of what is compared.
 
-    A direction is undetermined if its singular value is below n ε times the largest one, with ε of the float
-    type: within rounding, nothing is known of it."""
+    A direction is undetermined if its singular value is below n ε times the largest one, or times that norm,
+    with ε of the float type: within rounding, nothing is known of it."""
     n = triangle.shape[0] - 1
     flat, unravel = ravel_pytree(at)
     bend = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
@@ -55,7 +56,7 @@ def uncertainty(
     # with as many parameters as residuals nothing is left to estimate the variance from
     variance = np.sum(factor[:, -1] ** 2) / (count - n) if count > n else np.inf
     _, singular, directions = np.linalg.svd(factor[:n, :n])
-    known = singular > n * np.finfo(triangle.dtype).eps * singular.max(initial=0)
+    known = singular > n * np.finfo(triangle.dtype).eps * singular.max(initial=scale)
     moves = bend @ directions.T  # what each direction does to the parameters
     spread = moves[:, known] / singular[known]
     covariance = (

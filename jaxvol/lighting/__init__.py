@@ -7,6 +7,8 @@ from .lights import (
     PointLight as PointLight,
 )
 from .materials import Material as Material, material as material
+from .path_traced import PathTraced as PathTraced
+from .path_tracing import path_trace as path_trace
 from .scatterers import ScattererTemplates as ScattererTemplates
 from .seam import Lighting as Lighting
 from .template import (

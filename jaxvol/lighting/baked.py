@@ -45,8 +45,8 @@ class BakedLighting(Lighting):
     def ratio(self) -> Float[Array, "nx ny nz 3"]:
         """The ratios at the nodes."""
         shifts = jnp.arange(3, dtype=jnp.uint32) * 10
-        steps = (self.words[:, None] >> shifts) & jnp.uint32(LEVELS)
-        return (steps * (self.highest / LEVELS)).reshape(*self.shape, 3)
+        steps = (self.words[:, None] >> shifts[None]) & jnp.uint32(LEVELS)
+        return (steps.astype(self.highest.dtype) * (self.highest / LEVELS)[None]).reshape(*self.shape, 3)
 
     def over(self, around: Surroundings) -> "BakedShading":
         return BakedShading(jax.lax.stop_gradient(self))
@@ -126,7 +126,7 @@ def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighti
     ratios = jnp.stack(chosen.over(chunk, (none, none, none)), axis=-1).reshape(nx, ny, nz, 3)
     ratios = _spread(ratios, seen.reshape(nx, ny, nz))
     highest = jnp.maximum(ratios.max((0, 1, 2)), 1e-6)
-    steps = jnp.round(ratios / highest * LEVELS).astype(jnp.uint32).reshape(-1, 3)
+    steps = jnp.round(ratios.reshape(-1, 3) / highest[None] * LEVELS).astype(jnp.uint32)
     words = steps[:, 0] | steps[:, 1] << 10 | steps[:, 2] << 20
     return BakedLighting(words, highest, (nx, ny, nz))
 

@@ -1,7 +1,7 @@
 """Where does light come from, and how much of it arrives? With Mitsuba's names and units."""
 
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -108,7 +108,7 @@ class ConstantLight(Light):
         self.radiance = _power("radiance", radiance)
 
 
-def lights_of(lights: Light | tuple[Light, ...] | list[Light]) -> tuple[Light, ...]:
+def lights_of(lights: Light | tuple[Light, ...] | Any) -> tuple[Light, ...]:
     """One or several lights as a tuple. **Raises** `ValueError` for none, and for what is no light."""
     several = (lights,) if isinstance(lights, Light) else lights
     if not isinstance(several, tuple | list) or not several:

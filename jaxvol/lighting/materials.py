@@ -1,7 +1,7 @@
 """What does a material do to light inside it, and where in a volume is it?"""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -124,7 +124,7 @@ def material(name: str, *, millimetre: float = 1.0, **where: Arrayable) -> Mater
     return Material(opacity, path * number("millimetre", millimetre, above=0), index, **where)
 
 
-def materials_of(materials: Material | Sequence[Material]) -> tuple[Material, ...]:
+def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
     """One or several materials as a tuple. **Raises** `ValueError` for none, and for what is no material."""
     several = (materials,) if isinstance(materials, Material) else tuple(materials)
     if not several:

@@ -29,6 +29,7 @@ from .template import (
     ScattererTemplate,
     photons_above,
     scatterer_templates,
+    settings,
     template_levels,
 )
 
@@ -69,8 +70,8 @@ class ScattererTemplates(Lighting):
       random for each pixel: less noise, at as many times the cost.
     - `photons`: of each template keep so many of the brightest, corrected for the energy left out. By default
       all.
-    - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, by the
-      trapezoidal rule over these places; materials meet in ramps, the lit side ends in one, and the image is
+    - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, were each
+      stretch of it like its far end; materials meet in ramps, the lit side ends in one, and the image is
       differentiable. `"hard"`: as published: a photon is hidden where anything is seen at one of these
       places. Its gradient with respect to λ, the light and the camera is wrong, since it does not see
       photons that become hidden, or change their material.
@@ -109,8 +110,8 @@ class ScattererTemplates(Lighting):
 
     def __init__(
         self,
-        materials: Material | Sequence[Material],
-        lights: Light | tuple[Light, ...],
+        materials: Material | Sequence[Any],
+        lights: Light | tuple[Light, ...] | Any,
         *,
         templates: int = 8,
         blend: bool = False,
@@ -140,7 +141,10 @@ class ScattererTemplates(Lighting):
         self.cutoff = None
         if is_traced(cutoff) or cutoff != 0:
             self.cutoff = number("cutoff", cutoff, above=0, below=1)
-        self.critical_angle = None if critical_angle is None else number("critical_angle", critical_angle)
+        self.critical_angle = None
+        if critical_angle is not None:
+            self.critical_angle = number("critical_angle", critical_angle, above=0, below=90.001)
+        packets, threshold, energy = settings(packets, threshold, energy)
         # True: fine enough for what scatters over several voxels
         self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
         self.given = given
@@ -215,7 +219,7 @@ def _memory(_: Array) -> dict:
 
 def _same(a: Any, b: Any) -> bool:
     """Whether two leaves are known to be equal: large ones, such as labels, only if they are one array."""
-    return a is b or (np.shape(a) == np.shape(b) and np.size(a) <= 2**16 and bool(np.all(a == b)))
+    return a is b or (np.size(a) <= 2**16 and np.array_equal(np.asarray(a), np.asarray(b)))
 
 
 @eqx.filter_jit
@@ -265,7 +269,7 @@ class TemplateShading(Shading):
         for light in self.how.lights:
             if isinstance(light, ConstantLight):
                 r, g, b = (jnp.pi * radiance for radiance in light.radiance)
-                lights.append((None, jnp.inf, (r, g, b)))
+                lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
             elif isinstance(light, LocatedLight):
                 lights.append(tuple(light.at(sample.point)))
         whole = sum(found)
@@ -330,11 +334,9 @@ class TemplateShading(Shading):
             for extinction in places:
                 hidden |= extinction > 0
             return (~hidden).astype(first.dtype)
-        length, depth = _norm(offset), jnp.zeros_like(first)
         pieces = np.diff([0.0, 1.0, *self.how.reach])
-        for piece, near, far in zip(pieces, [sample.extinction, *places], places, strict=False):
-            depth = depth + piece * (near + far) / 2
-        return jnp.exp(-depth * length)
+        depth = sum(piece * extinction for piece, extinction in zip(pieces, places, strict=True))
+        return jnp.exp(-depth * _norm(offset))
 
     def _lit_side(self, offset: Triple, toward: Triple | None, distance: Scalar) -> Scalar:
         """Whether a photon is nearer to the light than the sample is."""

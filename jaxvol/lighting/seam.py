@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from ..compiled import in_memory
 from ..locate import Space
-from ..memory import in_memory
 from ..transfer import Classification, Measured, Transfer
 from ..triple import Scalar, Triple
 from ..volume import Volume
@@ -59,8 +59,8 @@ class Surroundings(eqx.Module):
     transfer: Transfer
     space: Space
     live: Bool[Array, ""] | None = None
-    """True, which XLA must not know: see `memory`. None: no branches, out of which a volume could not tell
-    what it was asked for."""
+    """True, which XLA must not know: see `compiled.in_memory`. None: no branches, out of which a volume could
+    not tell what it was asked for."""
 
     def at(self, point: Triple) -> Place:
         """What is at a point."""

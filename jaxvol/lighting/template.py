@@ -84,7 +84,7 @@ def scatterer_template(
     *,
     packets: int = 4,
     threshold: float = 0.01,
-    energy: Energy = "conserving",
+    energy: Energy | Any = "conserving",
     flights: bool = True,
     critical_angle: float | Any | None = None,
     merge: float = 0.01,
@@ -122,12 +122,7 @@ def scatterer_template(
 
     **Raises:** `ValueError` for numbers out of range, and where `levels` are needed.
     """
-    packets, threshold = (
-        integer("packets", packets, 1),
-        float(number("threshold", threshold, above=0, below=1)),
-    )
-    if energy not in get_args(Energy):
-        raise ValueError(f"energy must be one of {', '.join(get_args(Energy))}; got {energy!r}.")
+    packets, threshold, energy = settings(packets, threshold, energy)
     if not flights and energy != "printed":
         raise ValueError(
             'flights=False belongs to energy="printed"; a conserving template has no such factors.'
@@ -150,8 +145,8 @@ def scatterer_templates(
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
     if how.get("levels") is None:
-        settings = {name: how[name] for name in ("packets", "threshold", "energy") if name in how}
-        how["levels"] = max(template_levels(each, **settings) for each in materials)
+        given = {name: how[name] for name in ("packets", "threshold", "energy") if name in how}
+        how["levels"] = max(template_levels(each, **given) for each in materials)
     optics = jax.tree.map(lambda *each: jnp.stack(each), *(each.optics for each in materials))
 
     def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
@@ -160,6 +155,17 @@ def scatterer_templates(
 
     several = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)), in_axes=(0, 0, None))
     return several(optics, jnp.arange(len(materials)), jnp.arange(count))
+
+
+def settings(packets: Any, threshold: Any, energy: Any) -> tuple[int, float, Energy]:
+    """These, of the right kinds. **Raises** `ValueError` otherwise."""
+    if energy not in get_args(Energy):
+        raise ValueError(f"energy must be one of {', '.join(get_args(Energy))}; got {energy!r}.")
+    return (
+        integer("packets", packets, 1),
+        float(number("threshold", threshold, above=0, below=1)),
+        energy,
+    )
 
 
 def template_levels(

@@ -1,0 +1,232 @@
+"""Which gradients are wrong, under which transform, with cells cut at the exit and without?
+
+A derivative tells how an image changes as long as no sample crosses a face. Where one does, the image of a
+march that does not cut its cells there jumps, and no derivative sees it. So each march's gradient (float64,
+`adjoint="replay"`) is summed up along a way, and compared with the change of the image from one end to the
+other (central differences of the reference engine): by the fundamental theorem both agree, unless something
+jumped on the way. The shortest way is the usual finite difference, which rarely meets a jump and so finds
+nothing wrong; the longest moves samples by about a step, as a step of a fit does.
+
+The scene has material at all faces of the volume, empty space in its middle, and, in the marches that tell of
+labels, a segmentation with a function for each label. Error: |sum of the gradients - change| over the larger
+of the two, of several weightings of the image and directions of each leaf.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from matplotlib.colors import LogNorm
+
+import jaxvol as jv
+
+from . import common, record
+from .common import plt
+
+
+STEP = 0.11
+WIDTHS = {1e-5: 1, 0.1: 8, 1.0: 48}
+"""Half the lengths of ways, in the units of `Leaf`: moves of about a step. And at how many of its points the
+gradient is taken."""
+WRONG = 0.1
+"""An error from which on a gradient counts as wrong: what is right has kinks, and errs by less."""
+WEIGHTINGS, DIRECTIONS = 6, 2
+LEFT = 0.3
+NOTE = f"EarlyTermination leaves {LEFT:g} here, by default 1/255: its jumps are as large as what it leaves."
+CUT = " + AlphaCorrection"
+
+Scene = tuple[jv.Volume, Any, jv.Camera, jv.March]
+
+
+class Leaf(NamedTuple):
+    """A part of the scene, and a change of it that moves samples by about a step."""
+
+    where: Callable[[Scene], Array]
+    unit: Callable[[Array], Any]
+
+
+def functions(scene: Scene) -> jv.TransferFunction:
+    """The transfer function, or those of all labels."""
+    transfer = scene[1]
+    return transfer.stacked if isinstance(transfer, jv.LabelTransferFunction) else transfer
+
+
+LEAVES = {
+    "position": Leaf(lambda s: s[2].position, lambda x: STEP),
+    "focal point": Leaf(lambda s: s[2].focal_point, lambda x: STEP),
+    "view angle": Leaf(lambda s: s[2].view_angle, lambda x: 3.0),
+    "spacing": Leaf(lambda s: s[0].spacing, lambda x: STEP / 8),
+    "origin": Leaf(lambda s: s[0].origin, lambda x: STEP),
+    "step": Leaf(lambda s: s[3].step, lambda x: STEP / 24),
+    "colours": Leaf(lambda s: functions(s).colors, lambda x: 0.1),
+    # what is hidden stays so: that an extinction of 0 may grow is a matter of leaps, not of jumps
+    "extinction": Leaf(lambda s: functions(s).extinction, lambda x: 0.1 * x),
+    "voxels": Leaf(lambda s: s[0].data, lambda x: 0.02),
+}
+
+ALONE: dict[str, tuple[jv.Transform, ...]] = {
+    "ray casting": (),
+    "Jitter": (jv.Jitter(3),),
+    "EmptySpaceJitter": (jv.EmptySpaceJitter(4),),
+    "SpaceLeaping": (jv.SpaceLeaping(),),
+    "EarlyTermination": (jv.EarlyTermination(LEFT),),
+    "labels": (),
+}
+
+
+def marches() -> dict[str, tuple[jv.Transform, ...]]:
+    """Each transform alone, and with cells cut at the exit."""
+    pairs = {}
+    for name, transforms in ALONE.items():
+        pairs[name] = transforms
+        pairs[name + CUT] = (*transforms, jv.AlphaCorrection())
+    return pairs | {f"labels{CUT}(labels)": (jv.AlphaCorrection(labels=True),)}
+
+
+def scene_of(name: str, quadrature: str, size: int) -> Scene:
+    """A smooth field whose rim is seen and whose middle is not."""
+    shape, spacing, origin = (9, 8, 10), (0.3, 0.35, 0.25), (-0.5, 0.2, 0.1)
+    x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
+    data = 0.15 + 0.25 * (x**2 + 0.8 * y**2 + 1.1 * z**2) + 0.1 * np.sin(2 * x + 3 * y - z)
+    labels = (x + 0.6 * y - 0.3 * z > 0.25).astype(np.uint8)
+    volume = jv.Volume(jnp.asarray(data, float), spacing, origin, labels)
+    colors = np.array([(0.2, 0.3, 0.8), (0.3, 0.8, 0.3), (0.9, 0.7, 0.4)])
+    transfer: Any = jv.TransferFunction([0.0, 0.25, 1.0], colors, [0.0, 0.0, 3.0])
+    if name.startswith("labels"):
+        other = jv.TransferFunction([0.0, 0.25, 1.0], 1 - colors, [0.0, 0.0, 6.0])
+        transfer = jv.LabelTransferFunction([transfer, other])
+    camera = jv.Camera(
+        (3.9, -3.3, 3.1), np.asarray(volume.center) + 0.05, (0.1, 0, 1), 35.0, size=(size, size)
+    )
+    march = jv.March(STEP, marches()[name], quadrature, max_samples=64)
+    return jax.tree.map(_doubled, (volume, transfer, camera, march))
+
+
+def _doubled(leaf: Any) -> Any:
+    return jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf
+
+
+def measure(
+    name: str, quadrature: str, size: int, seed: int, leaves: Sequence[str], widths: dict[float, int]
+) -> dict[str, list[float]]:
+    """Relative error of the gradient to each leaf, along ways of each width."""
+    scene, rng = scene_of(name, quadrature, size), np.random.default_rng(seed)
+    weights = jnp.asarray(rng.normal(size=(WEIGHTINGS, size, size, 4)))
+
+    @eqx.filter_jit
+    def losses(scene: Scene) -> Array:
+        """Of the image as it is defined."""
+        return jnp.tensordot(weights, jv.render(*scene, adjoint="direct").rgba, axes=3)
+
+    @eqx.filter_jit
+    def gradients(scene: Scene) -> Any:
+        """Of the losses of the image as it is rendered."""
+        _, pull = eqx.filter_vjp(lambda scene: jv.render(*scene).rgba, scene)
+        return jax.vmap(lambda weight: pull(weight)[0])(weights)
+
+    def along(where: Callable[[Scene], Array], way: Array, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """How the losses change along a way, to either side of the scene: as gradients tell, and in truth."""
+
+        def moved(part: float) -> Scene:
+            return eqx.tree_at(where, scene, where(scene) + part * way)
+
+        parts = (np.arange(points) + 0.5) / points * 2 - 1
+        slopes = [where(gradients(moved(part))).reshape(WEIGHTINGS, -1) @ way.reshape(-1) for part in parts]
+        return 2 * np.mean(slopes, axis=0), np.asarray(losses(moved(1.0)) - losses(moved(-1.0)))
+
+    found: dict[str, list[float]] = {}
+    for leaf in leaves:
+        where, unit = LEAVES[leaf]
+        ways = [
+            jnp.asarray(rng.normal(size=where(scene).shape)) * unit(where(scene)) for _ in range(DIRECTIONS)
+        ]
+        found[leaf] = [
+            _relative(*zip(*(along(where, width * way, points) for way in ways), strict=True))
+            for width, points in widths.items()
+        ]
+    return found
+
+
+def _relative(told: Sequence[np.ndarray], true: Sequence[np.ndarray]) -> float:
+    told, true = np.stack(told), np.stack(true)
+    largest = max(np.linalg.norm(told), np.linalg.norm(true))
+    return float(np.linalg.norm(told - true) / largest)
+
+
+def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path) -> None:
+    """Marches by leaves, for each quadrature and width."""
+    names, leaves = list(next(iter(result.values()))), list(LEAVES)
+    figure, axes = plt.subplots(
+        len(result),
+        len(widths),
+        figsize=(4.2 * len(widths) + 1.6, (0.27 * len(names) + 1.2) * len(result)),
+        squeeze=False,
+        sharex=True,
+        sharey=True,
+        layout="constrained",
+    )
+    for line, (quadrature, rows) in zip(axes, result.items(), strict=True):
+        for number, (panel, width) in enumerate(zip(line, widths, strict=True)):
+            errors = np.array(
+                [[rows[name].get(leaf, [np.nan] * 3)[number] for leaf in leaves] for name in names]
+            )
+            image = panel.imshow(errors, norm=LogNorm(1e-4, 1, clip=True), cmap="YlOrRd", aspect="auto")
+            for row, column in np.argwhere(errors >= WRONG):
+                text = f"{errors[row, column]:.1f}"
+                panel.text(column, row, text, ha="center", va="center", fontsize=7, color="white")
+            panel.set_title(f"{quadrature} rule, moves of ± {width:g} step", fontsize=9)
+            panel.set_xticks(range(len(leaves)), leaves, rotation=40, ha="right", fontsize=8)
+            panel.set_yticks(range(len(names)), names, fontsize=8)
+    bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.01)
+    bar.set_label(f"|sum of gradients - change| / larger of both; in numbers from {WRONG:g} on", fontsize=8)
+    figure.suptitle(NOTE, fontsize=9)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=1)
+    parser.add_argument("--size", type=int, default=6, help="pixels along a side")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    names, leaves, widths = list(marches()), list(LEAVES), WIDTHS
+    quadratures = ["left", "midpoint"]
+    if chosen.quick:
+        names, leaves, quadratures = names[:2], ["position", "colours"], quadratures[:1]
+        widths = {1e-5: 1, 1.0: 24}
+
+    result: dict[str, dict[str, Any]] = {}
+    with jax.enable_x64(True):
+        for quadrature in quadratures:
+            result[quadrature] = {}
+            for name in names:
+                found = measure(name, quadrature, chosen.size, chosen.seed, leaves, widths)
+                result[quadrature][name] = found
+                told = ", ".join(f"{leaf} {errors[-1]:.2g}" for leaf, errors in found.items())
+                print(f"{quadrature:8} {name:36} {told}", flush=True)
+    wrong = {
+        quadrature: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
+        for quadrature, rows in result.items()
+    }
+    path = record.write(
+        chosen.output / "gradient_errors.json",
+        "Which gradients are wrong without AlphaCorrection, per transform?",
+        {
+            "image": [chosen.size] * 2,
+            "widths": list(widths),
+            "wrong from": WRONG,
+            "wrong": wrong,
+            "relative errors": result,
+        },
+        seed=chosen.seed,
+        command=["experiments.gradient_errors", *given],
+    )
+    draw(result, list(widths), path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

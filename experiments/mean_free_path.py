@@ -1,0 +1,233 @@
+"""Are mean free paths found back from images: from those of templates, and from path-traced ones?
+
+Three balls of three materials, lit from the side, are rendered with scatterer templates; from three times too
+long, or too short, Levenberg–Marquardt looks for the three mean free paths.
+
+Then one ball at a time, of an optical thickness from far below 1 to far above, rendered with templates and
+by path tracing. A template says from where light reaches a sample, not how much of it leaves the object: so
+the brightness of the lights is fitted along with the mean free path, and what remains is the bias of the
+model. Twice: with the extinction that the camera's rays meet known, and with it following from the mean free
+path, as it does in the path tracer. Objects too small for their mean free path leave it undetermined.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
+
+from . import common, record
+from .common import plt
+
+
+GOAL = 0.01
+STEPS = 40
+OFF = (3.0, 1 / 3, 3.0)
+COLOR = (0.8, 0.6, 0.5)
+POSITIONS = ((0.0, -4.0, 1.0), (3.0, 2.5, 1.0))
+RADIUS = 0.7
+THICKNESSES = (0.02, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+KNOWN, TIED = "extinction known", "extinction 1/λ"
+
+
+def balls(resolution: int, parts: Sequence[tuple[float, tuple[float, float, float], float]]) -> jv.Volume:
+    """Balls (value, centre, radius) in [-1, 1]³, their faces a voxel wide."""
+    line = np.linspace(-1, 1, resolution)
+    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
+    data = np.zeros(grid.shape[:3])
+    for value, center, radius in parts:
+        inside = (radius - np.linalg.norm(grid - center, axis=-1)) * (resolution - 1) / 2 + 0.5
+        data = np.maximum(data, value * np.clip(inside, 0, 1))
+    return jv.Volume(data.astype(np.uint8), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
+
+
+def cameras(size: int) -> list[jv.Camera]:
+    return [jv.Camera(position, (0, 0, 0), (0, 0, 1), 32, size=(size, size)) for position in POSITIONS]
+
+
+def lights(brightness: Any = 1.0) -> tuple[Any, ...]:
+    sun, sky = jnp.full(3, 2.0) * brightness, jnp.full(3, 0.15) * brightness
+    return DirectionalLight((0.8, 0.5, -0.6), sun), ConstantLight(sky)
+
+
+def templates(materials: Any, brightness: Any = 1.0) -> ScattererTemplates:
+    return ScattererTemplates(
+        materials, lights(brightness), templates=4, photons=12, levels=4, reach=(2.0, 4.0)
+    )
+
+
+def marching(volume: jv.Volume) -> jv.March:
+    return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(),), "midpoint")
+
+
+def three_materials(size: int, resolution: int) -> dict[str, Any]:
+    """Found from the renders of templates themselves."""
+    parts = [(60, (-0.45, 0, -0.1), 0.4), (130, (0.4, 0.1, -0.2), 0.38), (210, (0.0, 0, 0.5), 0.36)]
+    volume, truth = balls(resolution, parts), (0.08, 0.12, 0.16)
+    march, colors = marching(volume), ((0.8, 0.4, 0.3), (0.5, 0.6, 0.3), (0.8, 0.8, 0.75))
+    points = [
+        (20.0, colors[0], 0.0),
+        *((value, color, 0.4) for (value, *_), color in zip(parts, colors, strict=True)),
+    ]
+    transfer = jv.TransferFunction.from_points(points, unit_distance=0.1)
+    ranges = ((15, 90), (90, 170), (170, 256))
+
+    def made(paths: Sequence[float]) -> tuple[jv.Material, ...]:
+        each = zip(paths, ranges, strict=True)
+        return tuple(jv.Material(0.5, path, 1.4, values=values) for path, values in each)
+
+    def scene(materials: Any, camera: jv.Camera) -> tuple:
+        return volume, transfer, camera, march, templates(materials)
+
+    views = [
+        (c, jv.render(*scene(made(truth), c)[:4], lighting=templates(made(truth))).rgba)
+        for c in cameras(size)
+    ]
+    start = made([path * off for path, off in zip(truth, OFF, strict=True)])
+    found = jv.fit(jv.ImageResidual(scene, views), start, max_steps=STEPS)
+    ratios = [float(m.mean_free_path) / path for m, path in zip(found.parameters, truth, strict=True)]
+    return {
+        "truth": truth,
+        "start": OFF,
+        "found": ratios,
+        "losses": found.losses.tolist(),
+        "message": found.message,
+    }
+
+
+def one_ball(
+    size: int, resolution: int, paths: int, thicknesses: Sequence[float], seed: int
+) -> list[dict[str, Any]]:
+    """Found from the renders of templates, and from path-traced ones, by optical thickness."""
+    volume = balls(resolution, [(200, (0, 0, 0), RADIUS)])
+    march, values = marching(volume), np.array([60.0, 140.0, 255.0])
+
+    def material(path: Any) -> jv.Material:
+        return jv.Material(0.2, path, 1.0, values=(60, 256))
+
+    def transfer(extinction: Any) -> jv.TransferFunction:
+        there = jnp.array([0.0, 1.0, 1.0]) * extinction
+        return jv.TransferFunction(values, np.broadcast_to(COLOR, (3, 3)), there)
+
+    def scene(given: dict[str, Any], camera: jv.Camera) -> tuple:
+        path = given["material"].mean_free_path
+        extinction = given["tied"] / path + (1 - given["tied"]) * given["extinction"]
+        return volume, transfer(extinction), camera, march, templates(given["material"], given["brightness"])
+
+    constraints = {
+        "material": None,
+        "brightness": jv.Positive(),
+        "tied": jv.Fixed(),
+        "extinction": jv.Fixed(),
+    }
+    rows = []
+    for thickness in thicknesses:
+        path = 2 * RADIUS / thickness
+        # whoever lights by templates chooses how dense matter is to look: here as it is, down to what can be
+        # seen at all
+        extinction = max(1 / path, 2.0)
+
+        def start(off: float, tied: float, path: float = path, dense: float = extinction) -> dict[str, Any]:
+            known = {"tied": jnp.float32(tied), "extinction": jnp.float32(dense)}
+            return {"material": material(path * off), "brightness": jnp.float32(1.0), **known}
+
+        own, traced = [], []
+        for camera in cameras(size):
+            *plain, lighting = scene(start(1.0, 0.0), camera)
+            own.append((camera, jv.render(*plain, lighting=lighting).image((0, 0, 0))))
+            image = jv.path_trace(
+                volume, transfer(1 / path), camera, lights(), paths=paths, key=seed, materials=material(path)
+            )
+            traced.append((camera, image.radiance))
+        cases = {"templates": (own, 0.0), KNOWN: (traced, 0.0), TIED: (traced, 1.0)}
+        row: dict[str, Any] = {"thickness": thickness}
+        for name, (views, tied) in cases.items():
+            residual = jv.ImageResidual(scene, views, background=(0, 0, 0))
+            found = jv.fit(
+                residual,
+                start(1 / 3, tied),
+                constraints=constraints,
+                max_steps=STEPS,
+            )
+            errors = found.uncertainty.standard_errors
+            row[name] = {
+                "ratio": float(found.parameters["material"].mean_free_path) / path,
+                "standard error": next(e for n, e in errors.items() if "mean_free_path" in n) / path,
+                "brightness": float(found.parameters["brightness"]),
+                "undetermined": found.uncertainty.undetermined,
+                "loss": float(found.losses.min()),
+                "message": found.message,
+            }
+        rows.append(row)
+        print(
+            thickness,
+            {name: (round(row[name]["ratio"], 4), row[name]["undetermined"]) for name in cases},
+            flush=True,
+        )
+    return rows
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
+    losses = result["three materials"]["losses"]
+    left.semilogy(range(1, len(losses) + 1), losses, "o-")
+    left.set(xlabel="step", ylabel="loss", title="three materials, from three times off")
+    rows = result["one ball"]
+    names = {
+        "templates": "renders of templates",
+        KNOWN: f"path traced, {KNOWN}",
+        TIED: f"path traced, {TIED}",
+    }
+    for (name, label), mark in zip(names.items(), ("ko", "C0s", "C3^"), strict=True):
+        known = [row for row in rows if not row[name]["undetermined"] and np.isfinite(row[name]["ratio"])]
+        right.loglog(
+            [r["thickness"] for r in known], [r[name]["ratio"] for r in known], mark + "-", label=label
+        )
+    lost = [row["thickness"] for row in rows if row["templates"]["undetermined"]]
+    if lost:
+        right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label="said to be undetermined")
+    right.axhline(1, color="k", linewidth=0.8)
+    right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
+    right.set_title("one ball, in two views")
+    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=1)
+    parser.add_argument("--size", type=int, default=32, help="pixels along a side")
+    parser.add_argument("--resolution", type=int, default=32, help="voxels along an axis")
+    parser.add_argument("--paths", type=int, default=256, help="paths through each pixel")
+    given = record.arguments(argv)
+    chosen, thicknesses = parser.parse_args(given), THICKNESSES
+    if chosen.quick:
+        chosen.size, chosen.resolution, chosen.paths = 10, 12, 2
+        thicknesses = (2.0,)
+
+    result = {
+        "image": [chosen.size] * 2,
+        "resolution": chosen.resolution,
+        "paths": chosen.paths,
+        "goal": GOAL,
+        "three materials": three_materials(chosen.size, chosen.resolution),
+        "one ball": one_ball(chosen.size, chosen.resolution, chosen.paths, thicknesses, chosen.seed),
+    }
+    worst = max(abs(ratio - 1) for ratio in result["three materials"]["found"])
+    steps = len(result["three materials"]["losses"])
+    print(f"three materials: within {worst:.2%} (goal {GOAL:.0%}), {steps} steps")
+    path = record.write(
+        chosen.output / "mean_free_path.json",
+        "Are mean free paths found back from images, of templates and path-traced?",
+        result,
+        seed=chosen.seed,
+        command=["experiments.mean_free_path", *given],
+    )
+    draw(result, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""How near do scatterer templates come to light as it is scattered, and in what time?
+
+The head phantom, of skin, muscle and bone, lit from the side: path traced, with standard errors; and rendered
+without light, and with templates, hard and soft, one for each pixel and blended. Templates have no scale of
+their own, so each image is first multiplied by the number that brings it nearest to the path-traced one.
+What that leaves is the error; what noise is in the reference is told beside it.
+"""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
+
+from . import common, record, timing
+from .common import plt
+
+
+TRACED, UNLIT = "path traced", "unlit"
+LIGHTS = (DirectionalLight((0.9, 0.2, -0.5), (2.0, 2.0, 1.9)), ConstantLight((0.12, 0.12, 0.14)))
+MATERIALS = (
+    jv.Material(0.3, 0.06, 1.39, values=(50, 150)),
+    jv.Material(0.2, 0.03, 1.55, values=(150, 256)),
+)
+POINTS = [
+    (50, (0.85, 0.55, 0.42), 0.0),
+    (80, (0.85, 0.55, 0.42), 0.8),
+    (120, (0.75, 0.3, 0.25), 0.8),
+    (150, (0.7, 0.4, 0.3), 0.8),
+    (185, (0.9, 0.88, 0.8), 0.9),
+    (255, (0.95, 0.95, 0.92), 0.9),
+]
+
+
+def lightings(templates: int) -> dict[str, jv.lighting.Lighting | None]:
+    how: dict[str, Any] = {"packets": 8, "threshold": 0.008, "reach": (2.0, 4.0, 8.0), "templates": templates}
+    made = {
+        "hard": {"occlusion": "hard"},
+        "hard, blended": {"occlusion": "hard", "blend": True},
+        "soft": {},
+        "soft, blended": {"blend": True},
+        "soft, baked": {"baked": 64},
+    }
+    lit = {name: ScattererTemplates(MATERIALS, LIGHTS, **how, **more) for name, more in made.items()}
+    return {UNLIT: None, **lit}
+
+
+def measure(
+    size: int, resolution: int, paths: int, templates: int, repetitions: int, seed: int
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Rows of what was measured, and images over black."""
+    volume = jv.phantom("head", resolution)
+    transfer = jv.TransferFunction.from_points(POINTS, unit_distance=0.05)
+    camera = jv.Camera((1.6, -2.6, 1.0), volume.center, (0, 0, 1), 28, size=(size, size))
+    step = float(volume.spacing.min()) / 2
+    march = jv.March(
+        step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1 / 255)), "midpoint"
+    )
+
+    begun = time.perf_counter()
+    traced = jv.path_trace(volume, transfer, camera, LIGHTS, paths=paths, key=seed, materials=MATERIALS)
+    wanted = np.asarray(traced.radiance)
+    seconds = time.perf_counter() - begun
+    noise = float(np.sqrt(np.mean(np.asarray(traced.standard_error) ** 2)))
+
+    def frame(lighting: Any) -> jax.Array:
+        return jv.render(volume, transfer, camera, march, lighting=lighting).image((0, 0, 0))
+
+    lit = lightings(templates)
+    taken = timing.interleaved({n: lambda each=each: frame(each) for n, each in lit.items()}, repetitions)
+    rows: dict[str, Any] = {TRACED: {"seconds": round(seconds, 3), "standard error": noise, "paths": paths}}
+    images = {TRACED: wanted}
+    for name, each in lit.items():
+        image = np.asarray(frame(each))
+        scale = float(np.sum(image * wanted) / np.sum(image**2))
+        images[name] = image * scale
+        error = float(np.sqrt(np.mean((images[name] - wanted) ** 2)))
+        rows[name] = {**common.row(taken[name], taken[UNLIT], error), "scale": scale}
+    return rows, images
+
+
+def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
+    figure, axes = plt.subplots(1, len(images), figsize=(2 * len(images), 2.7), layout="constrained")
+    for axis, (name, image) in zip(axes, images.items(), strict=True):
+        axis.imshow(jv.to_srgb(np.clip(image, 0, 1)))
+        row = rows[name]
+        told = (
+            f"error {row['rmse']:.3f}\n{row['ratio']['median']:.1f} × unlit"
+            if "rmse" in row
+            else (f"noise {row['standard error']:.3f}\n{row['seconds']:.1f} s, first image")
+        )
+        axis.set(title=name, xlabel=told, xticks=[], yticks=[])
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=3)
+    parser.add_argument("--size", type=int, default=128, help="pixels along a side")
+    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
+    parser.add_argument("--paths", type=int, default=128, help="paths through each pixel")
+    parser.add_argument("--templates", type=int, default=8, help="for each material")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    if chosen.quick:
+        chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions = 16, 16, 2, 2, 1
+    rows, images = measure(
+        chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions, chosen.seed
+    )
+    for name, row in rows.items():
+        print(name, {key: value for key, value in row.items() if key != "all seconds"})
+    path = record.write(
+        chosen.output / "path_traced.json",
+        "How near do scatterer templates come to path tracing, and in what time?",
+        {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows},
+        seed=chosen.seed,
+        command=["experiments.path_traced", *given],
+    )
+    draw(rows, images, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

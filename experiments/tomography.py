@@ -1,0 +1,268 @@
+"""Is a density recovered from a few X-ray views, beside filtered back projection and SART?
+
+Through a transfer function that is black, and whose extinction is the value itself, a volume is seen as an
+X-ray image: -log(1 - opacity) is the line integral of its values. The head phantom, as a density of 64³
+voxels, is so rendered by parallel rays from 24 directions around its axis, without noise and as counts of
+photons. From the same line integrals it is recovered:
+
+- by scikit-image's filtered back projection (`iradon`), negative densities set to 0, with the filter that
+  comes nearest to the truth;
+- by its SART (`iradon_sart`), which corrects the slices view by view, densities kept from becoming negative;
+- by `jv.fit`: L-BFGS, by the gradient that the renderer takes to every voxel. A bijection keeps densities
+  positive. Of the geometry it knows no more than its rays, which might as well come from any other cameras.
+
+The views are marched at a sixth of a voxel, the fit at a half. Truth and results share a grid on which values
+are trilinear, for the fit as for SART, so none has to bear what a grid leaves out of the real world. Under
+noise both iterations come near the truth first and then fit the noise: the nearest and the last one are told.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+from skimage.transform import iradon, iradon_sart
+
+import jaxvol as jv
+from jaxvol.metrics import psnr
+
+from . import common, record
+from .common import plt
+
+
+DENSEST = 0.1
+"""Density of the greatest value, 1/voxel: where the head is thickest, one photon in 14 passes."""
+THIN = 0.1
+"""Part of the mean density below which the bijection bends. With 1, what is thin moves too slowly."""
+FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
+FBP, SART, OURS = "FBP", "SART", "jaxvol"
+
+Rays = tuple[Float[Array, "views columns slices 3"], Float[Array, "views columns slices 3"]]
+Sinogram = Float[Array, "views columns slices"]
+Density = Float[np.ndarray, "n n n"]
+
+
+class Setting(NamedTuple):
+    """How long is iterated, and at which step the renderer marches, voxels."""
+
+    sweeps: int
+    evaluations: int
+    step: float = 0.5
+    step_of_views: float = 1 / 6
+
+
+def angles(views: int) -> np.ndarray:
+    """Directions over half a turn, degrees."""
+    return np.linspace(0, 180, views, endpoint=False)
+
+
+def rays(n: int, views: int) -> Rays:
+    """Origins and directions of parallel rays, one through each node of the plane across them. As for
+    scikit-image x points down and y to the right, and the axis runs through node n // 2."""
+    turn, across = np.deg2rad(angles(views)), np.arange(n) - n // 2
+    ahead = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)[:, None, None]
+    aside = np.stack([-np.sin(turn), np.cos(turn), 0 * turn], axis=-1)[:, None, None]
+    height = np.arange(n)[:, None] * np.array([0.0, 0.0, 1.0])
+    origins = np.array([n // 2, n // 2, 0]) + n * ahead + across[:, None, None] * aside + height
+    return jnp.asarray(origins, jnp.float32), jnp.asarray(np.broadcast_to(-ahead, origins.shape), jnp.float32)
+
+
+def line_integrals(density: Any, rays: Rays, step: float) -> Sinogram:
+    """Of a density, 1/voxel, by rendering it."""
+    absorbing = jv.TransferFunction([0.0, 1.0], np.zeros((2, 3)), [0.0, 1.0])
+    march = jv.March(step, (jv.AlphaCorrection(),), "midpoint")
+    return -jnp.log1p(-jv.render_rays(jv.Volume(density), absorbing, *rays, march).rgba[..., 3])
+
+
+def counted(sinogram: np.ndarray, photons: float | None, seed: int) -> np.ndarray:
+    """Line integrals as they follow from counting so many photons sent along each ray; None for infinitely
+    many."""
+    if photons is None:
+        return sinogram
+    counts = np.random.default_rng(seed).poisson(photons * np.exp(-sinogram.astype(float)))
+    return np.log(photons / np.maximum(counts, 1)).astype(np.float32)
+
+
+class Difference(eqx.Module):
+    """Line integrals of a density minus those that were measured, over `unit`."""
+
+    rays: Rays
+    measured: Sinogram
+    unit: Float[Array, ""]
+    step: float = eqx.field(static=True)
+
+    def __call__(self, density: Array) -> Array:
+        return (line_integrals(density, self.rays, self.step) - self.measured) / self.unit
+
+
+class Progress:
+    """The error after each iteration, and the seconds that the iterations took without looking at it."""
+
+    def __init__(self, truth: Density):
+        self.truth, self.spent, self.begun = truth, 0.0, time.perf_counter()
+        self.rows: list[dict[str, float]] = []
+        self.nearest: Density | None = None
+
+    def look(self, density: Any) -> None:
+        self.spent += time.perf_counter() - self.begun
+        density = np.asarray(density)
+        error = float(np.sqrt(np.mean((density - self.truth) ** 2)))
+        if error < min((row["rmse"] for row in self.rows), default=np.inf):
+            self.nearest = density
+        self.rows.append({"seconds": round(self.spent, 3), "rmse": error})
+        self.begun = time.perf_counter()
+
+
+def filtered(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+    """FBP by each filter."""
+    progress = Progress(truth)
+    for name in FILTERS:
+        slices = [iradon(one.T, angles(len(one)), filter_name=name) for one in np.moveaxis(sinogram, 2, 0)]
+        progress.look(np.maximum(np.stack(slices, axis=-1), 0))
+    best = int(np.argmin([row["rmse"] for row in progress.rows]))
+    return progress, f"the filter {FILTERS[best]}"
+
+
+def algebraic(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+    """SART, sweep after sweep over all views."""
+    progress, slices = Progress(truth), [None] * sinogram.shape[2]
+    for _ in range(setting.sweeps):
+        slices = [
+            iradon_sart(one.T, angles(len(one)), image=image, clip=(0, np.inf))
+            for one, image in zip(np.moveaxis(sinogram, 2, 0), slices, strict=True)
+        ]
+        progress.look(np.stack(slices, axis=-1))
+    return progress, "sweeps over all views"
+
+
+def fitted(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+    """L-BFGS from a flat and thin density: `THIN` of what the views tell of the mean."""
+    views, n, _ = sinogram.shape
+    thin = THIN * float(sinogram.mean()) / n
+    # the loss bends by about 1 where all densities change alike, so that a first step is of the right length
+    unit = jnp.float32(thin * np.sqrt(views * n))
+    residual = Difference(rays(n, views), jnp.asarray(sinogram), unit, setting.step)
+
+    def fit(evaluations: int, look: Callable[[Any], None]) -> jv.Fit:
+        return jv.fit(
+            residual,
+            jnp.full((n, n, n), thin, jnp.float32),
+            solver=optx.LBFGS(0.0, 0.0),
+            constraints=jv.Positive(thin),
+            max_steps=evaluations,
+            patience=evaluations,
+            callback=lambda step, density, loss: look(density),
+        )
+
+    fit(2, lambda density: None)  # compiled before the clock runs
+    progress = Progress(truth)
+    fit(setting.evaluations, progress.look)
+    return progress, "evaluations with gradient"
+
+
+METHODS = {FBP: filtered, SART: algebraic, OURS: fitted}
+
+
+def measure(truth: Density, views: int, photons: float | None, setting: Setting, seed: int) -> dict[str, Any]:
+    """How near each method comes; the slice that is shown is kept under `"slice"`."""
+    exact = np.array(line_integrals(truth, rays(len(truth), views), setting.step_of_views))
+    sinogram, middle, rows = counted(exact, photons, seed), truth.shape[2] // 2, {}
+    for name, method in METHODS.items():
+        progress, counts = method(sinogram, truth, setting)
+        nearest, last = min(progress.rows, key=lambda row: row["rmse"]), progress.rows[-1]
+        rows[name] = {
+            "rmse": nearest["rmse"],
+            "psnr": psnr(progress.nearest, truth, truth.max()),
+            "at": progress.rows.index(nearest) + 1,
+            "rmse at the end": last["rmse"],
+            "counted in": counts,
+            "all": progress.rows,
+            "slice": progress.nearest[:, :, middle],
+        }
+    return rows
+
+
+def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
+    """A slice by each method, for all numbers of photons, over how the whole volume's error fell."""
+    figure = plt.figure(figsize=(10, 2.75 * len(result) + 3.2), layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.08)
+    upper, lower = figure.subfigures(2, 1, height_ratios=(2.75 * len(result), 3))
+    shown = upper.subplots(len(result), 1 + len(METHODS), squeeze=False)
+    for number, (line, (photons, rows)) in enumerate(zip(shown, result.items(), strict=True)):
+        pictures = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}
+        for panel, (name, picture) in zip(line, pictures.items(), strict=True):
+            panel.imshow(picture, cmap="gray", vmin=0, vmax=0.8 * truth.max())
+            panel.set(xticks=[], yticks=[])
+            told = f"RMSE {rows[name]['rmse']:.5f}, {rows[name]['psnr']:.1f} dB" if name in rows else ""
+            panel.set_xlabel(told, fontsize=9)
+            if number == 0:
+                panel.set_title(name, fontsize=9)
+        line[0].set_ylabel(photons, fontsize=9)
+    by_count, by_time = lower.subplots(1, 2, sharey=True)
+    for (photons, rows), line in zip(result.items(), ("-", "--"), strict=False):
+        for name, color in zip((SART, OURS), ("C1", "C0"), strict=True):
+            errors = [row["rmse"] for row in rows[name]["all"]]
+            by_count.loglog(range(1, len(errors) + 1), errors, color + line, label=f"{name}, {photons}")
+            by_time.loglog([row["seconds"] for row in rows[name]["all"]], errors, color + line)
+        for panel in (by_count, by_time):
+            panel.axhline(rows[FBP]["rmse"], color="0.5", linestyle=line, label=f"{FBP}, {photons}")
+    by_count.set(xlabel="sweep over all views (SART), evaluation (jaxvol)", ylabel="RMSE, 1/voxel")
+    by_time.set(xlabel="seconds, compilation left out")
+    by_count.legend(fontsize=7)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=1)
+    parser.add_argument("--resolution", type=int, default=64, help="voxels along an axis")
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument(
+        "--photons", type=float, nargs="*", default=[1e4], help="per ray; without noise always"
+    )
+    parser.add_argument("--sweeps", type=int, default=30, help="of SART")
+    parser.add_argument("--evaluations", type=int, default=45, help="of the fit's loss and gradient")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    if chosen.quick:
+        chosen.resolution, chosen.views, chosen.sweeps, chosen.evaluations = 16, 8, 5, 25
+
+    head = jv.phantom("head", chosen.resolution)
+    truth = np.asarray(head.data, np.float32) / 255 * DENSEST
+    setting = Setting(chosen.sweeps, chosen.evaluations)
+    result = {}
+    for photons in (None, *chosen.photons):
+        name = "no noise" if photons is None else f"{photons:g} photons a ray"
+        result[name] = measure(truth, chosen.views, photons, setting, chosen.seed)
+        for method, row in result[name].items():
+            print(
+                f"{name:22} {method:7} RMSE {row['rmse']:.6f} ({row['psnr']:.2f} dB) at {row['at']},"
+                f" at the end {row['rmse at the end']:.6f}; {len(row['all'])} {row['counted in']},"
+                f" {row['all'][-1]['seconds']:.1f} s",
+                flush=True,
+            )
+    path = record.write(
+        chosen.output / "tomography.json",
+        "Is a density recovered from 24 X-ray views, beside filtered back projection and SART?",
+        {
+            "voxels": list(truth.shape),
+            "views": chosen.views,
+            "densest": float(truth.max()),
+            "steps": {"views": setting.step_of_views, "fit": setting.step},
+            "photons": {
+                name: {method: {k: v for k, v in row.items() if k != "slice"} for method, row in rows.items()}
+                for name, rows in result.items()
+            },
+        },
+        seed=chosen.seed,
+        command=["experiments.tomography", *given],
+    )
+    draw(result, truth, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""In which direction does light go on from a scattering? The phase function of Henyey and Greenstein."""
+
+import math
+
+import jax.numpy as jnp
+
+from ..triple import Scalar, Triple
+
+
+def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
+    """Density, per solid angle, of the direction after a scattering; its integral over the sphere is 1.
+
+    - `cosine`: of the angle between the directions in which light travels before and after.
+    - `anisotropy`: g in (-1, 1), the mean cosine: 0 alike in all directions, above 0 forward.
+
+    Source: Henyey and Greenstein 1941.
+    """
+    g = anisotropy
+    # written so that it stays positive where g and the cosine are both near 1
+    squared = (1 - g) * (1 - g) + 2 * g * (1 - cosine)
+    return (1 - g * g) / (4 * math.pi * squared * jnp.sqrt(squared))
+
+
+def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
+    """A cosine drawn from `phase`, by inversion, from a number in [0, 1).
+
+    The inverse in its usual form, `(1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g`, multiplied out: this one
+    keeps its digits as g goes to 0, where the other divides rounding by it.
+    """
+    g, x = anisotropy, 2 * uniform - 1
+    numerator = x + g * ((3 + x * x) / 2 + g * (x - g * (1 - x * x) / 2))
+    return jnp.clip(numerator / jnp.square(1 + g * x), -1, 1)
+
+
+def scattered(anisotropy: Scalar, first: Scalar, second: Scalar) -> Triple:
+    """A unit direction drawn from `phase` around the z axis, from two numbers in [0, 1)."""
+    cosine = scattered_cosine(anisotropy, first)
+    sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0))
+    angle = 2 * math.pi * second
+    return sine * jnp.cos(angle), sine * jnp.sin(angle), cosine
+
+
+def turned(around_z: Triple, direction: Triple) -> Triple:
+    """A unit direction that lies around another one as `around_z` does around the z axis."""
+    (x, y, cosine), (dx, dy, dz) = around_z, direction
+    (a, b, c), (d, e, f) = _beside(direction)
+    return _unit((x * a + y * d + cosine * dx, x * b + y * e + cosine * dy, x * c + y * f + cosine * dz))
+
+
+def _beside(direction: Triple) -> tuple[Triple, Triple]:
+    """Two unit directions at right angles to a unit direction, and to each other.
+
+    Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
+    """
+    x, y, z = direction
+    sign = jnp.where(z >= 0, 1, -1).astype(z.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+def _unit(direction: Triple) -> Triple:
+    """A direction that is of unit length but for rounding, which would add up over many scatterings."""
+    x, y, z = direction
+    scale = (3 - (x * x + y * y + z * z)) / 2  # 1 / sqrt(n), to first order around 1
+    return x * scale, y * scale, z * scale

@@ -1,0 +1,39 @@
+"""Mean free paths are found back from renders of templates, and said to be undetermined where they are."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from experiments.mean_free_path import GOAL, balls, lights, marching, three_materials
+from jaxvol.lighting import ScattererTemplates
+
+
+@pytest.mark.slow
+def test_three_mean_free_paths_are_found_from_three_times_off():
+    found = three_materials(size=24, resolution=24)
+    np.testing.assert_allclose(found["found"], 1, atol=GOAL)
+
+
+@pytest.mark.slow
+def test_a_mean_free_path_much_longer_than_the_object_is_said_to_be_undetermined():
+    volume = balls(24, [(200, (0, 0, 0), 0.3)])
+    transfer = jv.TransferFunction((60, 140, 255), np.full((3, 3), 0.5), (0, 8, 8))
+    march = marching(volume)
+    camera = jv.Camera((0, -4, 1), (0, 0, 0), (0, 0, 1), 20, size=(16, 16))
+
+    def scene(material, camera):
+        lighting = ScattererTemplates(material, lights(), templates=2, photons=8, levels=2, reach=(2.0,))
+        return volume, transfer, camera, march, lighting
+
+    def fitted(path):
+        truth, start = (jv.Material(0.5, p, values=(60, 256)) for p in (path, path * 1.5))
+        *plain, lighting = scene(truth, camera)
+        residual = jv.ImageResidual(scene, [(camera, jv.render(*plain, lighting=lighting).rgba)])
+        return jv.fit(residual, start, max_steps=15)
+
+    known = fitted(0.1)
+    assert known.uncertainty.undetermined == []
+    assert jnp.allclose(known.parameters.mean_free_path, 0.1, rtol=GOAL)
+    with pytest.warns(UserWarning, match="mean_free_path"):
+        assert fitted(300.0).uncertainty.undetermined == [[".mean_free_path"]]

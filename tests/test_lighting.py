@@ -1,0 +1,921 @@
+"""Light: each step of the shading by hand, all engines alike, and gradients by differences."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol import reference, visible
+from jaxvol.engine import _prepared
+from jaxvol.lighting import (
+    ConstantLight,
+    DirectionalLight,
+    Material,
+    PointLight,
+    ScattererTemplate,
+    ScattererTemplates,
+    scatterer_templates,
+    scatterers,
+    seam,
+)
+from jaxvol.lighting.baked import BakedLighting
+from jaxvol.lighting.seam import Sample, Surroundings, lit
+from jaxvol.locate import Affine
+from jaxvol.triple import apart
+
+from .scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer
+
+
+# ---------------------------------------------------------------- samples lit one by one
+
+
+def look_around(volume, transfer):
+    return Surroundings(volume, transfer, Affine(volume))
+
+
+def sample_at(around, point, pixel, transmittance):
+    """The sample that a ray would take at a world point."""
+    seen, point = around.transfer.over(around.volume), apart(point)
+    measured = seen.measure(around.space.coordinate(point))
+    color, extinction = seen.classify(measured)
+    none, one = jnp.zeros_like(extinction), jnp.ones_like(extinction)
+    return Sample(
+        point, (none, none, one), measured, color, extinction, one * transmittance, (pixel[0], pixel[1])
+    )
+
+
+@eqx.filter_jit
+def lit_points(lighting, volume, transfer, points, pixels, transmittance):
+    around = look_around(volume, transfer)
+    shading = lighting.over(around)
+
+    def one(point, pixel):
+        return jnp.stack(lit(shading, around, sample_at(around, point, pixel, transmittance))[0])
+
+    return jax.vmap(one)(points, pixels)
+
+
+def shade(lighting, volume, transfer, points, *, pixels=None, transmittance=1.0):
+    """The colours of some points as lit."""
+    points = jnp.asarray(points, float)
+    pixels = jnp.zeros((len(points), 2), jnp.int32) if pixels is None else pixels
+    return np.asarray(lit_points(lighting, volume, transfer, points, pixels, jnp.asarray(transmittance)))
+
+
+# ---------------------------------------------------------------- the steps, by hand
+#
+# A grid of nodes a unit apart, its middle at the origin, of air but for single nodes, on which the sample and
+# its photons come to lie. A wall is seen, and of no material. Two lights of three are dark in each scene.
+
+SKIN, OTHER_SKIN, BONE, OTHER_BONE, WALL = 1.0, 1.2, 2.0, 2.2, 3.0
+SEEN = {
+    0.0: ((0.0, 0.0, 0.0), 0.0),
+    0.5: ((0.0, 0.0, 0.0), 0.0),
+    SKIN: ((0.8, 0.5, 0.4), 0.6),
+    OTHER_SKIN: ((0.2, 0.6, 0.9), 0.6),
+    BONE: ((0.9, 0.9, 0.1), 0.9),
+    OTHER_BONE: ((0.3, 0.1, 0.7), 0.9),
+    WALL: ((0.5, 0.4, 0.3), 1.5),
+}
+TRANSFER = jv.TransferFunction(list(SEEN), [c for c, _ in SEEN.values()], [e for _, e in SEEN.values()])
+COLOR = {value: np.asarray(color) for value, (color, _) in SEEN.items()}
+MATERIALS = (
+    Material(0.5, 0.7, 1.2, values=(0.9, 1.3)),
+    Material(0.8, 0.4, 0.8, values=(1.9, 2.3)),
+)
+POWER = np.array([1.0, 2.0, 3.0])
+PAIR = (((2, 0, 0), 0.3), ((-2, 0, 0), 0.6))
+
+
+def nodes(places):
+    """A volume of these values at these nodes, and skin in the middle."""
+    data = np.zeros((9, 9, 9), np.float32)
+    for (x, y, z), value in {(0, 0, 0): SKIN, **places}.items():
+        data[x + 4, y + 4, z + 4] = value
+    return jv.Volume(data, origin=(-4, -4, -4))
+
+
+def given(*of_materials):
+    """Templates made by hand, one for each material: of photons (offset, intensity)."""
+    offset, intensity = zip(*(zip(*each, strict=True) for each in of_materials), strict=True)
+    return ScattererTemplate(jnp.asarray(offset, float)[:, None], jnp.asarray(intensity, float)[:, None])
+
+
+def lights(*, sun=None, lamp=None, sky=False):
+    """A sun in a direction, a lamp at a place and a sky, of which one shines."""
+    dark = np.zeros(3)
+    return (
+        DirectionalLight(
+            (0, 0, 1) if sun is None else -np.asarray(sun, float), dark if sun is None else POWER
+        ),
+        PointLight((9, 9, 9) if lamp is None else lamp, dark if lamp is None else POWER),
+        ConstantLight(POWER if sky else dark),
+    )
+
+
+def middle(occlusion, places, photons, *, reach=(2.0,), transmittance=1.0, cutoff=1e-6, **of_lights):
+    """The colour of the node in the middle."""
+    lighting = ScattererTemplates(
+        MATERIALS,
+        lights(**of_lights),
+        occlusion=occlusion,
+        reach=reach,
+        cutoff=cutoff,
+        given=given(photons, photons),
+    )
+    return shade(lighting, nodes(places), TRANSFER, [(0, 0, 0)], transmittance=transmittance)[0]
+
+
+def smooth(x):
+    """The ramp of the lit side under soft occlusion: from 0 at 0 to 1 at 1."""
+    x = np.clip(x, 0, 1)
+    return x**2 * (3 - 2 * x)
+
+
+FORMS = pytest.mark.parametrize("occlusion", ["hard", "soft"])
+
+
+def same(found, expected):
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
+
+
+@FORMS
+def test_step_1_photons_toward_the_sun_are_lit(occlusion):
+    for toward, intensity in (((1, 0, 0), 0.3), ((-1, 0, 0), 0.6)):
+        same(middle(occlusion, {}, PAIR, sun=toward), COLOR[SKIN] * POWER * intensity)
+
+
+def test_step_1_the_lit_side_ends_softly():
+    cosine = 0.1
+    sun = (cosine, np.sqrt(1 - cosine**2), 0)
+    part = 0.3 * smooth(0.5 + cosine / 0.5) + 0.6 * smooth(0.5 - cosine / 0.5)
+    same(middle("soft", {}, PAIR, sun=sun), COLOR[SKIN] * POWER * part)
+    same(middle("hard", {}, PAIR, sun=sun), COLOR[SKIN] * POWER * 0.3)
+
+
+def test_step_1_photons_nearer_to_the_lamp_are_lit_and_those_behind_it_are_not():
+    photons, r = (((3, 0, 0), 0.3), ((2, 0, 0), 0.6)), 1.2
+    arriving = COLOR[SKIN] * POWER / r**2
+    same(middle("hard", {}, photons, lamp=(r, 0, 0)), arriving * 0.6)
+    # r - |r d - p|, to second order of p / r, over |p|
+    parts = [smooth(0.5 + (1 - length / (2 * r)) / 0.5) for length in (3, 2)]
+    assert parts[0] == 0
+    same(middle("soft", {}, photons, lamp=(r, 0, 0)), arriving * 0.6 * parts[1])
+
+
+def test_step_1_the_lamp_lights_by_distance_exactly():
+    """A photon to the side of a lamp is nearer to it only if it is nearer by its distance."""
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        lamp, photon = random.normal(size=3) * 2, random.normal(size=3)
+        nearer = np.linalg.norm(lamp - photon) < np.linalg.norm(lamp)
+        found = middle("hard", {}, ((photon, 0.4), (photon, 0.0)), lamp=lamp, reach=())
+        clear = np.abs(photon).max() > 1.01  # not beside the sample, in its own matter
+        if clear:
+            same(found, COLOR[SKIN] * POWER / (lamp @ lamp) * 0.4 * nearer)
+
+
+@FORMS
+def test_step_1_the_sky_lights_all_photons(occlusion):
+    same(middle(occlusion, {}, PAIR, sky=True), COLOR[SKIN] * np.pi * POWER * 0.9)
+
+
+@FORMS
+def test_step_2_a_photon_in_a_wall_is_hidden(occlusion):
+    hidden = {"hard": 0, "soft": np.exp(-2 * 1.5)}
+    part = 0.3 * hidden[occlusion] + 0.6
+    same(middle(occlusion, {(2, 0, 0): WALL}, PAIR, sky=True), COLOR[SKIN] * np.pi * POWER * part)
+
+
+@FORMS
+def test_step_2_a_wall_behind_a_photon_hides_it_within_reach(occlusion):
+    places = {(4, 0, 0): WALL}
+    hidden = {"hard": 0, "soft": np.exp(-2 * 1.5)}
+    part = 0.3 * hidden[occlusion] + 0.6
+    same(middle(occlusion, places, PAIR, sky=True), COLOR[SKIN] * np.pi * POWER * part)
+    out = COLOR[SKIN] * np.pi * POWER * 0.9
+    same(middle(occlusion, places, PAIR, sky=True, reach=()), out)
+
+
+@FORMS
+def test_step_3_brightness_grows_with_the_intensity_of_each_photon_that_is_seen(occlusion):
+    for first, second in ((0.3, 0.6), (0.6, 0.6), (0.3, 0.9)):
+        photons = ((2, 0, 0), first), ((-2, 0, 0), second)
+        expected = COLOR[SKIN] * np.pi * POWER * (first + second)
+        same(middle(occlusion, {}, photons, sky=True), expected)
+
+
+@FORMS
+def test_step_4_a_photon_in_the_same_material_adds_its_colour(occlusion):
+    hidden = {"hard": 0, "soft": np.exp(-2 * 0.6)}
+    dense = {"hard": 1, "soft": 1 - np.exp(-0.6 * 0.7)}
+    brightness = 0.3 * hidden[occlusion] + 0.6
+    expected = np.pi * POWER * brightness * (COLOR[SKIN] + 0.3 * dense[occlusion] * COLOR[OTHER_SKIN])
+    same(middle(occlusion, {(2, 0, 0): OTHER_SKIN}, PAIR, sky=True), expected)
+
+
+@FORMS
+def test_step_4_inner_colour_comes_from_all_sides(occlusion):
+    """Of two photons the one in matter need not be on the lit side."""
+    dense = {"hard": 1, "soft": 1 - np.exp(-0.6 * 0.7)}
+    inner = 0.3 * dense[occlusion] * COLOR[OTHER_SKIN]
+    expected = POWER * 0.6 * (COLOR[SKIN] + inner)
+    same(middle(occlusion, {(2, 0, 0): OTHER_SKIN}, PAIR, sun=(-1, 0, 0)), expected)
+
+
+@FORMS
+def test_step_5_a_photon_in_another_material_is_moved_and_scaled(occlusion):
+    """The speeds are as 1.2 to 0.8, so that it comes to lie 3 away; the opacities as 0.8 to 0.5."""
+    places = {(2, 0, 0): BONE, (3, 0, 0): OTHER_BONE}
+    hidden = {"hard": 0, "soft": np.exp(-3 * 0.9)}
+    dense = {"hard": 1, "soft": 1 - np.exp(-0.9 * 0.4)}
+    brightness = 0.3 * hidden[occlusion] + 0.6
+    inner = 0.3 * 0.8 / 0.5 * dense[occlusion] * COLOR[OTHER_BONE]
+    same(middle(occlusion, places, PAIR, sky=True), np.pi * POWER * brightness * (COLOR[SKIN] + inner))
+
+
+@FORMS
+def test_step_5_a_photon_moved_out_of_matter_adds_no_colour(occlusion):
+    same(middle(occlusion, {(2, 0, 0): BONE}, PAIR, sky=True), np.pi * POWER * 0.9 * COLOR[SKIN])
+
+
+@FORMS
+def test_step_6_faint_photons_are_left_out(occlusion):
+    full = COLOR[SKIN] * np.pi * POWER
+    for transmittance, part in ((1.0, 0.9), (0.1, 0.6), (0.05, 0.0)):
+        found = middle(occlusion, {}, PAIR, sky=True, cutoff=0.05, transmittance=transmittance)
+        same(found, full * part)
+
+
+def test_by_default_faint_photons_are_left_out_under_hard_occlusion_alone():
+    assert ScattererTemplates(MATERIALS, lights(sky=True), occlusion="hard").cutoff == np.float32(0.02)
+    assert ScattererTemplates(MATERIALS, lights(sky=True)).cutoff is None
+
+
+@FORMS
+def test_what_belongs_to_no_material_keeps_its_colour(occlusion):
+    same(middle(occlusion, {(0, 0, 0): WALL}, PAIR, sky=True), COLOR[WALL])
+
+
+@FORMS
+def test_where_a_place_belongs_to_two_materials_the_first_counts(occlusion):
+    """They have templates of their own, of which one is twice as bright."""
+    brighter = tuple((offset, 2 * intensity) for offset, intensity in PAIR)
+    everywhere = [Material(0.5, 0.7, 1.2, values=(0.0, 4.0)), MATERIALS[0]]
+    for materials, part in ((everywhere, 0.9), (everywhere[::-1], 0.9), ([MATERIALS[1], everywhere[0]], 1.8)):
+        lighting = ScattererTemplates(
+            materials,
+            lights(sky=True),
+            occlusion=occlusion,
+            reach=(2.0,),
+            cutoff=1e-6,
+            given=given(PAIR, brighter),
+        )
+        found = shade(lighting, nodes({}), TRANSFER, [(0, 0, 0)])[0]
+        same(found, COLOR[SKIN] * np.pi * POWER * part)
+
+
+def test_materials_by_label_are_where_the_label_is():
+    """Nodes of label 1 for x < 0, of label 2 elsewhere, which no material has."""
+    data = np.full((9, 9, 9), SKIN, np.float32)
+    labels = np.where(np.arange(9) < 4, 1, 2).astype(np.uint8)[:, None, None] * np.ones((1, 9, 9), np.uint8)
+    volume = jv.Volume(data, origin=(-4, -4, -4), labels=labels)
+    skin = Material(0.5, 0.7, label=1)
+    photons = ((8, 0, 0), 0.3), ((0, 8, 0), 0.6)  # outside of the volume, where they are not hidden
+    points = [(-2, 0, 0), (-0.75, 0, 0), (-0.4, 0, 0), (1, 0, 0)]
+    lit_color = COLOR[SKIN] * np.pi * POWER * 0.9
+    hard, soft = (
+        shade(
+            ScattererTemplates(
+                skin, ConstantLight(POWER), occlusion=occlusion, reach=(2.0,), given=given(photons)
+            ),
+            volume,
+            TRANSFER,
+            points,
+        )
+        for occlusion in ("hard", "soft")
+    )
+    same(hard, [lit_color, lit_color, COLOR[SKIN], COLOR[SKIN]])
+    away = COLOR[SKIN] * np.pi * POWER * 0.9 * np.exp(-8 * 0.6 / 2)
+    # between the nodes the material comes and goes by a share of 0.75, and of 0.4
+    same(soft, [part * away + (1 - part) * COLOR[SKIN] for part in (1, 0.75, 0.4, 0)])
+
+
+def test_a_blend_is_the_mean_over_the_templates():
+    """In air, where the colour is linear in a template."""
+    random = np.random.default_rng(1)
+    offset = jnp.asarray(random.normal(size=(1, 2, 3, 3)) + 2.2, float)
+    templates = ScattererTemplate(offset, jnp.asarray(random.uniform(0.1, 0.3, (1, 2, 3)), float))
+
+    def seen(templates, **how):
+        skin = Material(0.5, 1.0)
+        how = {"reach": (2.0,), "given": templates, **how}
+        return shade(ScattererTemplates(skin, lights(sky=True), **how), nodes({}), TRANSFER, [(0, 0, 0)])[0]
+
+    each = [seen(jax.tree.map(lambda leaf, i=i: leaf[:, i : i + 1], templates)) for i in (0, 1)]
+    assert np.abs(each[0] - each[1]).max() > 1e-2
+    same(seen(templates, blend=True), (each[0] + each[1]) / 2)
+
+
+# ---------------------------------------------------------------- what it looks like
+
+PLAIN = jv.TransferFunction([0.0, 0.5, 1.0], np.full((3, 3), 0.7), [0.0, 0.0, 4.0])
+DENSE = jv.TransferFunction(PLAIN.values, PLAIN.colors, 10 * PLAIN.extinction)
+FLESH = Material(0.5, 0.12, 1.3)
+NODES, SPACING = 25, 1 / 12  # from -1 to 1
+
+
+def solid(inside):
+    """A volume of 1 where `inside(x, y, z)` is true, else 0."""
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, NODES)] * 3, indexing="ij")
+    return jv.Volume(inside(x, y, z).astype(np.float32), (SPACING,) * 3, (-1, -1, -1))
+
+
+@functools.cache
+def pool():
+    """Many templates, grown once: (1, 64, photons)."""
+    return scatterer_templates(FLESH, 1, count=64, levels=5)
+
+
+def brightness(volume, points, light, *, reach=(2.0,)):
+    """The mean colour of 64 points under a sun and a sky."""
+    some = jax.tree.map(lambda leaf: leaf[:, :4], pool()).blended().brightest(24)
+    lighting = ScattererTemplates(
+        FLESH, light, reach=reach, given=jax.tree.map(lambda leaf: leaf[:, None], some)
+    )
+    assert len(points) == 64
+    return shade(lighting, volume, DENSE, points).mean()
+
+
+def grid(center, u, v, size):
+    """64 points on a square."""
+    s = (np.arange(8) + 0.5) / 8 - 0.5
+    a, b = (part.reshape(-1, 1) for part in np.meshgrid(s, s))
+    return np.asarray(center) + size * (a * np.asarray(u) + b * np.asarray(v))
+
+
+BLOCK = solid(lambda x, y, z: np.maximum(np.maximum(abs(x), abs(y)), abs(z)) < 0.5)
+SUN = DirectionalLight((0, 0, -1.0))
+DAY = SUN, ConstantLight((0, 0, 0))
+TOP, BOTTOM = (grid((0, 0, z), (1, 0, 0), (0, 1, 0), 0.5) for z in (0.46, -0.46))
+
+
+def test_the_lit_side_is_brighter():
+    assert brightness(BLOCK, TOP, DAY) > 3 * brightness(BLOCK, BOTTOM, DAY)
+    ball = solid(lambda x, y, z: x**2 + y**2 + z**2 < 0.7**2)
+    random = np.random.default_rng(0)
+    z, around = random.uniform(0.5, 1, 64), random.uniform(0, 2 * np.pi, 64)
+    ring = np.sqrt(1 - z**2)
+    cap = 0.7 * np.stack([ring * np.cos(around), ring * np.sin(around), z], axis=-1)
+    assert brightness(ball, cap, DAY) > 1.5 * brightness(ball, -cap, DAY)
+
+
+def test_cavities_are_darker_than_open_faces():
+    """The floor of a pit two voxels deep, against the face around it, under a sky."""
+    sky = DirectionalLight((0, 0, -1.0), (0, 0, 0)), ConstantLight()
+    pit = solid(
+        lambda x, y, z: (
+            (np.maximum(abs(x), abs(y)) < 0.7)
+            & (abs(z) < 0.5)
+            & ~((np.maximum(abs(x), abs(y)) < 0.1) & (z > 0.1))
+        )
+    )
+    floor = grid((0, 0, 0.05), (1, 0, 0), (0, 1, 0), 0.1)
+    face = grid((0.4, 0.4, 0.46), (1, 0, 0), (0, 1, 0), 0.1)
+    assert brightness(pit, floor, sky) < 0.7 * brightness(pit, face, sky)
+
+
+def test_a_thin_plate_shades_what_is_behind_it_within_reach():
+    """An ear before the head: photons come to lie between the two, and beyond the plate."""
+    plate = solid(
+        lambda x, y, z: (np.maximum(np.maximum(abs(x), abs(y)), abs(z)) < 0.5) | (abs(z - 0.67) < 0.05)
+    )
+    behind, far = (
+        brightness(plate, TOP, DAY, reach=reach) / brightness(BLOCK, TOP, DAY, reach=reach)
+        for reach in ((2.0,), ())
+    )
+    assert behind < 0.97 * far
+
+
+def test_noise_falls_as_templates_are_blended():
+    """Over pixels of a flat face that are alike but for their choice of a template: as one over the root."""
+    n = pool().intensity.shape[-1]
+    pixels = jnp.asarray(np.indices((20, 20)).reshape(2, -1).T, jnp.int32)
+    points = np.tile((0.03, 0.02, 0.46), (len(pixels), 1))
+    noise = []
+    for count in (1, 2, 4, 8):
+        sets = jax.tree.map(lambda leaf, c=count: leaf.reshape(64 // c, c, *leaf.shape[2:]), pool())
+        blended = sets.blended().brightest(8 * n)
+        missing = 8 * n - blended.intensity.shape[-1]
+        blended = ScattererTemplate(
+            jnp.pad(jnp.tile(blended.offset, (count, 1, 1)), ((0, 0), (0, missing), (0, 0))),
+            jnp.pad(jnp.tile(blended.intensity, (count, 1)), ((0, 0), (0, missing))),
+        )
+        given = jax.tree.map(lambda leaf: leaf[None], blended)
+        lighting = ScattererTemplates(FLESH, SUN, reach=(2.0,), given=given)
+        noise.append(shade(lighting, BLOCK, DENSE, points, pixels=pixels).std())
+    ratios = np.array(noise) * np.sqrt([1, 2, 4, 8]) / noise[0]
+    assert np.all(np.diff(noise) < 0)
+    assert np.all(np.abs(ratios - 1) < 0.35), ratios
+
+
+# ---------------------------------------------------------------- gradients of single samples
+
+
+def loss_of_points(lighting, scene):
+    """A sum over some lit points of a block, whose voxels rise smoothly."""
+    volume, transfer, points = scene
+    pixels = jnp.zeros((len(points), 2), jnp.int32)
+    found = lit_points(lighting, volume, transfer, points, pixels, jnp.ones(()))
+    return jnp.mean(found @ jnp.asarray([1.0, 0.6, -0.3]))
+
+
+def smooth_scene():
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, 9)] * 3, indexing="ij")
+    data = 1 / (1 + np.exp(6 * (x**2 + 0.5 * y**2 + z**2 + 0.4 * x * y - 0.5)))
+    volume = jv.Volume(jnp.asarray(data, float), (0.25,) * 3, (-1, -1, -1))
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (256, 3))
+    return (
+        volume,
+        doubled(jv.TransferFunction(PLAIN.values, PLAIN.colors, PLAIN.extinction)),
+        jnp.asarray(points),
+    )
+
+
+def slopes_in_the_path(occlusion, *steps):
+    """The adjoint's slope in λ, and central differences at these steps."""
+    with in_float64():
+        scene = smooth_scene()
+        lighting = ScattererTemplates(
+            Material(0.5, 0.3, 1.2),
+            (DirectionalLight((0.2, 0.4, -1)), ConstantLight((0.3, 0.3, 0.3))),
+            occlusion=occlusion,
+            templates=1,
+            packets=2,
+            photons=6,
+            reach=(2.0,),
+            cutoff=0.0,
+        )
+
+        @jax.jit
+        @jax.value_and_grad
+        def loss(path):
+            moved = eqx.tree_at(lambda light: light.materials[0].mean_free_path, lighting, path)
+            return loss_of_points(moved, scene)
+
+        at = jnp.asarray(0.3)
+        differences = (float(loss(at + h)[0] - loss(at - h)[0]) / (2 * h) for h in steps)
+        return float(loss(at)[1]), *differences
+
+
+def test_the_soft_gradient_in_the_path_is_the_difference_at_any_step():
+    adjoint, narrow, wide = slopes_in_the_path("soft", 2e-8, 1e-2)
+    np.testing.assert_allclose(adjoint, narrow, rtol=1e-5)
+    np.testing.assert_allclose(adjoint, wide, rtol=0.02)
+
+
+def test_the_hard_gradient_in_the_path_is_wrong():
+    """It does not see photons that become hidden, which are the most of it."""
+    adjoint, difference = slopes_in_the_path("hard", 1e-2)
+    assert abs(adjoint - difference) > 0.5 * abs(difference)
+
+
+# ---------------------------------------------------------------- at extremes
+
+EXTREMES = {
+    "as it is": {},
+    "nothing is seen": {"extinction": 0.0},
+    "all is opaque": {"extinction": 1e6},
+    "nothing is absorbed": {"opacity": 0.0},
+    "all is absorbed": {"opacity": 1.0},
+    "a short path": {"path": 1e-6},
+    "a long path": {"path": 1e6},
+    "an empty volume": {"data": 0.0},
+    "as air": {"index": 1.0},
+}
+
+
+@pytest.mark.parametrize("occlusion", ["soft", pytest.param("hard", marks=pytest.mark.slow)])
+def test_values_and_gradients_are_finite_at_extremes(occlusion):
+    """A lamp is at one of the samples throughout."""
+    volume, transfer, points = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float32) if eqx.is_array(leaf) else leaf, smooth_scene()
+    )
+    lighting = ScattererTemplates(
+        (Material(0.5, 0.3, 1.2, values=(0.4, 2.0)), Material(0.7, 0.2, 1.5)),
+        (DirectionalLight((0.2, 0.4, -1)), PointLight(tuple(map(float, points[0]))), ConstantLight()),
+        occlusion=occlusion,
+        templates=1,
+        packets=2,
+        photons=6,
+        reach=(2.0,),
+    )
+
+    @eqx.filter_jit
+    def slopes(scene):
+        return eqx.filter_value_and_grad(lambda scene: loss_of_points(scene[0], scene[1]))(scene)
+
+    for name, change in EXTREMES.items():
+        moved, data, function = lighting, volume, transfer
+        of_materials = {
+            "opacity": lambda light: [m.opacity for m in light.materials],
+            "path": lambda light: [m.mean_free_path for m in light.materials],
+            "index": lambda light: [m.refractive_index for m in light.materials],
+        }
+        for what, where in of_materials.items():
+            if what in change:
+                moved = eqx.tree_at(where, moved, [jnp.asarray(change[what])] * 2)
+        if "extinction" in change:
+            function = eqx.tree_at(
+                lambda t: t.extinction, function, jnp.full_like(function.extinction, change["extinction"])
+            )
+        if "data" in change:
+            data = eqx.tree_at(lambda v: v.data, data, jnp.full_like(data.data, change["data"]))
+        value, gradient = slopes((moved, (data, function, points)))
+        assert np.isfinite(value), name
+        for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+            assert np.all(np.isfinite(leaf)), (name, jax.tree_util.keystr(path))
+
+
+# ---------------------------------------------------------------- baked
+
+
+def baked_scene():
+    volume = solid(lambda x, y, z: x**2 + y**2 + z**2 < 0.6**2)
+    random = np.random.default_rng(0).normal(size=(64, 3))
+    points = 0.57 * random / np.linalg.norm(random, axis=1, keepdims=True)
+    given = jax.tree.map(lambda leaf: leaf[:, :2], pool()).brightest(6)
+    return volume, points, {"given": given, "reach": (2.0,)}
+
+
+def test_baked_light_comes_closer_to_the_blended_one_as_its_grid_gets_finer():
+    volume, points, how = baked_scene()
+    exact = shade(ScattererTemplates(FLESH, SUN, blend=True, **how), volume, PLAIN, points)
+    errors = []
+    for resolution in (5, 13, 37):
+        lighting = ScattererTemplates(FLESH, SUN, baked=resolution, **how)
+        ready = lighting.prepared(look_around(volume, PLAIN))
+        assert ready.shape == (resolution,) * 3
+        errors.append(np.abs(shade(ready, volume, PLAIN, points) - exact).mean())
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] < 0.05 * exact.mean()
+
+
+def test_light_is_baked_once_for_what_stays_the_same(monkeypatch):
+    volume, _, how = baked_scene()
+    calls = []
+
+    def baked(lighting, around):
+        calls.append(lighting)
+        return BakedLighting(jnp.zeros(8, jnp.uint32), jnp.zeros(3), (2, 2, 2))
+
+    monkeypatch.setattr(scatterers, "_baked", baked)
+
+    def prepared(volume=volume, transfer=PLAIN, light=SUN, path=0.12, step=0.1):
+        lighting = ScattererTemplates(Material(0.5, path, 1.3), light, baked=9, **how)
+        return _prepared(lighting, volume, transfer, jv.March(step))
+
+    first = prepared()
+    assert prepared() is first
+    assert prepared(step=0.2) is first
+    assert len(calls) == 1
+    for number, changed in enumerate(
+        (
+            {"light": DirectionalLight((0, 1.0, -1))},
+            {"path": 0.2},
+            {"transfer": eqx.tree_at(lambda t: t.colors, PLAIN, PLAIN.colors / 2)},
+            {"volume": jv.Volume(volume.data + 0.1, volume.spacing, volume.origin)},
+            {"volume": jv.Volume(volume.data, 2 * volume.spacing, volume.origin)},
+        )
+    ):
+        assert prepared(**changed) is prepared(**changed)
+        assert len(calls) == number + 2, changed
+
+
+def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
+    volume, points, how = baked_scene()
+    lighting = ScattererTemplates(FLESH, SUN, baked=13, **how)
+    ready = lighting.prepared(look_around(volume, PLAIN))
+    expected = shade(ready, volume, PLAIN, points)
+    # under jit, where nothing is prepared
+    np.testing.assert_allclose(shade(lighting, volume, PLAIN, points), expected, atol=2e-3)
+    slope = eqx.filter_grad(lambda light: jnp.sum(shade_traced(light, volume, points)))(lighting)
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(slope))
+
+
+def shade_traced(lighting, volume, points):
+    pixels = jnp.zeros((len(points), 2), jnp.int32)
+    return lit_points(lighting, volume, PLAIN, jnp.asarray(points, float), pixels, jnp.ones(()))
+
+
+# ---------------------------------------------------------------- images
+
+SIZE = (16, 12)
+MANY = (
+    DirectionalLight((0.6, 0.8, -1.0), (0.9, 0.8, 0.7)),
+    PointLight((0.9, -1.2, 1.4), (1.0, 1.0, 2.0)),
+    ConstantLight((0.1, 0.15, 0.2)),
+)
+PARTS = (Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.8, 0.1, 1.5, values=(0.5, 2.0)))
+SETS = {
+    "leapt": (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)),
+    "unleapt": (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05)),
+    "plain": (),
+    "aligned": (jv.AlphaCorrection(),),
+    "jittered": (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection()),
+}
+
+
+def templates(occlusion="soft", materials=PARTS, light=MANY, **how):
+    how = {"templates": 2, "packets": 2, "photons": 4, "reach": (2.0,), "seed": 5, **how}
+    return ScattererTemplates(materials, light, occlusion=occlusion, **how)
+
+
+def both(volume, transfer, camera, march, lighting):
+    """The image by the fast engine and by the reference."""
+    fast, slow = (
+        jv.render(volume, transfer, camera, march, lighting=lighting, adjoint=adjoint)
+        for adjoint in ("replay", "direct")
+    )
+    assert fast.rgba[..., :3].max() > 0.1
+    np.testing.assert_array_equal(fast.samples, slow.samples)
+    return np.asarray(fast.rgba), np.asarray(slow.rgba)
+
+
+CASES = [
+    pytest.param(name, occlusion, marks=() if (name, occlusion) == ("leapt", "soft") else pytest.mark.slow)
+    for occlusion in ("soft", "hard")
+    for name in SETS
+]
+
+
+@pytest.mark.parametrize(("transforms", "occlusion"), CASES)
+def test_the_fast_engine_is_the_reference(transforms, occlusion):
+    """Under hard occlusion rounding may hide a photon, by which single pixels differ."""
+    volume = scaled_phantom("sphere", 12)
+    march = jv.March(0.07, SETS[transforms], max_samples=80)
+    fast, slow = both(volume, soft_transfer(0.1), around(volume, SIZE), march, templates(occlusion))
+    off = np.abs(fast - slow).max(axis=-1)
+    if occlusion == "hard":
+        off = np.sort(off.reshape(-1))[:-4]
+    assert off.max() <= 2e-5
+
+
+@pytest.mark.slow
+def test_leaping_over_empty_space_changes_no_lit_pixel():
+    volume = scaled_phantom("sphere", 12)
+    camera, transfer = around(volume, SIZE), soft_transfer(0.1)
+    leapt, other = (
+        jv.render(volume, transfer, camera, jv.March(0.07, SETS[name], max_samples=80), lighting=templates())
+        for name in ("leapt", "unleapt")
+    )
+    np.testing.assert_allclose(leapt.rgba, other.rgba, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_a_curved_grid_and_labels_are_lit_alike():
+    volume, probe = jv.toroidal_phantom(20)
+    data = np.asarray(volume.data, np.float32) / float(np.max(volume.data))
+    volume = jv.Volume(data, volume.spacing, volume.origin)
+    march = jv.March(4.0, (probe, jv.AlphaCorrection()), max_samples=128)
+    space = march.locate(volume)
+    center = np.array([float(m) for m in space.middle])
+    far = center + 1.5 * float(space.diagonal) * np.array([0.5, -0.7, 0.5])
+    camera = jv.Camera(far, center, (0, 0, 1), 30.0, size=SIZE)
+    flesh = Material(0.5, 8.0, 1.4)
+    fast, slow = both(volume, soft_transfer(10.0), camera, march, templates(materials=flesh, light=MANY[0]))
+    np.testing.assert_allclose(fast, slow, atol=2e-5)
+
+    noise = anisotropic_noise()
+    labels = (np.indices(noise.shape).sum(axis=0) // 9 % 3).astype(np.uint8)
+    volume = jv.Volume(noise.data, noise.spacing, noise.origin, labels)
+    one = soft_transfer(0.3)
+    other = jv.TransferFunction(one.values, 1 - one.colors, 2 * one.extinction)
+    march = jv.March(0.07, (jv.AlphaCorrection(labels=True),), max_samples=80)
+    materials = Material(0.5, 0.15, 1.4, label=1), Material(0.8, 0.1, 1.5, label=2)
+    fast, slow = both(
+        volume,
+        jv.LabelTransferFunction([None, one, other]),
+        around(volume, SIZE),
+        march,
+        templates(materials=materials),
+    )
+    np.testing.assert_allclose(fast, slow, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_a_baked_image_is_like_the_blended_one():
+    volume = scaled_phantom("sphere", 24)
+    camera, transfer = around(volume, SIZE), soft_transfer(0.1)
+    march = jv.March(0.05, (jv.AlphaCorrection(),), max_samples=128)
+    exact, baked, unlit = (
+        np.asarray(jv.render(volume, transfer, camera, march, lighting=lighting).rgba)
+        for lighting in (templates(blend=True), templates(baked=48), None)
+    )
+    assert np.abs(baked - exact).mean() < 0.05 * np.abs(unlit - exact).mean()
+
+    @jax.jit
+    def image(position):
+        moved = eqx.tree_at(lambda c: c.position, camera, position)
+        return jv.render(volume, transfer, moved, march, lighting=templates(baked=48)).rgba
+
+    np.testing.assert_allclose(image(camera.position), baked, atol=2e-3)
+
+
+def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
+    """All of it goes through one of these, which the programs of images and gradients with a light call."""
+    called = []
+    for module in (seam, reference, visible):
+        for name in ("lit", "lit_colors", "Chosen", "Sample"):
+            if hasattr(module, name):
+                original = getattr(module, name)
+
+                def noted(*args, name=name, original=original, **how):
+                    called.append(name)
+                    return original(*args, **how)
+
+                monkeypatch.setattr(module, name, noted)
+    volume = scaled_phantom("sphere", 12)
+    transfer, camera, march = soft_transfer(0.1), around(volume, (9, 7)), jv.March(0.2, max_samples=32)
+
+    def loss(camera, lighting, adjoint):
+        return jnp.sum(jv.render(volume, transfer, camera, march, lighting=lighting, adjoint=adjoint).rgba)
+
+    for adjoint in ("replay", "direct"):
+        eqx.filter_eval_shape(eqx.filter_grad(loss), camera, None, adjoint)
+    assert not called
+    eqx.filter_eval_shape(loss, camera, templates(), "direct")
+    assert "Sample" in called
+    assert "lit" in called
+
+
+# ---------------------------------------------------------------- gradients of images
+
+IMAGE_STEP = 2e-8
+"""Of central differences in float64: among the kinks of a piecewise linear field, which lie densely."""
+
+LEAVES = {
+    "opacity": lambda s: s[4].materials[0].opacity,
+    "mean_free_path": lambda s: s[4].materials[0].mean_free_path,
+    "refractive_index": lambda s: s[4].materials[0].refractive_index,
+    "other opacity": lambda s: s[4].materials[1].opacity,
+    "other mean_free_path": lambda s: s[4].materials[1].mean_free_path,
+    "other refractive_index": lambda s: s[4].materials[1].refractive_index,
+    "direction": lambda s: s[4].lights[0].direction,
+    "irradiance": lambda s: s[4].lights[0].irradiance,
+    "light's position": lambda s: s[4].lights[1].position,
+    "intensity": lambda s: s[4].lights[1].intensity,
+    "radiance": lambda s: s[4].lights[2].radiance,
+    "colors": lambda s: s[1].colors,
+    "extinction": lambda s: s[1].extinction,
+    "data": lambda s: s[0].data,
+    "spacing": lambda s: s[0].spacing,
+    "origin": lambda s: s[0].origin,
+    "position": lambda s: s[2].position,
+    "focal_point": lambda s: s[2].focal_point,
+    "view_up": lambda s: s[2].view_up,
+    "view_angle": lambda s: s[2].view_angle,
+    "step": lambda s: s[3].step,
+}
+
+
+def image_scene():
+    """A small scene in float64, its materials meeting in the midst of its values."""
+    noise = anisotropic_noise()
+    volume = jv.Volume(
+        jnp.asarray(np.asarray(noise.data[:6, :5, :7], float)), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1)
+    )
+    transfer = doubled(soft_transfer())
+    transfer = eqx.tree_at(lambda t: t.extinction, transfer, transfer.extinction + 0.1)
+    camera = jv.Camera((1.9, -1.3, 1.7), tuple(map(float, volume.center)), (0.1, 0, 1), 40.0, size=(6, 5))
+    march = jv.March(0.21, (jv.AlphaCorrection(),), "midpoint", max_samples=32)
+    materials = Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.7, 0.1, 1.2, values=(0.5, 2.0))
+    lights = (
+        DirectionalLight((0.6, 0.8, -1.0), (0.9, 0.8, 0.7)),
+        PointLight((0.9, -1.2, 1.4), (1.0, 1.0, 2.0)),
+        ConstantLight((0.1, 0.15, 0.2)),
+    )
+    return volume, transfer, camera, march, templates(materials=materials, light=lights)
+
+
+def image_loss(adjoint):
+    random = np.random.default_rng(5)
+    weights = random.normal(size=(5, 6, 4))
+
+    def loss(scene):
+        rendering = jv.render(*scene[:4], lighting=scene[4], adjoint=adjoint)
+        return jnp.sum(rendering.rgba * jnp.asarray(weights))
+
+    return loss
+
+
+def directions(scene):
+    random = np.random.default_rng(0)
+    return {leaf: jnp.asarray(random.normal(size=where(scene).shape)) for leaf, where in LEAVES.items()}
+
+
+def differences(value, scene, names):
+    """Slopes of the loss along a direction of each leaf."""
+    along, found = directions(scene), {}
+    for leaf in names:
+        where = LEAVES[leaf]
+        ends = [
+            value(eqx.tree_at(where, scene, where(scene) + sign * IMAGE_STEP * along[leaf]))
+            for sign in (1, -1)
+        ]
+        found[leaf] = float(ends[0] - ends[1]) / (2 * IMAGE_STEP)
+    return found
+
+
+def check_slopes(gradient, scene, expected):
+    along = directions(scene)
+    for leaf, difference in expected.items():
+        slope = jnp.vdot(LEAVES[leaf](gradient), along[leaf])
+        np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6, err_msg=leaf)
+
+
+def test_gradients_of_an_image_match_central_differences():
+    """By one program, which gives the value as well as the gradient."""
+    with in_float64():
+        scene = image_scene()
+        program = eqx.filter_jit(eqx.filter_value_and_grad(image_loss("replay")))
+        expected = differences(lambda s: program(s)[0], scene, LEAVES)
+        assert min(map(abs, expected.values())) > 1e-5
+        check_slopes(program(scene)[1], scene, expected)
+
+
+@pytest.mark.slow
+def test_replay_direct_and_forward_agree():
+    with in_float64():
+        scene = image_scene()
+        replay, direct = (
+            eqx.filter_jit(eqx.filter_grad(image_loss(adjoint)))(scene) for adjoint in ("replay", "direct")
+        )
+        for leaf, where in LEAVES.items():
+            size = float(np.abs(where(direct)).max())
+            np.testing.assert_allclose(
+                where(replay), where(direct), rtol=1e-7, atol=1e-9 * size, err_msg=leaf
+            )
+        forward = eqx.filter_jit(lambda s, t: eqx.filter_jvp(image_loss("forward"), (s,), (t,))[1])
+        for leaf, along in directions(scene).items():
+            still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
+            slope = forward(scene, eqx.tree_at(LEAVES[leaf], still, along))
+            np.testing.assert_allclose(slope, jnp.vdot(LEAVES[leaf](direct), along), rtol=1e-7, atol=1e-9)
+
+
+# ---------------------------------------------------------------- bad input
+
+HALF = Material(0.5, 1.0)
+BAD = {
+    "templates": (lambda: ScattererTemplates(HALF, SUN, templates=0), "templates must be an integer"),
+    "photons": (lambda: ScattererTemplates(HALF, SUN, photons=0), "photons must be an integer"),
+    "occlusion": (
+        lambda: ScattererTemplates(HALF, SUN, occlusion="some"),
+        "occlusion must be one of soft, h",
+    ),
+    "reach": (lambda: ScattererTemplates(HALF, SUN, reach=(1.0, 2.0)), "reach must be multiples above 1"),
+    "reach's order": (lambda: ScattererTemplates(HALF, SUN, reach=(4.0, 2.0)), "reach must be multiples"),
+    "cutoff": (lambda: ScattererTemplates(HALF, SUN, cutoff=1.0), "cutoff must be"),
+    "seed": (lambda: ScattererTemplates(HALF, SUN, seed=-1), "seed must be an integer"),
+    "baked": (lambda: ScattererTemplates(HALF, SUN, baked=1), "baked must be an integer of at least 2"),
+    "threshold": (lambda: ScattererTemplates(HALF, SUN, threshold=0.0), "threshold must be"),
+    "packets": (lambda: ScattererTemplates(HALF, SUN, packets=0), "packets must be an integer"),
+    "energy": (lambda: ScattererTemplates(HALF, SUN, energy="lost"), "energy must be one of"),
+    "critical_angle": (lambda: ScattererTemplates(HALF, SUN, critical_angle=0.0), "critical_angle must be"),
+    "given": (lambda: ScattererTemplates([HALF, HALF], SUN, given=given(PAIR)), "templates of 2 materials"),
+    "lights": (lambda: ScattererTemplates(HALF, ()), "lights must be a light"),
+    "materials": (lambda: ScattererTemplates((), SUN), "materials must hold a Material at least"),
+    "lighting": (
+        lambda: _prepared(3, nodes({}), TRANSFER, jv.March(0.1)),
+        "lighting must be None or a Lighting, such as ScattererTemplates; got 3",
+    ),
+    "labels": (
+        lambda: shade(
+            ScattererTemplates(Material(0.5, 1.0, label=1), SUN, given=given(PAIR)),
+            nodes({}),
+            TRANSFER,
+            [(0, 0, 0)],
+        ),
+        "labels are needed here",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_levels_are_asked_for_where_an_opacity_is_traced():
+    def photons(opacity, **how):
+        return ScattererTemplates(Material(opacity, 1.0), SUN, **how).grown(blend=False).intensity
+
+    with pytest.raises(ValueError, match="levels must be given where opacity is traced"):
+        jax.eval_shape(photons, 0.5)
+    assert jax.eval_shape(lambda a: photons(a, levels=3, packets=2), 0.5).shape == (1, 8, 14)

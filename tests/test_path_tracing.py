@@ -1,0 +1,353 @@
+"""Does path tracing give the light that is there, and the error that it has?
+
+Held against closed forms (absorption, a white furnace, Chandrasekhar's diffuse reflection) and quadrature in
+NumPy, by z-scores of pixels and of means over regions. Seeds are fixed, so that a test that passes stays so.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+import jaxvol as jv
+from jaxvol.lighting import ConstantLight, DirectionalLight, Light, Material, PointLight
+
+from .scenes import anisotropic_noise, around, in_float64, inside, soft_transfer, uniform_transfer
+
+
+EXTINCTION = np.array([0.0, 0.0, 1.0, 4.0, 0.5, 0.0, 7.0, 7.0])
+POINTS = np.array([0.0, 0.3, 0.35, 0.5, 0.55, 0.6, 0.9, 1.0])
+COLORS = np.linspace((0.9, 0.2, 0.6), (0.3, 1.0, 0.5), 8)
+BLACK = (0.0, 0.0, 0.0)
+SUN = DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0))
+LAMP = PointLight((1.5, -2.0, 2.0), (1.0, 4.0, 2.0))
+SKY = ConstantLight((0.5, 1.0, 0.7))
+NIGHT = DirectionalLight((0.0, 0.0, 1.0), BLACK), PointLight((5.0, 0.0, 0.0), BLACK), ConstantLight(BLACK)
+PATHS = 128
+
+
+def lit(*lights: Light) -> tuple[Light, ...]:
+    """These lights, and one of each other kind that is out: one compiled program serves all tests."""
+    return tuple(next((one for one in lights if type(one) is type(out)), out) for out in NIGHT)
+
+
+FURNACE = lit(ConstantLight())
+
+
+def trace(volume, transfer, camera, lights, **how: Any) -> jv.PathTraced:
+    return jv.path_trace(volume, transfer, camera, lights, **({"paths": PATHS} | how))
+
+
+def often(times: int, *scene: Any, **how: Any) -> jv.PathTraced:
+    """So many times PATHS."""
+    traced = None
+    for _ in range(times):
+        traced = trace(*scene, **how, onto=traced)
+    assert traced is not None
+    return traced
+
+
+def cube(labels=None) -> jv.Volume:
+    """The same everywhere, with sides of length 1."""
+    return jv.Volume(np.full((24,) * 3, 0.5, np.float32), (1 / 23,) * 3, labels=labels)
+
+
+def far(volume: jv.Volume, height: float) -> jv.Camera:
+    """A view of so much of a volume, along +z, almost parallel."""
+    center = np.asarray(volume.center)
+    angle = np.rad2deg(2 * np.arctan(height / 2 / 200))
+    return jv.Camera(center - [0, 0, 200], center, (0, 1, 0), angle, size=(20, 16))
+
+
+def spiky(factor: float = 1.0) -> jv.TransferFunction:
+    """Clear, thin and dense by turns."""
+    return jv.TransferFunction(POINTS, COLORS, factor * EXTINCTION)
+
+
+def regions(image) -> np.ndarray:
+    """Sums over blocks of 4 x 4 pixels."""
+    height, width, *rest = np.shape(image)
+    return np.asarray(image, float).reshape(height // 4, 4, width // 4, 4, *rest).sum(axis=(1, 3))
+
+
+def z_of_regions(difference, variance) -> np.ndarray:
+    """How many standard errors the regions' differences are. 0 where both are 0."""
+    return regions(difference) / np.sqrt(np.maximum(regions(variance), 1e-30))
+
+
+@pytest.mark.parametrize("view", [around, inside])
+def test_opacity_is_that_of_absorption(view):
+    volume = anisotropic_noise()
+    camera = view(volume)
+    traced = np.asarray(trace(volume, spiky(), camera, FURNACE).opacity)
+    march = jv.March(float(volume.spacing.min()) / 40, (jv.AlphaCorrection(),), "midpoint")
+    opacity = np.asarray(jv.render(volume, spiky(), camera, march).rgba[..., 3], float)
+    assert np.ptp(opacity) > 0.3
+    assert np.all(traced[opacity == 0] == 0)
+    z = z_of_regions(traced - opacity, opacity * (1 - opacity) / PATHS)
+    assert abs(z).max() < 3.5
+    assert 0.5 < np.mean(z**2) < 1.7
+
+
+def test_the_opacity_of_a_constant_volume_is_its_closed_form():
+    volume, extinction = cube(), 0.9
+    traced = trace(volume, uniform_transfer(extinction, BLACK), far(volume, 0.6), FURNACE)
+    expected = -np.expm1(-extinction)
+    error = np.sqrt(expected * (1 - expected) / (PATHS * traced.opacity.size))
+    assert abs(float(traced.opacity.mean()) - expected) < 3 * error
+    # nothing is scattered, and what stands behind is seen through what is left
+    assert float(traced.radiance.max()) == 0
+    behind, left = np.array([2.0, 1.0, 0.5], np.float32), 1 - np.asarray(traced.opacity)
+    np.testing.assert_allclose(traced.image(behind), left[..., None] * behind, rtol=1e-6)
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.8, -0.5])
+def test_in_a_white_furnace_nothing_is_to_be_seen(anisotropy):
+    volume = anisotropic_noise()
+    transfer = jv.TransferFunction(POINTS, np.ones((8, 3)), 10 * EXTINCTION)
+    traced = trace(volume, transfer, around(volume), FURNACE, anisotropy=anisotropy)
+    assert float(traced.scatterings.max()) > 3
+    np.testing.assert_allclose(traced.image(), 1, atol=1e-5)
+    assert not traced.exhausted.any()
+
+
+def once_scattered(volume, transfer, camera, lights, anisotropy, samples=256, toward=64) -> np.ndarray:
+    """Light scattered a single time, by the midpoint rule along the ray and along the way to each light."""
+    data, spacing, origin = (np.asarray(a, float) for a in (volume.data, volume.spacing, volume.origin))
+    low, high = (np.asarray(corner, float) for corner in volume.corners)
+    values, colors, table = (
+        np.asarray(a, float) for a in (transfer.values, transfer.colors, transfer.extinction)
+    )
+
+    def value(points):
+        return (
+            map_coordinates(data, ((points - origin) / spacing).T.reshape(3, -1), order=1)
+            .reshape(points.shape[:-1][::-1])
+            .T
+        )
+
+    def extinction(points):
+        return np.interp(value(points), values, table)
+
+    def exits(origins, directions):
+        with np.errstate(divide="ignore"):
+            walls = np.stack([(low - origins) / directions, (high - origins) / directions])
+        return np.maximum(walls.min(axis=0).max(axis=-1), 0), walls.max(axis=0).min(axis=-1)
+
+    origins, directions = (np.asarray(a, float).reshape(-1, 3) for a in camera.rays())
+    near, far = exits(origins, directions)
+    width = np.maximum(far - near, 0) / samples
+    middles = np.arange(samples) + 0.5
+    points = origins[:, None] + (near[:, None] + middles * width[:, None])[..., None] * directions[:, None]
+    points = np.clip(points, low, high)
+    here = value(points)
+    density = np.interp(here, values, table)
+    albedo = np.stack([np.interp(here, values, colors[:, i]) for i in range(3)], axis=-1)
+    depth = np.cumsum(density, axis=1) * width[:, None] - density * width[:, None] / 2
+    gathered = np.zeros((len(origins), 3))
+    for light in lights:
+        if isinstance(light, DirectionalLight):
+            way = np.broadcast_to(-np.asarray(light.direction, float), points.shape)
+            irradiance = np.asarray(light.irradiance, float)
+            end = np.inf
+        else:
+            way = np.asarray(light.position, float) - points
+            end = np.linalg.norm(way, axis=-1)
+            irradiance = np.asarray(light.intensity, float) / end[..., None] ** 2
+        way = way / np.linalg.norm(way, axis=-1, keepdims=True)
+        step = np.minimum(exits(points, way)[1], end) / toward
+        shade = np.zeros(step.shape)
+        for i in range(toward):
+            shade += step * extinction(np.clip(points + ((i + 0.5) * step)[..., None] * way, low, high))
+        cosine = np.sum(way * directions[:, None], axis=-1)
+        g = anisotropy
+        phase = (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
+        weight = (density * width[:, None] * phase * np.exp(-depth - shade))[..., None]
+        gathered += np.sum(weight * albedo * irradiance, axis=1)
+    return gathered.reshape(*np.asarray(camera.rays()[0]).shape)
+
+
+def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_told():
+    volume, transfer, anisotropy = anisotropic_noise(), spiky(), 0.4
+    camera = around(volume)
+    how: Any = {"anisotropy": anisotropy, "max_scatterings": 1}
+    traced = often(2, volume, transfer, camera, lit(SUN, LAMP), **how)
+    assert traced.exhausted.any()  # what was scattered once would have gone on
+    expected = once_scattered(volume, transfer, camera, (SUN, LAMP), anisotropy)
+    difference, error = np.asarray(traced.radiance) - expected, np.asarray(traced.standard_error)
+    assert abs(z_of_regions(difference, error**2)).max() < 4
+    assert np.all(abs(difference.sum(axis=(0, 1))) < 3 * np.sqrt((error**2).sum(axis=(0, 1))))
+    bright = expected > 0.3 * expected.max(axis=(0, 1))
+    assert 0.85 < np.std((difference / np.maximum(error, 1e-30))[bright]) < 1.15
+
+    more = often(8, volume, transfer, camera, lit(SUN, LAMP), **how)
+    assert more.paths == 4 * traced.paths
+    fallen = float(jnp.mean(more.standard_error)) / float(jnp.mean(traced.standard_error))
+    assert abs(fallen - 0.5) < 0.02
+    assert abs(z_of_regions(more.radiance - expected, more.standard_error**2)).max() < 4
+
+
+def chandrasekhar(albedo: np.ndarray, cosine: float) -> np.ndarray:
+    """His function H for isotropic scattering, by iterating its integral equation."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    nodes, weights = (nodes + 1) / 2, weights / 2
+    h = np.ones((len(albedo), 64))
+    root = np.sqrt(1 - albedo)[:, None]
+
+    def next_of(mu):
+        kernel = nodes / (mu[:, None] + nodes)
+        return 1 / (root + (albedo[:, None] / 2) * ((h * weights) @ kernel.T))
+
+    for _ in range(200):
+        h = next_of(nodes)
+    return next_of(np.asarray([cosine]))[:, 0]
+
+
+@pytest.mark.parametrize("albedo", [(0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
+def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(albedo):
+    # a half-space is a cube of 60 mean free paths, seen in the middle of a side
+    albedo, cosine, volume = np.array(albedo), 0.6, cube()
+    sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
+    traced = often(8, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lit(sun))
+    h = chandrasekhar(albedo, 1.0) * chandrasekhar(albedo, cosine)
+    expected = albedo / 4 * cosine / (1 + cosine) * h
+    mean = np.asarray(traced.radiance, float).mean(axis=(0, 1))
+    error = np.sqrt((np.asarray(traced.standard_error, float) ** 2).sum(axis=(0, 1))) / 320
+    assert np.all(error < 0.005 * expected)
+    assert np.all(abs(mean - expected) < 3 * error)
+
+
+def test_lights_add_up():
+    volume, camera, transfer = anisotropic_noise(), around(anisotropic_noise()), spiky(3)
+    each = [trace(volume, transfer, camera, lights, key=7) for lights in (lit(SUN, LAMP), lit(SKY))]
+    all_ = trace(volume, transfer, camera, lit(SUN, LAMP, SKY), key=8)
+    difference = all_.radiance - each[0].radiance - each[1].radiance
+    variance = sum(np.asarray(image.standard_error) ** 2 for image in (*each, all_))
+    assert abs(z_of_regions(difference, variance)).max() < 4
+    np.testing.assert_array_equal(each[0].opacity, each[1].opacity)  # the camera's rays are the same
+
+
+def test_more_paths_are_those_of_all_at_once():
+    volume, camera, lights = anisotropic_noise(), inside(anisotropic_noise()), lit(SUN, SKY)
+    some = trace(volume, spiky(), camera, lights, key=3)
+    more = trace(volume, spiky(), camera, lights, key=3, onto=some)
+    once = trace(volume, spiky(), camera, lights, key=jax.random.key(3), paths=2 * PATHS)
+    assert more.paths == once.paths
+    for name in ("radiance", "opacity", "standard_error", "scatterings"):
+        np.testing.assert_allclose(getattr(more, name), getattr(once, name), rtol=1e-3, atol=1e-5)
+    assert float(abs(more.radiance - some.radiance).max()) > 1e-3
+
+
+def test_how_many_paths_go_on_side_by_side_does_not_show():
+    volume, camera, lights = anisotropic_noise(), around(anisotropic_noise()), lit(SUN, LAMP, SKY)
+    usual = trace(volume, spiky(), camera, lights, key=3)
+    other = trace(volume, spiky(), camera, lights, key=3, lanes=250)  # and in two waves
+    np.testing.assert_array_equal(usual.opacity, other.opacity)
+    np.testing.assert_allclose(usual.radiance, other.radiance, rtol=1e-4, atol=1e-6)
+    # but another key does
+    assert float(abs(trace(volume, spiky(), camera, lights, key=4).radiance - usual.radiance).max()) > 1e-3
+
+
+def test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_its_opacity():
+    volume = anisotropic_noise()
+    camera, lights = around(volume), lit(SUN, LAMP, SKY)
+    materials = Material(0.25, 0.4, values=(0.4, 0.7)), Material(0.5, 0.2, values=(0.6, 2.0))
+    # the same by hand, as steps of the transfer function
+    gap, color = 1e-6, np.array([0.8, 0.9, 1.0])
+    values = np.array([0.0, 0.2, 0.4 - gap, 0.4, 0.7, 0.7 + gap, 0.9, 1.0])
+    kept = np.array([1.0, 1.0, 1.0, 0.75, 0.75, 0.5, 0.5, 0.5])[:, None]
+    by_hand = jv.TransferFunction(values, kept * color, [0.3, 0.3, 0.3, 2.5, 2.5, 5.0, 5.0, 5.0])
+    a = trace(volume, by_hand, camera, lights)
+    b = trace(volume, uniform_transfer(0.3, color), camera, lights, materials=materials, key=1)
+    z = z_of_regions(a.radiance - b.radiance, a.standard_error**2 + b.standard_error**2)
+    assert abs(z).max() < 4
+    opacity = (a.opacity + b.opacity) / 2
+    z = z_of_regions(a.opacity - b.opacity, opacity * (1 - opacity) * 2 / PATHS)
+    assert abs(z).max() < 4
+
+
+def test_materials_are_found_by_label():
+    labels = np.zeros((24,) * 3, np.uint8)
+    labels[12:] = 2
+    volume, material = cube(labels), Material(0.9, 0.5, label=2)
+    traced = trace(volume, uniform_transfer(0.5), far(volume, 0.6), FURNACE, materials=material)
+    right, left = np.s_[:, :8], np.s_[:, 12:]  # seen along +z, x grows to the left
+    for half, extinction in ((left, 0.5), (right, 2.0)):
+        opacity = np.asarray(traced.opacity)[half]
+        expected = -np.expm1(-extinction)
+        error = np.sqrt(expected * (1 - expected) / (PATHS * opacity.size))
+        assert abs(opacity.mean() - expected) < 3.5 * error
+    # a scattering of the material keeps a tenth of the light, one of the rest all of it
+    seen = np.asarray(traced.radiance)[..., 0] / np.asarray(traced.opacity)
+    assert seen[right].mean() < 0.1
+    assert seen[left].mean() > 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["uint8", "int16", "float16", "float64"])
+def test_the_type_of_voxels_does_not_show(kind):
+    whole = np.random.default_rng(0).integers(0, 100, (24,) * 3)
+    transfer = jv.TransferFunction(np.linspace(0, 100, 40), np.full((40, 3), 0.8), np.linspace(0, 9, 40) ** 2)
+    single, other = (
+        trace(jv.Volume(whole.astype(dtype), (1 / 23,) * 3), transfer, far(cube(), 1.2), lit(SUN, LAMP, SKY))
+        for dtype in ("float32", kind)
+    )
+    np.testing.assert_allclose(single.radiance, other.radiance, rtol=1e-3, atol=1e-4)
+    with in_float64():
+        volume = jv.Volume(whole.astype(kind), (1 / 23,) * 3)
+        double = trace(volume, transfer, far(cube(), 1.2), lit(SUN, LAMP, SKY))
+    assert double.radiance.dtype == jnp.float32
+    np.testing.assert_allclose(single.radiance.mean(), double.radiance.mean(), rtol=0.01)
+
+
+def test_what_is_invisible_is_empty():
+    volume = anisotropic_noise()
+    traced = trace(volume, uniform_transfer(0.0), around(volume), lit(SUN, LAMP, SKY))
+    assert float(traced.opacity.max()) == 0
+    np.testing.assert_array_equal(traced.image((0.2, 0.4, 0.6))[0, 0], np.float32([0.2, 0.4, 0.6]))
+    assert float(traced.standard_error.max()) == 0
+
+
+def test_the_error_of_an_image_counts_the_noise_of_its_background():
+    volume, camera = anisotropic_noise(), around(anisotropic_noise())
+    background = (0.5, 2.0, 0.0)
+    several = [
+        trace(volume, spiky(), camera, lit(SUN, LAMP), key=key, max_scatterings=2) for key in range(24)
+    ]
+    images = np.stack([image.image(background) for image in several])
+    told = np.stack([image.image_error(background) for image in several])
+    thick = np.mean([image.opacity for image in several], axis=0) > 0.3
+    assert thick.sum() > 50
+    ratio = images.var(axis=0, ddof=1)[thick].mean(axis=0) / (told**2).mean(axis=0)[thick].mean(axis=0)
+    assert np.all(abs(ratio - 1) < 0.15)
+
+
+def test_bad_arguments_are_named():
+    volume = anisotropic_noise()
+    camera, transfer = around(volume), soft_transfer()
+
+    def fails(word: str, *args, **how):
+        with pytest.raises(ValueError, match=word):
+            jv.path_trace(*(args or (volume, transfer, camera, FURNACE)), **how)
+
+    fails("lights", volume, transfer, camera, ())
+    fails("paths", paths=0)
+    fails("paths", paths=1.5)
+    fails("key", key="seed")
+    fails("key", key=-1)
+    fails("anisotropy", anisotropy=1.0)
+    fails("max_scatterings", max_scatterings=0)
+    fails("lanes", lanes=0)
+    fails("materials", materials=())
+    fails("materials", materials=Material(0.5, 1.0, label=1))
+    fails("labels", volume, jv.LabelTransferFunction([transfer]), camera, FURNACE)
+    fails("onto", onto=np.zeros((16, 20, 3)))
+    flat, rgb = jnp.zeros((4, 4)), jnp.zeros((4, 4, 3))
+    earlier = jv.PathTraced(rgb, flat, rgb, flat, flat > 0, jnp.uint32(0), 2)
+    fails("size", onto=earlier)
+    fails("key", volume, transfer, jv.Camera.looking_at(volume, size=(4, 4)), FURNACE, onto=earlier)
+    with pytest.raises(ValueError, match="background"):
+        earlier.image((1.0, 2.0))

@@ -1,0 +1,115 @@
+"""Does a program that shares no line with ours see the same light? Mitsuba's `volpath`, on the head phantom.
+
+The medium is the same to the last bit but rounding: Mitsuba's grids of extinction and albedo are trilinear
+between our nodes, and ours are linear in the trilinear value.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.lighting import ConstantLight, DirectionalLight
+
+
+mi: Any = pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install jaxvol[peers]")
+
+SIZE = 24
+DENSE = 12.0
+"""Extinction of the greatest value, 1/length; the head is 1.7 lengths high."""
+DARK, BRIGHT = np.array([0.95, 0.6, 0.4]), np.array([0.7, 0.9, 0.99])
+"""Albedo of values 0 and 255."""
+POSITION, VIEW_UP, ANGLE = (1.5, -3.0, 1.2), (0.3, 0.1, 1.0), 34.0
+SUN, IRRADIANCE, SKY = (-0.3, 1.0, -0.6), (6.0, 8.0, 10.0), (0.3, 0.2, 0.1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    """The fast variant where there is an LLVM, else the one that is always there."""
+    import drjit as dr
+
+    mi.set_variant("llvm_ad_rgb" if dr.has_backend(dr.JitBackend.LLVM) else "scalar_rgb")
+
+
+def by_mitsuba(volume: jv.Volume, anisotropy: float, samples: int, seed: int) -> np.ndarray:
+    """Its image of samples at any place of a pixel, with the sky behind."""
+    place = mi.ScalarTransform4f
+    low, high = (corner.tolist() for corner in volume.corners)
+    # its texels are the middles of cells, ours are nodes: its grid reaches half a cell farther
+    half = np.asarray(volume.spacing, float) / 2
+    start, end = np.asarray(low) - half, np.asarray(high) + half
+    to_grid = place().translate(start.tolist()).scale((end - start).tolist())
+    share = np.asarray(volume.data, np.float32).transpose(2, 1, 0)[..., None] / 255
+
+    def grid(values: np.ndarray) -> dict[str, Any]:
+        tensor = mi.VolumeGrid(np.ascontiguousarray(values, np.float32))
+        return {"type": "gridvolume", "grid": tensor, "to_world": to_grid, "raw": True, "wrap_mode": "clamp"}
+
+    middle, extent = (np.asarray(low) + high) / 2, (np.asarray(high) - low) / 2
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": -1, "rr_depth": 64},
+            "sensor": {
+                "type": "perspective",
+                "fov": ANGLE,
+                "fov_axis": "y",
+                "to_world": place().look_at(origin=POSITION, target=middle.tolist(), up=VIEW_UP),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": SIZE,
+                    "height": SIZE,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                },
+                "sampler": {"type": "independent"},
+            },
+            "sun": {
+                "type": "directional",
+                "direction": SUN,
+                "irradiance": {"type": "rgb", "value": IRRADIANCE},
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}},
+            "head": {
+                "type": "cube",
+                "to_world": place().translate(middle.tolist()).scale(extent.tolist()),
+                "bsdf": {"type": "null"},
+                "interior": {
+                    "type": "heterogeneous",
+                    "sigma_t": grid(share * DENSE),
+                    "albedo": grid(DARK + share * (BRIGHT - DARK)),
+                    "phase": {"type": "hg", "g": anisotropy},
+                },
+            },
+        }
+    )
+    return np.array(mi.render(scene, spp=samples, seed=seed))
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.6])
+def test_the_head_is_lit_as_by_mitsuba(anisotropy):
+    volume = jv.phantom("head", 32)
+    transfer = jv.TransferFunction([0, 255], np.stack([DARK, BRIGHT]), [0, DENSE])
+    camera = jv.Camera(POSITION, volume.center, VIEW_UP, ANGLE, size=(SIZE, SIZE))
+    lights = DirectionalLight(SUN, IRRADIANCE), ConstantLight(SKY)
+    how: Any = {"paths": 256, "anisotropy": anisotropy, "antialias": True}
+    ours = jv.path_trace(volume, transfer, camera, lights, **how)
+    # its standard error from images of several seeds
+    theirs = np.stack([by_mitsuba(volume, anisotropy, samples=64, seed=seed) for seed in range(8)])
+
+    def regions(image: Any) -> np.ndarray:
+        return np.asarray(image, float).reshape(6, SIZE // 6, 6, SIZE // 6, 3).mean(axis=(1, 3))
+
+    mine = regions(ours.image(jnp.asarray(SKY)))
+    variance = regions(jnp.square(ours.image_error(jnp.asarray(SKY)))) / (SIZE // 6) ** 2
+    each = np.stack([regions(image) for image in theirs])
+    # of 8 images alone a variance would be too rough: that of all regions together, by brightness
+    of_8 = each.var(axis=0, ddof=1) / 8
+    pooled = np.maximum(of_8, variance * np.median(of_8[variance > 0] / variance[variance > 0]))
+    z = (mine - each.mean(axis=0)) / np.sqrt(np.maximum(variance + pooled, 1e-12))
+    assert mine[2:4, 2:4].min() > 0.05
+    assert np.ptp(mine[..., 0]) > 0.03
+    assert abs(z).max() < 3.5
+    assert abs(mine.mean() - each.mean()) < 3 * np.sqrt((variance + pooled).mean() / 36 * 3)
