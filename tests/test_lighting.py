@@ -838,6 +838,7 @@ def check_slopes(gradient, scene, expected):
         np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6, err_msg=leaf)
 
 
+@pytest.mark.slow
 def test_gradients_of_an_image_match_central_differences():
     """By one program, which gives the value as well as the gradient."""
     with in_float64():

@@ -56,8 +56,8 @@ class ScattererTemplates(Lighting):
     2. v_j is 0 for a photon that is hidden, 1 for others, tested at x + p_j and at its multiples `reach`.
     3. b, the brightness, grows with the intensities of photons that are not hidden.
     4. s, the colour that shines through from inside, comes from photons in the same material,
-    5. or in another one: a photon there lies at n / n' times its offset, and has α' / α times its
-       intensity, n being refractive indices, α opacities, and those of the photon's material primed.
+    5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
+       times its intensity, n being refractive indices, α opacities, and those of its material primed.
     6. Photons are left out where the ray's transmittance times their intensity is below `cutoff`.
 
     What belongs to no material keeps its colour.
