@@ -86,8 +86,9 @@ def measure(
 
 def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
     figure, axes = plt.subplots(1, len(images), figsize=(2 * len(images), 2.7), layout="constrained")
+    white = np.quantile(images[TRACED], 0.995)  # shown as white, in all of them
     for axis, (name, image) in zip(axes, images.items(), strict=True):
-        axis.imshow(jv.to_srgb(np.clip(image, 0, 1)))
+        axis.imshow(jv.to_srgb(np.clip(image / white, 0, 1)))
         row = rows[name]
         told = (
             f"error {row['rmse']:.3f}\n{row['ratio']['median']:.1f} × unlit"
