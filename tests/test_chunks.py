@@ -1,0 +1,36 @@
+"""What is chosen is put in front, in order, and comes back to its place."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvol.chunks import CHUNK, Chosen
+
+
+@pytest.mark.parametrize(
+    ("shape", "share"), [((3, 5), 0.5), ((8, 700), 0.1), ((1, 3000), 1.0), ((2, 7), 0.0), ((1, CHUNK), 0.7)]
+)
+def test_the_chosen_ones_are_in_front_and_in_order(shape, share):
+    masks = np.random.default_rng(0).random((2, *shape)) < share
+    chosen = Chosen.of([jnp.asarray(mask) for mask in masks])
+    wanted = np.flatnonzero(masks)
+    assert chosen.number == len(wanted)
+    np.testing.assert_array_equal(chosen.place[: len(wanted)], wanted)
+    assert chosen.place.size % CHUNK == 0
+    assert np.all(chosen.place[len(wanted) :] == masks.size)
+
+
+def test_each_chosen_one_is_taken_once_and_put_where_it_was():
+    rng = np.random.default_rng(1)
+    values = [jnp.asarray(rng.normal(size=(4, 900)), jnp.float32) for _ in range(2)]
+    chosen = Chosen.of([value > 0.5 for value in values])
+
+    def one(places, carry):
+        whole, visits = carry
+        found = chosen.take(values, places)
+        return chosen.put(whole, places, 2 * found), visits.at[places].add(1, mode="drop")
+
+    whole, visits = chosen.over(one, (jnp.zeros(7200), jnp.zeros(7200)))
+    for value, part, count in zip(values, chosen.apart(whole, 2), chosen.apart(visits, 2), strict=True):
+        np.testing.assert_array_equal(part, np.where(value > 0.5, 2 * value, 0))
+        np.testing.assert_array_equal(count, value > 0.5)
