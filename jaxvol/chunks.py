@@ -62,7 +62,7 @@ class Chosen(NamedTuple):
 def _in_front(chosen: Bool[Array, " entries"]) -> Int[Array, " padded"]:
     """The places of those that are chosen, in order, then numbers past the last place.
 
-    As `jnp.nonzero`, in a fifth of its time on CPU, where XLA sums up slowly along an array. Here stretches of
+    As `jnp.nonzero`, in a fifth of its time on CPU, where XLA sums up slowly along an array. Here pieces of
     256 entries are summed up side by side."""
     size = chosen.size
     padded = jnp.pad(chosen, (0, -size % CHUNK))

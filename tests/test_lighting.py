@@ -300,9 +300,8 @@ def test_materials_by_label_are_where_the_label_is():
         for occlusion in ("hard", "soft")
     )
     same(hard, [lit_color, lit_color, COLOR[SKIN], COLOR[SKIN]])
-    away = COLOR[SKIN] * np.pi * POWER * 0.9 * np.exp(-8 * 0.6 / 2)
     # between the nodes the material comes and goes by a share of 0.75, and of 0.4
-    same(soft, [part * away + (1 - part) * COLOR[SKIN] for part in (1, 0.75, 0.4, 0)])
+    same(soft, [part * lit_color + (1 - part) * COLOR[SKIN] for part in (1, 0.75, 0.4, 0)])
 
 
 def test_a_blend_is_the_mean_over_the_templates():
@@ -447,7 +446,8 @@ def smooth_scene():
 
 
 def slopes_in_the_path(occlusion, *steps):
-    """The adjoint's slope in λ, and central differences at these steps."""
+    """The adjoint's slope in λ, its mean over the way from a step below to a step above; and that of the
+    central difference; for each of these steps."""
     with in_float64():
         scene = smooth_scene()
         lighting = ScattererTemplates(
@@ -467,20 +467,23 @@ def slopes_in_the_path(occlusion, *steps):
             moved = eqx.tree_at(lambda light: light.materials[0].mean_free_path, lighting, path)
             return loss_of_points(moved, scene)
 
-        at = jnp.asarray(0.3)
-        differences = (float(loss(at + h)[0] - loss(at - h)[0]) / (2 * h) for h in steps)
-        return float(loss(at)[1]), *differences
+        for h in steps:
+            way = 0.3 + h * jnp.linspace(-1, 1, 257)
+            inside = np.mean([float(loss(at)[1]) for at in (way[1:] + way[:-1]) / 2])
+            yield inside, float(loss(way[-1])[0] - loss(way[0])[0]) / (2 * h)
 
 
 def test_the_soft_gradient_in_the_path_is_the_difference_at_any_step():
-    adjoint, narrow, wide = slopes_in_the_path("soft", 2e-8, 1e-2)
-    np.testing.assert_allclose(adjoint, narrow, rtol=1e-5)
-    np.testing.assert_allclose(adjoint, wide, rtol=0.02)
+    """A jump would be seen by the difference alone."""
+    for (adjoint, difference), error in zip(
+        slopes_in_the_path("soft", 2e-8, 1e-2), (1e-5, 0.01), strict=True
+    ):
+        np.testing.assert_allclose(adjoint, difference, rtol=error)
 
 
 def test_the_hard_gradient_in_the_path_is_wrong():
     """It does not see photons that become hidden, which are the most of it."""
-    adjoint, difference = slopes_in_the_path("hard", 1e-2)
+    [(adjoint, difference)] = slopes_in_the_path("hard", 1e-2)
     assert abs(adjoint - difference) > 0.5 * abs(difference)
 
 
@@ -499,7 +502,8 @@ EXTREMES = {
 }
 
 
-@pytest.mark.parametrize("occlusion", ["soft", pytest.param("hard", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("occlusion", ["soft", "hard"])
 def test_values_and_gradients_are_finite_at_extremes(occlusion):
     """A lamp is at one of the samples throughout."""
     volume, transfer, points = jax.tree.map(
