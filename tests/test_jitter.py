@@ -167,3 +167,16 @@ def test_bad_input_is_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("pattern", ["white", "blue"])
+def test_a_crop_is_jittered_as_its_part_of_the_image(pattern):
+    volume = jv.phantom("sphere", 16)
+    transfer = jv.TransferFunction.from_points([(0, (0, 0, 0), 0.0), (255, (1, 1, 1), 0.9)], 0.5)
+    camera = jv.Camera.looking_at(volume, size=(24, 20))
+    march = jv.March(0.1, (jv.Jitter(3, pattern),))
+    whole = jv.render(volume, transfer, camera, march).rgba
+    part = jv.render(volume, transfer, camera.crop(9, 5, 11, 8), march).rgba
+    np.testing.assert_allclose(part, whole[5:13, 9:20], atol=1e-6)
+    again = jv.render(volume, transfer, camera.crop(4, 2, 18, 14).crop(5, 3, 11, 8), march).rgba
+    np.testing.assert_allclose(again, part, atol=1e-6)
