@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
 from .checks import Arrayable, finite_array, number, require
@@ -120,7 +121,9 @@ class Camera(eqx.Module):
             )
         x = [self._column(edge) for edge in (left, left + width)]
         y = [self._row(edge) for edge in (top + height, top)]
-        return self._showing(jnp.stack([*x, *y]), (width, height), self.corner + jnp.asarray([left, top]))
+        return self._showing(
+            jnp.stack([*x, *y]), (width, height), self.corner + np.array([left, top], np.int32)
+        )
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
         """The camera that shows 1/`factor` of the image in an image of the same size, around

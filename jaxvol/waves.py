@@ -90,7 +90,8 @@ class _OfPixels(Waves):
         column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
         width, height = self.size
         origin, direction = each_ray(source.ray)(column, row)
-        pixel = column + source.corner[0], row + source.corner[1]
+        left, top = source.corner.astype(column.dtype)
+        pixel = column + left, row + top
         return entering(space, origin, direction, pixel, (column < width) & (row < height))
 
     def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
