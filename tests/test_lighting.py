@@ -682,7 +682,7 @@ def test_leaping_over_empty_space_changes_no_lit_pixel():
 
 @pytest.mark.slow
 def test_a_curved_grid_and_labels_are_lit_alike():
-    volume, probe = jv.toroidal_phantom(20)
+    volume, probe = jv.toroidal_phantom("spheres", (12, 16, 24), speckle=False)
     data = np.asarray(volume.data, np.float32) / float(np.max(volume.data))
     volume = jv.Volume(data, volume.spacing, volume.origin)
     march = jv.March(4.0, (probe, jv.AlphaCorrection()), max_samples=128)
