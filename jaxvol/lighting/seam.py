@@ -110,8 +110,8 @@ class Shading(eqx.Module):
         """What all terms want to know of the sample itself."""
 
     def term(self, around: Surroundings, sample: Sample, notes: PyTree, number: Int[Array, ""]) -> PyTree:
-        """What one place adds: arrays, which are summed up over all."""
-        raise NotImplementedError
+        """What one place adds: arrays, which are summed up over all. Not asked where `terms` is 0."""
+        return ()
 
     @abstractmethod
     def color(self, sample: Sample, notes: PyTree, sums: PyTree) -> Triple:
