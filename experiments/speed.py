@@ -67,10 +67,10 @@ def peers() -> dict[str, str]:
 
 def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, dict[str, Any]]:
     """Time and error of every program's frame, and the part of ours that is spent on the occupancy."""
-    truth = np.asarray(common.frame(scene, marches.converged(scene.step, common.FINER)).image())
+    truth = np.asarray(common.image(scene, marches.converged(scene.step, common.FINER)).image())
     under = {OURS: fast(scene), PLAIN: jv.March(scene.step)}
-    programs: dict[str, Any] = {n: lambda m=m: common.frame(scene, m) for n, m in under.items()}
-    errors = {n: rmse(common.frame(scene, m).image(), truth) for n, m in under.items()}
+    programs: dict[str, Any] = {n: lambda m=m: common.image(scene, m) for n, m in under.items()}
+    errors = {n: rmse(common.image(scene, m).image(), truth) for n, m in under.items()}
     if there[VTK][0].isdigit():
         drawn = peer_vtk.prepare(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
         programs |= {VTK: drawn.draw, VTK_RAYS: drawn.cast}
@@ -108,7 +108,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
     march = fast(scene)
 
     def loss(transfer: jv.TransferFunction, march: jv.March = march) -> jax.Array:
-        return jnp.mean(jv.render(scene.volume, transfer, scene.camera, march).rgba ** 2)
+        return jnp.mean(common.image(scene._replace(transfer=transfer), march).rgba ** 2)
 
     def entries(march: jv.March) -> np.ndarray:
         gradient = jax.grad(loss)(scene.transfer, march)
@@ -118,7 +118,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
     both_of = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
     ours = entries(march)
     programs: dict[str, Any] = {
-        "image": lambda: common.frame(scene, march),
+        "image": lambda: common.image(scene, march),
         "image and gradient": lambda: both_of(scene.transfer),
     }
     found: dict[str, Any] = {"entries": len(ours), "pixels": scene.camera.size[0]}

@@ -42,7 +42,7 @@ from .phantoms import (
 )
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
-from .rendering import Rendering as Rendering
+from .rendering import Picture as Picture, Rendering as Rendering
 from .termination import EarlyTermination as EarlyTermination
 from .toroidal import ToroidalMap as ToroidalMap
 from .transfer import TransferFunction as TransferFunction

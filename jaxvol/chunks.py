@@ -28,7 +28,7 @@ class Chosen(NamedTuple):
     def of(cls, chosen: list[Bool[Array, "rows columns"]]) -> "Chosen":
         """Where these are true."""
         whole = jnp.concatenate(chosen)
-        return cls(_in_front(whole.reshape(-1)), jnp.sum(whole, dtype=jnp.int32), whole.shape[1])
+        return cls(in_front(whole.reshape(-1)), jnp.sum(whole, dtype=jnp.int32), whole.shape[1])
 
     def over(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
         """`one(places, carry)`, a chunk after the other. The last is filled up with places past the end."""
@@ -59,23 +59,20 @@ class Chosen(NamedTuple):
         return [jax.tree.unflatten(tree, part) for part in zip(*each, strict=True)]
 
 
-def _in_front(chosen: Bool[Array, " entries"]) -> Int[Array, " padded"]:
-    """The places of those that are chosen, in order, then numbers past the last place.
+def in_front(chosen: Bool[Array, " entries"]) -> Int[Array, " padded"]:
+    """The places of those that are chosen, in order, then numbers past the last place; as many as fill up
+    whole chunks.
 
-    As `jnp.nonzero`, in a fifth of its time on CPU, where XLA sums up slowly along an array. Here pieces of
-    256 entries are summed up side by side."""
-    size = chosen.size
-    padded = jnp.pad(chosen, (0, -size % CHUNK))
-    stretches = padded.reshape(-1, 256).T
-
-    def count(before: Int[Array, " stretches"], chosen: Bool[Array, " stretches"]) -> tuple[Array, Array]:
-        return before + chosen.astype(before.dtype), before
-
-    totals, before = jax.lax.scan(count, jnp.zeros(stretches.shape[1], jnp.int32), stretches)
-    rank = (before + (jnp.cumsum(totals) - totals)[None]).T.reshape(-1)
+    As `jnp.nonzero`, in a quarter of its time on CPU, where XLA sums up slowly along an array: here it is a
+    product with a triangle of ones, exact for numbers as small as these."""
+    padded = jnp.pad(chosen, (0, -chosen.size % CHUNK))
+    rows = padded.reshape(-1, 128).astype(jnp.float32)
+    within = jnp.matmul(rows, jnp.triu(jnp.ones((128, 128), rows.dtype), 1), precision="highest")
+    totals = jnp.sum(rows, axis=1)
+    rank = within + (jnp.cumsum(totals) - totals)[:, None]
     last = padded.size
     return (
-        jnp.full(last, size, jnp.int32)
-        .at[jnp.where(padded, rank, last)]
+        jnp.full(last, chosen.size, jnp.int32)
+        .at[jnp.where(padded, rank.reshape(-1).astype(jnp.int32), last)]
         .set(jnp.arange(last, dtype=jnp.int32), mode="drop", unique_indices=True)
     )

@@ -5,7 +5,7 @@ business; what they see is `reference`'s; and what a loss sees of it, `replay`'s
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args, overload
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ from .occupancy import Blocks
 from .packed import with_words, words_of
 from .reference import begin, end, samples_across, step
 from .relight import Lit
-from .rendering import Rendering
+from .rendering import Outputs, Picture, Rendering
 from .replay import Cotangents, Replay, Total
 from .taps import added, floats, with_voxels, without_voxels
 from .transfer import Transfer
@@ -41,6 +41,7 @@ DIRECT_WAVE = 64
 """Beams in a wave of `"direct"`, which keeps all its states to be differentiated."""
 
 
+@overload
 def render(
     volume: Volume,
     transfer: Transfer,
@@ -48,8 +49,34 @@ def render(
     march: March,
     *,
     lighting: Lighting | None = None,
+    outputs: Literal["all"] = "all",
     adjoint: Adjoint = "replay",
-) -> Rendering:
+) -> Rendering: ...
+
+
+@overload
+def render(
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    *,
+    lighting: Lighting | None = None,
+    outputs: Literal["rgba"],
+    adjoint: Adjoint = "replay",
+) -> Picture: ...
+
+
+def render(
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    *,
+    lighting: Lighting | None = None,
+    outputs: Any = "all",
+    adjoint: Adjoint = "replay",
+) -> Any:
     """The image of a volume.
 
     **Arguments:**
@@ -59,6 +86,7 @@ def render(
     - `march`: step and transforms.
     - `lighting`: how samples are lit, such as `lighting.ScattererTemplates`. Without, colours are those of
       the transfer function.
+    - `outputs`: `"rgba"` for the image alone, a tenth faster; `"all"` for what its rays met, too.
     - `adjoint`: how the image is differentiated; the image itself is the same.
         - `"replay"`: reverse mode (`jax.grad`). A second march computes the samples again, so that memory
           does not grow with their number: it takes one array like each leaf, and a wave's rays.
@@ -66,16 +94,45 @@ def render(
         - `"direct"`: both, and higher derivatives, by letting JAX differentiate
           `render_ray_reference`. Memory grows with the number of samples.
 
-    **Returns:** a `Rendering` with leading shape (height, width), in float32.
+    **Returns:** a `Rendering` with leading shape (height, width), in float32; or, for the image alone, a
+    `Picture`.
 
-    **Raises:** `ValueError` for an unknown adjoint, and for `"direct"` where the march or the spacing
-    is traced and `march.max_samples` is not given.
+    **Raises:** `ValueError` for unknown outputs or an unknown adjoint, and for `"direct"` where the march or
+    the spacing is traced and `march.max_samples` is not given.
 
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
     """
-    how, lighting = _How.of(adjoint, volume, march), _prepared(lighting, volume, transfer, march)
+    how, lighting = _How.of(outputs, adjoint, volume, march), _prepared(lighting, volume, transfer, march)
     return _render((volume, transfer, camera, march, lighting), how, Known.of(volume, march))
+
+
+@overload
+def render_rays(
+    volume: Volume,
+    transfer: Transfer,
+    origins: Arrayable,
+    directions: Arrayable,
+    march: March,
+    *,
+    lighting: Lighting | None = None,
+    outputs: Literal["all"] = "all",
+    adjoint: Adjoint = "replay",
+) -> Rendering: ...
+
+
+@overload
+def render_rays(
+    volume: Volume,
+    transfer: Transfer,
+    origins: Arrayable,
+    directions: Arrayable,
+    march: March,
+    *,
+    lighting: Lighting | None = None,
+    outputs: Literal["rgba"],
+    adjoint: Adjoint = "replay",
+) -> Picture: ...
 
 
 def render_rays(
@@ -86,14 +143,15 @@ def render_rays(
     march: March,
     *,
     lighting: Lighting | None = None,
+    outputs: Any = "all",
     adjoint: Adjoint = "replay",
-) -> Rendering:
+) -> Any:
     """What rays of one's own see. As `render`, but for:
 
     - `origins`, `directions`: (*rays, 3) world points, and directions of any length but 0. Distances
       are measured in world length whatever the length of a direction.
 
-    **Returns:** a `Rendering` with leading shape `*rays`. What is random along a ray is keyed by its
+    **Returns:** as `render`, with leading shape `*rays`. What is random along a ray is keyed by its
     place in the flattened array, as pixel (place, 0).
 
     **Raises:** as `render`, and `ValueError` for shapes that differ or do not end in 3, NaN or
@@ -107,7 +165,7 @@ def render_rays(
     message = "directions must not have length 0."
     directions = require(directions, lambda d: (d != 0).any(axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
-    how, lighting = _How.of(adjoint, volume, march), _prepared(lighting, volume, transfer, march)
+    how, lighting = _How.of(outputs, adjoint, volume, march), _prepared(lighting, volume, transfer, march)
     source = OwnRays(origins, directions)
     return _render((volume, transfer, source, march, lighting), how, Known.of(volume, march))
 
@@ -124,46 +182,47 @@ class Known(eqx.Module):
 
 
 class _How(eqx.Module):
-    """By which loop rays are marched to their ends."""
+    """What is found out, and by which loop rays are marched to their ends."""
 
+    outputs: Outputs = eqx.field(static=True)
     adjoint: Adjoint = eqx.field(static=True)
     length: int = eqx.field(static=True)
     """Of the loop of `"direct"`."""
 
     @classmethod
-    def of(cls, adjoint: Any, volume: Volume, march: March) -> "_How":
-        if adjoint not in get_args(Adjoint):
-            raise ValueError(f"adjoint must be one of {', '.join(get_args(Adjoint))}; got {adjoint!r}.")
+    def of(cls, outputs: Any, adjoint: Any, volume: Volume, march: March) -> "_How":
+        for name, given, known in (("outputs", outputs, Outputs), ("adjoint", adjoint, Adjoint)):
+            if given not in get_args(known):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
         if adjoint != "direct":
-            return cls(adjoint, 0)
+            return cls(outputs, adjoint, 0)
         length = samples_across(volume, march)
         # to the next of few lengths, so that a change of step rarely compiles the program again
-        return cls(adjoint, min(-(-length // 64) * 64, march.most_samples))
+        return cls(outputs, adjoint, min(-(-length // 64) * 64, march.most_samples))
 
 
 Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
 
 
 @compiled
-def _render(scene: Scene, how: _How, known: Known) -> Rendering:
-    return _replayed(scene, known) if how.adjoint == "replay" else _image(scene, how, known)
+def _render(scene: Scene, how: _How, known: Known) -> Any:
+    return _replayed(scene, how, known) if how.adjoint == "replay" else _image(scene, how, known)
 
 
-def _replayed(scene: Scene, known: Known) -> Rendering:
+def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
     """The image; in reverse mode, its derivative by a second march."""
-    how = _How("replay", 0)
 
     @eqx.filter_custom_vjp
-    def image(scene: Scene, known: Known) -> Rendering:
+    def image(scene: Scene, known: Known) -> Picture:
         return _image(scene, how, known)
 
     @image.def_fwd
-    def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Rendering, Rendering]:
+    def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Picture, Picture]:
         rendering = _image(scene, how, known)
         return rendering, rendering
 
     @image.def_bwd
-    def _(rendering: Rendering, gradient: Rendering, perturbed: Any, scene: Scene, known: Known) -> Any:
+    def _(rendering: Picture, gradient: Picture, perturbed: Any, scene: Scene, known: Known) -> Any:
         # None stands for what the loss does not use
         whole = jax.tree.map(
             lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
@@ -175,7 +234,7 @@ def _replayed(scene: Scene, known: Known) -> Rendering:
     return image(scene, jax.lax.stop_gradient(known))
 
 
-def _image(scene: Scene, how: _How, known: Known) -> Rendering:
+def _image(scene: Scene, how: _How, known: Known) -> Picture:
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
     direct = how.adjoint == "direct"
@@ -183,21 +242,21 @@ def _image(scene: Scene, how: _How, known: Known) -> Rendering:
     survey = None if direct else _survey((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
 
-    def wave(number: Int[Array, ""]) -> Rendering:
+    def wave(number: Int[Array, ""]) -> Picture:
         rays = waves.rays(source, space, number)
         if direct:
             one = each_ray(lambda ray, at: step(march, ray, volume, seen, at))
-            start = each_ray(lambda ray: begin(march, ray))(rays)
+            start = each_ray(lambda ray: begin(march, ray, how.outputs))(rays)
             at, _ = jax.lax.scan(lambda at, _: (one(rays, at), None), start, None, length=how.length)
         else:
             beams = Beams(rays, waves.beams, waves.box(source, rays, number))
-            at, _ = march_beams(march, volume, seen, survey, beams)
+            at, _ = march_beams(march, volume, seen, survey, beams, how.outputs)
         return each_ray(end)(rays, at)
 
     return jax.tree.map(waves.assemble, jax.lax.map(wave, jnp.arange(waves.number)))
 
 
-def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gradient: Rendering) -> Any:
+def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Picture, gradient: Picture) -> Any:
     """What every leaf of the scene gets of an image's gradient."""
     volume, transfer, source, march, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
@@ -209,7 +268,7 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gr
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
 
-    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Rendering, Rendering]) -> tuple[Any, None]:
+    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Picture, Picture]) -> tuple[Any, None]:
         (total, of_source), (number, rendering, gradient) = sums, given
 
         def made(moving: PyTree) -> Ray:
@@ -225,12 +284,13 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Rendering, gr
             places=places,
         )
         beams = Beams(rays, waves.beams, waves.box(source, rays, number))
-        _, (of_rays, total) = march_beams(march, packed, seen, survey, beams, replay)
+        _, (of_rays, total) = march_beams(march, packed, seen, survey, beams, None, replay)
         if not places:
             return (total, of_source), None
-        # a depth counts from the ray's origin, a sample's from the entry
-        toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
-        of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
+        if isinstance(gradient, Rendering):
+            # a depth counts from the ray's origin, a sample's from the entry
+            toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
+            of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
         of_volume, of_rays_source, of_march = pull(of_rays)[0]
         total = eqx.tree_at(
             lambda t: (t.volume, t.march),
@@ -297,7 +357,9 @@ def _survey(scene: Scene, known: Known) -> Survey | None:
         rays = waves.rays(own, space, none)
         beams = Beams(rays, waves.beams, waves.box(own, rays, none))
         at, _ = march_beams(first, volume, transfer.over(volume), survey, beams)
-        return waves.assemble(each_ray(end)(rays, at).depth[None]).reshape(columns.shape)
+        seen = each_ray(end)(rays, at)
+        assert isinstance(seen, Rendering)
+        return waves.assemble(seen.depth[None]).reshape(columns.shape)
 
     return march.survey(occupancy, View(source.ray, source.size, first_hit))
 

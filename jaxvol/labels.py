@@ -12,6 +12,7 @@ from .transfer import (
     Measured,
     Transfer,
     TransferFunction,
+    at_least,
     interpolated,
     points_below,
     row_of,
@@ -57,16 +58,15 @@ class LabelTransferFunction(Transfer):
     def classifier(self) -> Classify:
         """Look-up of colour and extinction, by label and value."""
         tables = jax.vmap(TransferFunction.rows)(self.stacked)
-        unseen, intervals = tables.shape[0] - 1, tables.shape[1]
+        unseen, points = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
         def classify(measured: Measured) -> tuple[Triple, Scalar]:
             value, label = measured
             label = jnp.where((label < 0) | (label > unseen), unseen, label)
             values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)
-            value = jnp.clip(value, values[0], values[-1])
-            interval = jnp.clip(points_below(values, value) - 1, 0, intervals - 1)
-            row = row_of(rows, label * intervals + interval)
+            value = at_least(value, values[0])
+            row = row_of(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
             return interpolated(row, value - row[0])
 
         return classify

@@ -22,7 +22,7 @@ from .checks import is_traced
 from .lighting.seam import Lighting, Sample, classification
 from .locate import Ray, enter
 from .march import Cell, March
-from .rendering import Rendering
+from .rendering import Outputs, Picture, Rendering
 from .transfer import Classification, Measured, Transfer
 from .triple import Scalar, Triple, along, apart
 from .volume import Volume
@@ -33,32 +33,39 @@ class Progress(eqx.Module):
 
     The front of the next cell lies at `(offset + index) d`. Counting steps, rather than adding them up,
     keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps.
+    What is not asked for is None.
     """
 
     index: Int[Array, ""]
     offset: Scalar
-    color: Triple
     opacity: Scalar
-    moment: Scalar
-    """Σ weight × depth past the entry."""
-    samples: Int[Array, ""]
-    aligned: Bool[Array, ""]
+    color: Triple | None
+    met: "Met | None"
     finished: Bool[Array, ""]
     memory: tuple[Any, ...]
 
 
-def begin(march: March, ray: Ray) -> Progress:
-    """A ray at its entry."""
+class Met(eqx.Module):
+    """What a ray has met.
+
+    - `moment`: Σ weight × depth past the entry.
+    """
+
+    moment: Scalar
+    samples: Int[Array, ""]
+    aligned: Bool[Array, ""]
+
+
+def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+    """A ray at its entry, which will find out so much, or nothing but its opacity."""
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
         index=count,
         offset=march.start(ray),
-        color=(zero, zero, zero),
         opacity=zero,
-        moment=zero,
-        samples=count,
-        aligned=no,
+        color=None if outputs is None else (zero, zero, zero),
+        met=Met(zero, count, no) if outputs == "all" else None,
         finished=no,
         memory=march.remember(ray),
     )
@@ -108,22 +115,26 @@ def blend(
     cell: tuple[tuple[Cell, Triple, Scalar], ...],
 ) -> Progress:
     """What has been accumulated behind a cell. Of its pieces are known colour and opacity."""
-    (r, g, b), total, moment = at.color, at.opacity, at.moment
-    samples, aligned = at.samples, at.aligned
-    for piece, (red, green, blue), alpha in cell:
+    total, color, met = at.opacity, at.color, at.met
+    for piece, own, alpha in cell:
         depth = march.sample(piece)
         weight = jnp.where(at.finished, 0, (1 - total) * alpha)
-        r, g, b = r + weight * red, g + weight * green, b + weight * blue
-        total, moment = total + weight, moment + weight * depth
-        samples = samples + (~at.finished & (depth < ray.length)).astype(samples.dtype)
-        aligned |= piece.cut & (weight > 0)
+        total = total + weight
+        if color is not None:
+            r, g, b = (sum_ + weight * part for sum_, part in zip(color, own, strict=True))
+            color = r, g, b
+        if met is not None:
+            taken = ~at.finished & (depth < ray.length)
+            met = Met(
+                met.moment + weight * depth,
+                met.samples + taken.astype(met.samples.dtype),
+                met.aligned | (piece.cut & (weight > 0)),
+            )
     return replace(
         at,
-        color=(r, g, b),
         opacity=total,
-        moment=moment,
-        samples=samples,
-        aligned=aligned,
+        color=color,
+        met=met,
         finished=at.finished | march.stop(1 - total),
     )
 
@@ -157,19 +168,23 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
     return move(march, ray, after, transparent)
 
 
-def end(ray: Ray, at: Progress) -> Rendering:
-    """What the ray has seen."""
+def end(ray: Ray, at: Progress) -> Picture:
+    """What the ray has seen: a `Rendering`, if it was to find out all."""
+    assert at.color is not None
+    rgba, exhausted = jnp.stack([*at.color, at.opacity]), ~at.finished
+    if at.met is None:
+        return Picture(rgba, exhausted)
     seen = at.opacity > 0
     # Of moment and opacity as parts of the opacity, which is so divided by 1: the derivative of a quotient
     # divides by the square, and that of the opacity of a veil is 0 in float32.
     whole = jax.lax.stop_gradient(jnp.where(seen, at.opacity, 1))
-    depth = ray.t_in + (at.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
+    depth = ray.t_in + (at.met.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
     return Rendering(
-        rgba=jnp.stack([*at.color, at.opacity]),
+        rgba=rgba,
+        exhausted=exhausted,
         depth=jnp.where(seen, depth, jnp.inf),
-        samples=at.samples,
-        aligned=at.aligned,
-        exhausted=~at.finished,
+        samples=at.met.samples,
+        aligned=at.met.aligned,
     )
 
 
@@ -209,7 +224,9 @@ def render_ray_reference(
         return step(march, ray, volume, seen, at), None
 
     at, _ = jax.lax.scan(one, begin(march, ray), None, length=samples_across(volume, march))
-    return end(ray, at)
+    rendering = end(ray, at)
+    assert isinstance(rendering, Rendering)
+    return rendering
 
 
 def samples_across(volume: Volume, march: March) -> int:

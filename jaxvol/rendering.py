@@ -1,29 +1,25 @@
 """What does a render give back?"""
 
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
-class Rendering(eqx.Module):
-    """What the rays saw. The leading shape is that of the rays: (height, width) from a camera.
+Outputs: TypeAlias = Literal["all", "rgba"]
+"""What is found out about rays: a `Rendering`, or just a `Picture`."""
+
+
+class Picture(eqx.Module):
+    """What rays look like. The leading shape is that of the rays: (height, width) from a camera.
 
     - `rgba`: linear colour, premultiplied by opacity, and opacity; not yet over any background.
-    - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
-      adds to the opacity, world length; infinite where nothing is seen.
-    - `samples`: samples evaluated.
-    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
-      (Kye 2013, Fig. 13).
     - `exhausted`: whether the ray spent `March.max_samples` before it was finished: it lacks what
       lies behind.
     """
 
     rgba: Float[Array, "*rays 4"]
-    depth: Float[Array, "*rays"]
-    samples: Int[Array, "*rays"]
-    aligned: Bool[Array, "*rays"]
     exhausted: Bool[Array, "*rays"]
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
@@ -36,3 +32,18 @@ class Rendering(eqx.Module):
             )
         background = jnp.broadcast_to(background, (*self.rgba.shape[:-1], 3))
         return self.rgba[..., :3] + (1 - self.rgba[..., 3:]) * background
+
+
+class Rendering(Picture):
+    """What rays look like, and what they met.
+
+    - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
+      adds to the opacity, world length; infinite where nothing is seen.
+    - `samples`: samples evaluated.
+    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
+      (Kye 2013, Fig. 13).
+    """
+
+    depth: Float[Array, "*rays"]
+    samples: Int[Array, "*rays"]
+    aligned: Bool[Array, "*rays"]

@@ -26,7 +26,7 @@ from .locate import Ray
 from .march import March
 from .reference import Progress, contained, front, pieces
 from .relight import LightTotal, Lit, Relit, relit
-from .rendering import Rendering
+from .rendering import Picture, Rendering
 from .taps import Tapped, added, floats, scattered, without_voxels
 from .transfer import Classification, Transfer
 from .triple import Scalar, Triple, along
@@ -37,24 +37,25 @@ from .wavefront import CELLS, Follower, Samples, over_cells
 
 class Cotangents(NamedTuple):
     """What the loss makes of each ray: how it changes with colour, opacity, and a unit of weight at a depth
-    from `middle` on; and what all the ray's samples are worth."""
+    from `middle` on, where depth was asked for; and what all the ray's samples are worth."""
 
     color: Triple
     opacity: Scalar
-    depth: Scalar
-    middle: Scalar
     worth: Scalar
+    depth: Scalar | None = None
+    middle: Scalar | None = None
 
     @classmethod
-    def of(cls, ray: Ray, rendering: Rendering, gradient: Rendering) -> "Cotangents":
+    def of(cls, ray: Ray, rendering: Picture, gradient: Picture) -> "Cotangents":
         """For rays (groups, rays in a group) and their part of the image, and of its gradient."""
         red, green, blue, opacity = (gradient.rgba[..., i] for i in range(4))
-        seen = rendering.rgba[..., 3] > 0
-        alpha = jnp.where(seen, rendering.rgba[..., 3], 1)
-        middle = jnp.where(seen, rendering.depth - ray.t_in, 0)
         worth = jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
-        depth = jnp.where(seen, gradient.depth, 0) / alpha
-        return cls((red, green, blue), opacity, depth, middle, worth)
+        if not (isinstance(rendering, Rendering) and isinstance(gradient, Rendering)):
+            return cls((red, green, blue), opacity, worth)
+        seen = rendering.rgba[..., 3] > 0
+        middle = jnp.where(seen, rendering.depth - ray.t_in, 0)
+        depth = jnp.where(seen, gradient.depth, 0) / jnp.where(seen, rendering.rgba[..., 3], 1)
+        return cls((red, green, blue), opacity, worth, depth, middle)
 
 
 class Total(eqx.Module):
@@ -124,10 +125,11 @@ class Replay(Follower):
             lit, sums = relit(self.light, self.seen, self.march, ray, samples, known, wanted, sums)
             total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
             colors, wanted = [part.color for part in lit], [part.of_color for part in lit]
-        worth = [
-            red * r + green * g + blue * b + each.opacity + each.depth * (depth - each.middle)
-            for (r, g, b), depth in zip(colors, depths, strict=True)
-        ]
+        worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
+        if each.depth is not None:
+            worth = [
+                value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
+            ]
         inside = over_cells(contained, of_cells=(False, True))
         kept, slopes = _slopes(known, worth, given.worth, kept)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
@@ -141,7 +143,7 @@ class Replay(Follower):
         if not self.places:
             return kept, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
-        of_depth = [weight * each.depth for weight in known.weight]
+        of_depth = [None if each.depth is None else weight * each.depth for weight in known.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
         of_march, of_volume, of_rays, asked, of_voxels = self._placed(
             ray, at, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
@@ -150,10 +152,10 @@ class Replay(Follower):
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return kept, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
-    def _placed(self, ray: Ray, at: Progress, wanted: list[tuple[PyTree, Scalar, Scalar, Any]]) -> tuple:
-        """What march, volume and rays get of what is wanted of each piece's measured values, width, depth,
-        and, where it is lit, point; then the voxels that were asked for, and what they get. Which samples a
-        ray has is taken as it is."""
+    def _placed(self, ray: Ray, at: Progress, wanted: list[tuple[PyTree, Scalar, Any, Any]]) -> tuple:
+        """What march, volume and rays get of what is wanted of each piece's measured values and width, its
+        depth where that counts, and its point where it is lit; then the voxels that were asked for, and what
+        they get. Which samples a ray has is taken as it is."""
         voxels = self.total.voxels is not None
         march, march_rest = eqx.partition(self.march, eqx.is_inexact_array)
         volume, volume_rest = eqx.partition(without_voxels(self.volume), eqx.is_inexact_array)
@@ -169,7 +171,8 @@ class Replay(Follower):
                 depth = march.sample(piece)
                 measured = self.transfer.measured(tapped, ray.path(depth))
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
-                found.append((floats(measured), piece.width, depth, point))
+                asked = depth if self.given.depth is not None else None
+                found.append((floats(measured), piece.width, asked, point))
             return found, tapped.asked
 
         ahead = jnp.arange(CELLS, dtype=at.index.dtype)

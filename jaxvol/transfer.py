@@ -20,7 +20,7 @@ FEW = 16
 less than looking its entries up."""
 
 Row: TypeAlias = tuple[Scalar, ...]
-"""What a sample in one interval between control points needs: see `TransferFunction.rows`."""
+"""What a sample between two control points needs: see `TransferFunction.rows`."""
 
 Measured: TypeAlias = tuple[Array, ...]
 """What a transfer function wants to know of a place: the value, and whatever else it goes by."""
@@ -181,8 +181,8 @@ class TransferFunction(Transfer):
             return points_below(values, value) - 1
 
         def search(measured: Measured) -> Measured:
-            value = jnp.clip(measured[0], values[0], values[-1])
-            interval = jnp.clip(jax.lax.cond(even, counted, searched, value), 0, last - 1)
+            value = at_least(measured[0], values[0])
+            interval = jnp.clip(jax.lax.cond(even, counted, searched, value), 0, last)
             return interval, value - at(interval)
 
         return search
@@ -197,9 +197,9 @@ class TransferFunction(Transfer):
 
         def chosen(measured: Measured) -> tuple[Triple, Scalar]:
             (value,) = measured
-            value = jnp.clip(value, values[0], values[-1])
+            value = at_least(value, values[0])
             row = tuple(rows[0])
-            for start, following in zip(values[1:-1], rows[1:], strict=True):
+            for start, following in zip(values[1:], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
             return interpolated(row, value - row[0])
 
@@ -208,35 +208,37 @@ class TransferFunction(Transfer):
     def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
         # By one scatter of whole rows, where JAX would sum up for every entry of a row apart.
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
-        clipped = jnp.clip(value, self.values[0], self.values[-1])
         if self.values.shape[0] <= FEW:
-            interval = jnp.clip(points_below(self.values, clipped) - 1, 0, rows.shape[0] - 1)
-            past = clipped - row_of(rows, interval)[0]
+            limited = at_least(value, self.values[0])
+            interval = jnp.maximum(points_below(self.values, limited) - 1, 0)
+            past = limited - row_of(rows, interval)[0]
         else:
             _, interval, past = measured
-        _, inverse, *_, r, g, b, first, last = row_of(rows, interval)
-        part = jnp.minimum(past * inverse, 1)
+        *_, r, g, b, slope, inverse = row_of(rows, interval)
+        part = past * inverse
         parts = jnp.stack([*color, extinction], axis=-1)
         shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
         sums = jnp.zeros((rows.shape[0], 8), shared.dtype).at[interval].add(shared, mode="promise_in_bounds")
-        at_points = jnp.pad(sums[:, :4], ((0, 1), (0, 0))) + jnp.pad(sums[:, 4:], ((1, 0), (0, 0)))
+        at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))
         leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
         transfer = eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), self, leaves)
-        slope = color[0] * r + color[1] * g + color[2] * b + extinction * (last - first) * inverse
-        return transfer, (jnp.where(value == clipped, slope, 0),)
+        of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
+        return transfer, (jnp.where(value >= self.values[0], of_value, 0),)
 
-    def rows(self) -> Float[Array, "intervals 10"]:
-        """A table with one row for each interval between points: all that a sample there needs, so that it
-        finds them side by side. Start, inverse width, colour at the start and its slope, extinction at the
-        start and at the end."""
+    def rows(self) -> Float[Array, "points 10"]:
+        """A table with one row for each point: all that a sample needs which lies past it, but not past the
+        next one, so that it finds them side by side. Value, colour, extinction; the slopes of colour and
+        extinction; and 1 over the way to the next point. Past the last one all slopes are 0."""
         values = jax.lax.stop_gradient(self.values)
         inverse = 1 / (values[1:] - values[:-1])[:, None]
-        color, extinction = self.colors, self.extinction[:, None]
-        slopes = (color[1:] - color[:-1]) * inverse
-        # a little more than the inverse, so that the end of an interval is never short of its end
-        more = inverse * (1 + 2 * float(jnp.finfo(inverse.dtype).eps))
-        columns = [values[:-1, None], more, color[:-1], slopes, extinction[:-1], extinction[1:]]
-        return jnp.concatenate(columns, axis=1)
+        at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        slopes = jnp.concatenate([(at_points[1:] - at_points[:-1]) * inverse, inverse], axis=1)
+        return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
+
+
+def at_least(value: Scalar, least: Scalar) -> Scalar:
+    # by comparing: a maximum, which hands NaN on, takes the processor four instructions
+    return jnp.where(value >= least, value, least)
 
 
 def points_below(
@@ -250,21 +252,20 @@ def points_below(
     return jnp.searchsorted(values, value, side=side, method=search).astype(jnp.int32)
 
 
-def row_of(rows: Float[Array, "intervals 10"], interval: Int[Array, "..."]) -> Row:
+def row_of(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
     """One row, by a look-up for each of its entries: batched, they are whole arrays from the start."""
-    interval = jnp.clip(interval, 0, rows.shape[0] - 1)
+    point = jnp.clip(point, 0, rows.shape[0] - 1)
     return tuple(
-        rows[:, i].at[interval].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        rows[:, i].at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
         for i in range(rows.shape[1])
     )
 
 
 def interpolated(row: Row, past: Scalar) -> tuple[Triple, Scalar]:
-    """Colour and extinction of a value so far past the start of an interval, from its row."""
-    color = row[2] + past * row[5], row[3] + past * row[6], row[4] + past * row[7]
-    # from end to end, and exact at both: where extinction falls to 0, it must be 0
-    part = jnp.minimum(past * row[1], 1)
-    return color, row[8] * (1 - part) + row[9] * part
+    """Colour and extinction of a value so far past a point, from its row."""
+    r, g, b, extinction = (at + past * slope for at, slope in zip(row[1:5], row[5:9], strict=True))
+    # where it falls to 0 it may be rounded to less
+    return (r, g, b), jnp.where(extinction >= 0, extinction, 0)
 
 
 def seen_between(

@@ -24,11 +24,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .beams import Box
+from .chunks import in_front
 from .compiled import in_memory
 from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
 from .reference import Progress, begin, blend, front, move, opacity, pieces
+from .rendering import Outputs
 from .transfer import Classification, Measured
 from .triple import Scalar
 from .visible import lit_colors
@@ -100,13 +102,14 @@ def march_beams(
     seen: Classification,
     survey: Survey | None,
     beams: Beams,
+    outputs: Outputs | None = "all",
     follower: Follower | None = None,
 ) -> tuple[Progress, Any]:
-    """Where the marches of all rays end, of shape (groups, GROUP); and what a follower who went along has
-    added up, for each ray and over all of them."""
+    """Where the marches of all rays end, of shape (groups, GROUP), with these outputs or nothing but opacity;
+    and what a follower who went along has added up, for each ray and over all of them."""
     rays, groups = beams.rays, beams.rays.length.shape[0]
     size = min(BATCH, groups)
-    at = jax.vmap(jax.vmap(begin, in_axes=(None, 0)), in_axes=(None, 0))(march, rays)
+    at = jax.vmap(jax.vmap(lambda ray: begin(march, ray, outputs)))(rays)
     finished = rays.length <= 0
     notes = None
     if survey is not None:
@@ -115,8 +118,11 @@ def march_beams(
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
     at = _with(at, finished=finished)
 
-    def run(rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""]) -> _State:
-        """March the groups in these rows for a while; a row past the last one stands for none."""
+    def run(
+        rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""]
+    ) -> tuple[_State, Bool[Array, " batch"]]:
+        """March the groups in these rows for a while, and tell which are alive; a row past the last one
+        stands for none."""
         known = jnp.minimum(rows, groups - 1)
         beam = jnp.repeat(known // (groups // beams.count), GROUP)
 
@@ -134,8 +140,11 @@ def march_beams(
         some, here = jax.tree.map(take, (rays, state[0]))
         here = _with(here, finished=here.finished | jnp.repeat(rows >= groups, GROUP))
 
+        def living(here: Progress) -> Bool[Array, " batch"]:
+            return jnp.any(_alive(march, here).reshape(size, GROUP), axis=-1)
+
         def go_on(here: tuple[Progress, Any]) -> Bool[Array, ""]:
-            return jnp.sum(jnp.any(_alive(march, here[0]).reshape(size, GROUP), axis=-1)) > keep
+            return jnp.sum(living(here[0])) > keep
 
         def onward(here: Progress) -> Progress:
             return here if survey is None else _leap(march, survey, notes, beam, some, here)
@@ -146,7 +155,7 @@ def march_beams(
                 return _segment(march, volume, seen, some, onward(here[0]))[0], None
 
             here, _ = jax.lax.while_loop(go_on, go, (here, None))
-            return jax.tree.map(put, state[0], here), None
+            return (jax.tree.map(put, state[0], here), None), living(here)
 
         companion, (at, (kept, sums, total)) = follower, state
         given = jax.tree.map(take, follower.given)
@@ -161,31 +170,25 @@ def march_beams(
         zeros = jax.tree.map(lambda leaf: jnp.zeros((size * GROUP, *leaf.shape[2:]), leaf.dtype), sums)
         along = jax.tree.map(take, kept), zeros, total
         here, (part, more, total) = jax.lax.while_loop(go_on, go_along, (here, along))
-        return jax.tree.map(put, at, here), (
-            jax.tree.map(put, kept, part),
-            jax.tree.map(add, sums, more),
-            total,
-        )
+        along = jax.tree.map(put, kept, part), jax.tree.map(add, sums, more), total
+        return (jax.tree.map(put, at, here), along), living(here)
 
-    def alive_rows(at: Progress) -> tuple[Int[Array, " padded"], Int[Array, ""]]:
-        alive = jnp.any(_alive(march, at), axis=-1)
-        rows = jnp.nonzero(alive, size=-(-groups // size) * size, fill_value=groups)[0]
-        return rows.astype(jnp.int32), jnp.sum(alive, dtype=jnp.int32)
-
-    def round_(round_: tuple[_State, Array, Array]) -> tuple[_State, Array, Array]:
-        state, rows, count = round_
+    def round_(state: tuple[_State, Bool[Array, " groups"]]) -> tuple[_State, Bool[Array, " groups"]]:
+        rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
         # only full batches, as long as there are any: what remains joins those of the next round
         batches = jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, int(KEPT * size), 0)
 
-        def one(i: Int[Array, ""], state: _State) -> _State:
-            return run(jax.lax.dynamic_slice_in_dim(rows, i * size, size), state, keep)
+        def one(i: Int[Array, ""], state: tuple[_State, Array]) -> tuple[_State, Array]:
+            some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
+            after, living = run(some, state[0], keep)
+            return after, state[1].at[some].set(living, mode="drop")
 
-        state = jax.lax.fori_loop(0, batches, one, state)
-        return state, *alive_rows(state[0])
+        return jax.lax.fori_loop(0, batches, one, state)
 
     state: _State = at, None if follower is None else (follower.kept, follower.sums, follower.total)
-    (at, along), _, _ = jax.lax.while_loop(lambda state: state[2] > 0, round_, (state, *alive_rows(at)))
+    alive = jnp.any(_alive(march, at), axis=-1)
+    (at, along), _ = jax.lax.while_loop(lambda state: jnp.any(state[1]), round_, (state, alive))
     return at, None if along is None else along[1:]
 
 

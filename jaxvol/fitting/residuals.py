@@ -179,7 +179,9 @@ class ImageResidual(Residual):
             volume, transfer, camera, march, lighting = self._scene(parameters, group, view)
             if pieces > 1:
                 camera = _rows_of(camera, first, rows)
-            rendering = render(volume, transfer, camera, march, lighting=lighting, adjoint=adjoint)
+            rendering = render(
+                volume, transfer, camera, march, lighting=lighting, outputs="rgba", adjoint=adjoint
+            )
             seen = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
             wanted = group.images[view, jnp.minimum(row, height - 1)]
