@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from ..camera import Camera
 from ..checks import Arrayable, finite_array, number, require
@@ -144,6 +143,8 @@ class Pose(Bijection):
         )
 
     def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
+        from scipy.spatial.transform import Rotation  # here: a first image need not wait for it
+
         start = self.start
         kept = [(c.view_angle, c.parallel_scale, c.window, _distance(c)) for c in (start, value)]
         same = jax.tree.structure(value) == jax.tree.structure(start) and all(

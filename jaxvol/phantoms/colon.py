@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
 
 from ..checks import integer
 from .canvas import FAR, Canvas
@@ -20,6 +19,8 @@ def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
 
     **Raises:** `ValueError` for fewer than 2 points.
     """
+    from scipy.interpolate import CubicSpline  # here: a first image need not wait for it
+
     points = integer("points", points, 2)
     turns = [(-0.6, -0.6, -0.66), (-0.64, -0.5, -0.1), (-0.6, -0.55, 0.45), (-0.3, -0.3, 0.68)]
     turns += [(0.1, -0.5, 0.45), (0.52, -0.55, 0.6), (0.66, -0.1, 0.35), (0.6, 0.1, -0.2), (0.45, -0.3, -0.6)]

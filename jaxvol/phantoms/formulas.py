@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.special import expit
 
 from .canvas import Canvas
 from .shapes import Block
@@ -23,7 +22,7 @@ def maker(value: Callable[..., Block]) -> Callable[[int, np.random.Generator], n
 
 def plane(x, y, z):
     height = 0.25 + 0.35 * (x + 1) / 2
-    return expit(((z + 1) / 2 - height) / 0.004)
+    return _rising(((z + 1) / 2 - height) / 0.004)
 
 
 def cut_block(x, y, z):
@@ -31,7 +30,7 @@ def cut_block(x, y, z):
 
 
 def sphere(x, y, z):
-    return expit((0.5 - np.sqrt(x * x + y * y + z * z)) / 0.008)
+    return _rising((0.5 - np.sqrt(x * x + y * y + z * z)) / 0.008)
 
 
 def constant(x, y, z):
@@ -44,3 +43,10 @@ def linear(x, y, z):
 
 def gaussian(x, y, z):
     return np.exp((x * x + y * y + z * z) / (-2 * 0.3**2))
+
+
+def _rising(x: Block) -> Block:
+    """From 0 far below 0 to 1 far above."""
+    from scipy.special import expit  # here: a first image need not wait for it
+
+    return expit(x)

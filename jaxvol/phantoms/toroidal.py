@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.ndimage import gaussian_filter1d
 
 from ..checks import integer
 from ..toroidal import ToroidalMap
@@ -102,6 +101,8 @@ def _speckle(
     rng: np.random.Generator, shape: tuple[int, ...], grain: float
 ) -> Float[np.ndarray, "beta sigma gamma"]:
     """Rayleigh numbers of mean 1, correlated over `grain` nodes of the last axis."""
+    from scipy.ndimage import gaussian_filter1d  # here: a first image need not wait for it
+
     impulse = np.zeros(shape[-1])
     impulse[shape[-1] // 2] = 1
     left = np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2))  # of the standard deviation
