@@ -29,7 +29,7 @@ from .compiled import in_memory
 from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
-from .reference import Progress, begin, blend, front, move, opacity, pieces
+from .reference import Progress, begin, blend, front, measure, move, opacity, pieces
 from .rendering import Outputs
 from .transfer import Classification, Measured
 from .triple import Scalar
@@ -117,6 +117,8 @@ def march_beams(
         hopeful = jnp.broadcast_to(survey.seen(notes), (beams.count,))
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
     at = _with(at, finished=finished)
+    if march.moves and survey is None and follower is None:
+        at = _probe(march, volume, seen, rays, at)
 
     def run(
         rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""]
@@ -242,23 +244,34 @@ def _segment(
     if seen.search is not None:
         found = in_memory(any_live, lambda values: [over_cells(seen.search)(v) for v in values], values)
         values = [(*read, *more) for read, more in zip(values, found, strict=True)]
-    alphas = in_memory(any_live, opacities, at, given, values)
-    bounded = march.moves or march.max_samples is not None
     taken, moved = jnp.full_like(at.index, CELLS), jnp.zeros(live.shape, bool)
-    if bounded:
-        taken, moved = _taken(march, at, live, alphas)
+    samples = Samples(list(cells(at, given)), values, [])
+    if not march.moves and march.max_samples is None:
+        samples = samples._replace(opacity=in_memory(any_live, opacities, at, given, values))
+    else:
+        settled = jax.vmap(lambda at: march.settled(at.memory))(at)
+        left = march.most_samples - at.index
+        whole_ones = ~jnp.any(live & ~(settled & (left >= CELLS)))
 
-    samples = Samples(list(cells(at, given)), values, alphas)
-    if bounded:  # what is not taken is blended as if it lay past the exit
+        def all_(*arguments: Any) -> tuple[list[Scalar], Array, Array]:
+            return opacities(*arguments), taken, moved
+
+        def some(*arguments: Any) -> tuple[list[Scalar], Array, Array]:
+            alphas = opacities(*arguments)
+            taken, moved = _taken(settled, left, alphas)
+            return [jnp.where(ahead[:, None] < taken[None], alpha, 0) for alpha in alphas], taken, moved
+
+        def as_taken(*arguments: Any) -> tuple[list[Scalar], Array, Array]:
+            return jax.lax.cond(whole_ones, all_, some, *arguments)
+
+        alphas, taken, moved = in_memory(any_live, as_taken, at, given, values)
+        # what is not taken is blended as if it lay past the exit
         takes = ahead[:, None] < taken[None]
-        samples = Samples(
-            [
-                eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
-                for cell in samples.cells
-            ],
-            values,
-            [jnp.where(takes, alpha, 0) for alpha in alphas],
-        )
+        left_out = [
+            eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
+            for cell in samples.cells
+        ]
+        samples = Samples(left_out, values, alphas)
     if seen.light is None:
         colors = [over_cells(seen.classify)(read)[0] for read in values]
     else:
@@ -272,24 +285,33 @@ def _segment(
 
 
 def _taken(
-    march: March, at: Progress, live: Bool[Array, " rays"], alphas: list[Scalar]
+    settled: Bool[Array, " rays"], left: Int[Array, " rays"], alphas: list[Scalar]
 ) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
-    """How many of a segment's cells a ray takes, and whether the last of them moves it. All, and no; but a
-    ray that is not settled goes no farther than its next transparent cell, where its samples move to
-    other places than these."""
-    settled = jax.vmap(lambda at: march.settled(at.memory))(at)
-    left = march.most_samples - at.index
+    """How many of a segment's cells a ray takes, that may take so many more, and whether the last of them
+    moves it. A ray that is not settled goes no farther than its next transparent cell, where its samples
+    move to other places than these."""
+    transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
+    first = 1 + jnp.argmax(transparent, axis=0).astype(left.dtype)
+    moved = ~settled & jnp.any(transparent, axis=0) & (first <= left)
+    return jnp.minimum(jnp.where(moved, first, CELLS), left), moved
 
-    def up_to(alphas: list[Scalar]) -> tuple[Array, Array]:
-        transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-        first = 1 + jnp.argmax(transparent, axis=0).astype(left.dtype)
-        moved = ~settled & jnp.any(transparent, axis=0) & (first <= left)
-        return jnp.minimum(jnp.where(moved, first, CELLS), left), moved
 
-    def all_(alphas: list[Scalar]) -> tuple[Array, Array]:
-        return jnp.full_like(left, CELLS), jnp.zeros_like(settled)
+def _probe(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
+    """Move on from a first cell that is transparent, as that of most rays is: one that is moved there would
+    take no more than this cell of a segment."""
 
-    return jax.lax.cond(jnp.all((settled & (left >= CELLS)) | ~live), all_, up_to, alphas)
+    def one(ray: Ray, at: Progress) -> Progress:
+        cut = pieces(march, ray, volume, front(march, at))
+        alphas = [opacity(march, ray, seen, piece, measure(march, ray, seen, piece)) for piece in cut]
+        goes = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
+        gone = move(march, ray, at, jnp.ones((), bool))
+        if gone.met is not None:
+            taken = jnp.sum(jnp.stack([march.sample(piece) < ray.length for piece in cut]))
+            samples = gone.met.samples + taken.astype(gone.met.samples.dtype)
+            gone = eqx.tree_at(lambda gone: gone.met.samples, gone, samples)
+        return jax.tree.map(lambda a, b: jnp.where(goes, a, b), gone, at)
+
+    return jax.vmap(jax.vmap(one))(ray, at)
 
 
 def _leap(

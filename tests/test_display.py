@@ -36,9 +36,7 @@ def test_bad_images_are_named(bad, tmp_path):
 
 def test_image_over_a_background():
     rgba = jnp.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0]]])
-    shape = rgba.shape[:2]
-    no, count = jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32)
-    rendering = jv.Rendering(rgba, jnp.ones(shape), count, no, no)
+    rendering = jv.Picture(rgba, exhausted=jnp.zeros(rgba.shape[:2], bool))
     np.testing.assert_allclose(rendering.image((1, 1, 1)), [[[0.7, 0.6, 0.5], [1, 1, 1]]])
     np.testing.assert_allclose(
         rendering.image(jnp.full((1, 2, 3), 0.5)), [[[0.45, 0.35, 0.25], [0.5, 0.5, 0.5]]]

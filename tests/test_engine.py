@@ -56,6 +56,31 @@ def test_adjoints_share_one_image(adjoint):
     assert_same(plain, jv.render(volume, soft_transfer(), camera, MARCH, adjoint=adjoint))
 
 
+@pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
+def test_an_image_alone_is_the_same_with_its_gradient(adjoint):
+    volume, transfer = anisotropic_noise(), soft_transfer()
+    march = jv.March(0.07, (jv.AlphaCorrection(), jv.EmptySpaceJitter(), jv.EarlyTermination(0.1)))
+    camera = around(volume, (12, 10))
+
+    def seen(extinction, outputs="all"):
+        changed = eqx.tree_at(lambda t: t.extinction, transfer, extinction)
+        return jv.render(volume, changed, camera, march, outputs=outputs, adjoint=adjoint)
+
+    whole, alone = seen(transfer.extinction), seen(transfer.extinction, "rgba")
+    assert isinstance(whole, jv.Rendering)
+    assert not isinstance(alone, jv.Rendering)
+    np.testing.assert_allclose(alone.rgba, whole.rgba, atol=1e-6)
+    np.testing.assert_array_equal(alone.exhausted, whole.exhausted)
+    np.testing.assert_allclose(alone.image(), whole.image(), atol=1e-6)
+    differentiated = jax.jacfwd if adjoint == "forward" else jax.grad
+    gradients = [
+        differentiated(lambda e, outputs=outputs: jnp.mean(seen(e, outputs).rgba ** 2))(transfer.extinction)
+        for outputs in ("all", "rgba")
+    ]
+    assert np.abs(gradients[0]).max() > 0
+    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-4, atol=1e-7)
+
+
 def test_crop_renders_the_same_pixels():
     volume = anisotropic_noise()
     camera = around(volume, (30, 20))
@@ -122,10 +147,16 @@ def test_a_transform_that_is_not_asked_for_leaves_no_trace(transforms):
     assert (operations(()) == operations(transforms)) == (transforms == ())
 
 
+def test_unknown_outputs_are_named():
+    volume = anisotropic_noise()
+    with pytest.raises(ValueError, match="outputs must be one of all, rgba; got 'depth'"):
+        jv.render(volume, soft_transfer(), around(volume, (4, 4)), MARCH, outputs="depth")
+
+
 def test_an_unknown_adjoint_is_named():
     # not through render, whose annotation the checker of the tests enforces first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
-        engine._How.of("reverse", anisotropic_noise(), MARCH)
+        engine._How.of("all", "reverse", anisotropic_noise(), MARCH)
 
 
 def test_direct_under_jit_asks_for_the_number_of_samples():
