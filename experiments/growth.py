@@ -57,7 +57,7 @@ def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions
         for size, scene in at.items()
         for method, transforms in METHODS.items()
     }
-    programs = {str(key): lambda of=of: common.frame(*of) for key, of in marches.items()}
+    programs = {str(key): lambda of=of: common.image(*of) for key, of in marches.items()}
     seconds = timing.interleaved(programs, repetitions)
     finest = min(min(scene.step for scene in at.values()) / 2, SIDE / usual["samples"] / common.FINER)
     # It leaps: over nothing that is seen, or the errors with and without leaping would differ.
