@@ -139,11 +139,13 @@ def blend(
     )
 
 
-def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""], cells: Any = 1) -> Progress:
-    """On over this many cells, of which the last one, or all, may have been transparent. The ray is finished
-    where the next one begins past the exit."""
+def move(
+    march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, cells: Any = 1
+) -> Progress:
+    """On over this many cells, of which the last one, or all, may have been transparent; None for a ray that
+    is settled. The ray is finished where the next one begins past the exit."""
     at = replace(at, index=at.index + cells)
-    if march.moves:
+    if march.moves and transparent is not None:
         steps, memory = march.advance(at.memory, ray, transparent)
         at = replace(at, offset=at.offset + steps - 1, memory=memory)
     return replace(at, finished=at.finished | (front(march, at) >= ray.length))

@@ -16,6 +16,7 @@ None of it shows in the result: cells, transforms and the blending are those of 
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -153,19 +154,26 @@ def march_beams(
 
         if follower is None:
 
-            def go(here: tuple[Progress, None]) -> tuple[Progress, None]:
-                return _segment(march, volume, seen, some, onward(here[0]))[0], None
+            def go(here: tuple[Progress, None], *, whole: bool) -> tuple[Progress, None]:
+                return _segment(march, volume, seen, some, onward(here[0]), whole=whole)[0], None
 
-            here, _ = jax.lax.while_loop(go_on, go, (here, None))
+            def some_may_move(here: tuple[Progress, None]) -> Bool[Array, ""]:
+                return go_on(here) & jnp.any(_alive(march, here[0]) & ~_settled(march, here[0]))
+
+            along, whole = (here, None), march.max_samples is None
+            if whole and march.moves:
+                along = jax.lax.while_loop(some_may_move, partial(go, whole=False), along)
+            here, _ = jax.lax.while_loop(go_on, partial(go, whole=whole), along)
             return (jax.tree.map(put, state[0], here), None), living(here)
 
         companion, (at, (kept, sums, total)) = follower, state
+        whole = not march.moves and march.max_samples is None
         given = jax.tree.map(take, follower.given)
 
         def go_along(here: tuple[Progress, Any]) -> tuple[Progress, Any]:
             at, (kept, sums, total) = here
             at = onward(at)
-            after, samples = _segment(march, volume, seen, some, at)
+            after, samples = _segment(march, volume, seen, some, at, whole=whole)
             kept, more, total = companion.follow(some, at, samples, given, kept, total)
             return after, (kept, jax.tree.map(jnp.add, sums, more), total)
 
@@ -208,26 +216,31 @@ def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
 
 
+def _settled(march: March, at: Progress) -> Bool[Array, " rays"]:
+    return jax.vmap(lambda at: march.settled(at.memory))(at)
+
+
 def _segment(
-    march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress
+    march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress, *, whole: bool
 ) -> tuple[Progress, Samples]:
-    """The next cells of each ray, on to where it is finished, or has moved off the places sampled here."""
+    """The next cells of each ray, on to where it is finished, or has moved off the places sampled here.
+    `whole` tells that all rays are settled, and may take all the cells."""
     ahead = jnp.arange(CELLS, dtype=at.index.dtype)
     live = _alive(march, at)
 
-    def whole(at: Progress) -> tuple[Cell, ...]:
+    def every(at: Progress) -> tuple[Cell, ...]:
         def one(ray: Ray, at: Progress, k: Int[Array, ""]) -> tuple[Cell, ...]:
             return pieces(march, ray, volume, front(march, at, k))
 
         return jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))(ray, at, ahead)
 
-    cut = whole(at)
+    cut = every(at)
     divided = len(cut) > 1
     # To find where a cell is divided is work not to be done twice; a whole cell costs less than memory does.
     given = cut if divided else None
 
     def cells(at: Progress, given: Any) -> tuple[Cell, ...]:
-        return given if divided else whole(at)
+        return given if divided else every(at)
 
     def measured(at: Progress, given: Any) -> list[Measured]:
         each = over_cells(lambda ray, piece: seen.measure(ray.path(march.sample(piece))), (False, True))
@@ -244,34 +257,18 @@ def _segment(
     if seen.search is not None:
         found = in_memory(any_live, lambda values: [over_cells(seen.search)(v) for v in values], values)
         values = [(*read, *more) for read, more in zip(values, found, strict=True)]
-    taken, moved = jnp.full_like(at.index, CELLS), jnp.zeros(live.shape, bool)
-    samples = Samples(list(cells(at, given)), values, [])
-    if not march.moves and march.max_samples is None:
-        samples = samples._replace(opacity=in_memory(any_live, opacities, at, given, values))
-    else:
-        settled = jax.vmap(lambda at: march.settled(at.memory))(at)
-        left = march.most_samples - at.index
-        whole_ones = ~jnp.any(live & ~(settled & (left >= CELLS)))
-
-        def all_(*arguments: Any) -> tuple[list[Scalar], Array, Array]:
-            return opacities(*arguments), taken, moved
-
-        def some(*arguments: Any) -> tuple[list[Scalar], Array, Array]:
-            alphas = opacities(*arguments)
-            taken, moved = _taken(settled, left, alphas)
-            return [jnp.where(ahead[:, None] < taken[None], alpha, 0) for alpha in alphas], taken, moved
-
-        def as_taken(*arguments: Any) -> tuple[list[Scalar], Array, Array]:
-            return jax.lax.cond(whole_ones, all_, some, *arguments)
-
-        alphas, taken, moved = in_memory(any_live, as_taken, at, given, values)
+    alphas = in_memory(any_live, opacities, at, given, values)
+    samples = Samples(list(cells(at, given)), values, alphas)
+    taken, moved = CELLS, None
+    if not whole:
+        taken, moved = _taken(march, at, alphas)
         # what is not taken is blended as if it lay past the exit
         takes = ahead[:, None] < taken[None]
         left_out = [
             eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
             for cell in samples.cells
         ]
-        samples = Samples(left_out, values, alphas)
+        samples = Samples(left_out, values, [jnp.where(takes, alpha, 0) for alpha in alphas])
     if seen.light is None:
         colors = [over_cells(seen.classify)(read)[0] for read in values]
     else:
@@ -280,19 +277,23 @@ def _segment(
     taken_cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
     # unrolled, so that nothing between two cells is put in memory
     after, _ = jax.lax.scan(lambda at, cell: (blended(ray, at, cell), None), at, taken_cells, unroll=CELLS)
-    after = jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, moved, taken)
+    if moved is None:
+        after = jax.vmap(lambda ray, at: move(march, ray, at, None, CELLS))(ray, after)
+    else:
+        after = jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, moved, taken)
     return after, samples
 
 
 def _taken(
-    settled: Bool[Array, " rays"], left: Int[Array, " rays"], alphas: list[Scalar]
+    march: March, at: Progress, alphas: list[Scalar]
 ) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
-    """How many of a segment's cells a ray takes, that may take so many more, and whether the last of them
-    moves it. A ray that is not settled goes no farther than its next transparent cell, where its samples
-    move to other places than these."""
+    """How many of a segment's cells a ray takes, and whether the last of them moves it. A ray that is not
+    settled goes no farther than its next transparent cell, where its samples move to other places than
+    these."""
+    left = march.most_samples - at.index
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     first = 1 + jnp.argmax(transparent, axis=0).astype(left.dtype)
-    moved = ~settled & jnp.any(transparent, axis=0) & (first <= left)
+    moved = ~_settled(march, at) & jnp.any(transparent, axis=0) & (first <= left)
     return jnp.minimum(jnp.where(moved, first, CELLS), left), moved
 
 
