@@ -49,7 +49,6 @@ ENERGIES: dict[str, dict[str, Any]] = {
     "printed": {"energy": "printed"},
     "printed, without its factors of flight": {"energy": "printed", "flights": False},
 }
-NOTE = "Measured on a machine with other work on it: ratios of times are indicative."
 
 
 def march(scene: Scene, seed: int = 0) -> jv.March:
@@ -201,7 +200,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     scene = skin_head(chosen.size, chosen.resolution)
     result = {
-        "note": NOTE,
         "goals": GOALS,
         "image": [chosen.size, chosen.size],
         "resolution": chosen.resolution,
