@@ -108,6 +108,11 @@ def color(
     return seen.light(Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel))
 
 
+def counts(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
+    """Whether a piece is one of a ray's samples. Of a whole cell some pieces have width 0."""
+    return (march.sample(piece) < ray.length) & (piece.width > 0)
+
+
 def blend(
     march: March,
     ray: Ray,
@@ -124,7 +129,7 @@ def blend(
             r, g, b = (sum_ + weight * part for sum_, part in zip(color, own, strict=True))
             color = r, g, b
         if met is not None:
-            taken = ~at.finished & (depth < ray.length)
+            taken = ~at.finished & counts(march, ray, piece)
             met = Met(
                 met.moment + weight * depth,
                 met.samples + taken.astype(met.samples.dtype),

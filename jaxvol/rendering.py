@@ -39,7 +39,7 @@ class Rendering(Picture):
 
     - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
       adds to the opacity, world length; infinite where nothing is seen.
-    - `samples`: samples evaluated.
+    - `samples`: samples evaluated, one for each piece into which a cell falls.
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
     """

@@ -30,7 +30,7 @@ from .compiled import in_memory
 from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
-from .reference import Progress, begin, blend, front, measure, move, opacity, pieces
+from .reference import Progress, begin, blend, counts, front, measure, move, opacity, pieces
 from .rendering import Outputs
 from .transfer import Classification, Measured
 from .triple import Scalar
@@ -307,7 +307,7 @@ def _probe(march: March, volume: Volume, seen: Classification, ray: Ray, at: Pro
         goes = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
         gone = move(march, ray, at, jnp.ones((), bool))
         if gone.met is not None:
-            taken = jnp.sum(jnp.stack([march.sample(piece) < ray.length for piece in cut]))
+            taken = jnp.sum(jnp.stack([counts(march, ray, piece) for piece in cut]))
             samples = gone.met.samples + taken.astype(gone.met.samples.dtype)
             gone = eqx.tree_at(lambda gone: gone.met.samples, gone, samples)
         return jax.tree.map(lambda a, b: jnp.where(goes, a, b), gone, at)
