@@ -381,12 +381,13 @@ def workspace(samples, size=512, resolution=256):
     camera = jv.Camera((3, 2, 2.5), (0, 0, 0), size=(size, size))
     march = jv.March(3.4 / samples, (jv.AlphaCorrection(), jv.EarlyTermination(0.01)))
 
-    def loss(data, transfer, camera):
+    def loss(given):
+        data, transfer, camera = given
         volume = eqx.tree_at(lambda v: v.data, small, data)
         return jnp.sum(jv.render(volume, transfer, camera, march).rgba ** 2)
 
-    program = eqx.filter_jit(jax.grad(loss, argnums=(0, 1, 2)), donate="none")
-    compiled = program.lower(data, soft_transfer(), camera).compile()
+    program = eqx.filter_jit(eqx.filter_grad(loss), donate="none")
+    compiled = program.lower((data, soft_transfer(), camera)).compile()
     return compiled.compiled.memory_analysis().temp_size_in_bytes
 
 
