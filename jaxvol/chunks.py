@@ -63,8 +63,9 @@ def in_front(chosen: Bool[Array, " entries"]) -> Int[Array, " padded"]:
     """The places of those that are chosen, in order, then numbers past the last place; as many as fill up
     whole chunks.
 
-    As `jnp.nonzero`, in a quarter of its time on CPU, where XLA sums up slowly along an array: here it is a
-    product with a triangle of ones, exact for numbers as small as these."""
+    As `jnp.nonzero`, in a quarter of its time for 16 384 entries on CPU, and two thirds for 65 536, where the
+    scatter weighs more: XLA sums up slowly along an array. Here it is a product with a triangle of ones,
+    exact for numbers as small as these."""
     padded = jnp.pad(chosen, (0, -chosen.size % CHUNK))
     rows = padded.reshape(-1, 128).astype(jnp.float32)
     within = jnp.matmul(rows, jnp.triu(jnp.ones((128, 128), rows.dtype), 1), precision="highest")

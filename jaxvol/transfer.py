@@ -237,7 +237,7 @@ class TransferFunction(Transfer):
 
 
 def at_least(value: Scalar, least: Scalar) -> Scalar:
-    # by comparing: a maximum, which hands NaN on, takes the processor four instructions
+    # by comparing, which takes less than a maximum, since that must hand NaN on
     return jnp.where(value >= least, value, least)
 
 

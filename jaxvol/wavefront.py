@@ -9,6 +9,8 @@ What makes this fast was measured (on CPU, by XLA's rules), and is what this fil
 - Rays come in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is marched
   segment after segment until a quarter of its groups is finished; then batches are made up anew from the
   groups that are left. Lanes that idle cost as much as those that work.
+- Rays that a transform may still move take a segment in part. They are marched first, in a loop that asks for
+  that; the loop for all others does not.
 - Where empty space is known (`Survey`), rays leap over it between two segments, each as far as it can.
 
 None of it shows in the result: cells, transforms and the blending are those of `reference`.
