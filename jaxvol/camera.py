@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Float, Num
 
 from .checks import Arrayable, finite_array, number, require
 from .triple import Triple, along, apart
@@ -43,9 +43,10 @@ class Camera(eqx.Module):
     view_angle: Float[Array, ""]
     parallel_scale: Float[Array, ""] | None
     window: Float[Array, "4"]
-    corner: Int[Array, "2"]
+    corner: Float[Array, "2"]
     """Column and row of the first pixel in the image that this one was cropped from: what is random along a
-    ray is keyed by its pixel there."""
+    ray is keyed by its pixel there. Whole numbers, kept as floats so that `jax.grad` takes a camera as it is;
+    their gradient is 0."""
     size: tuple[int, int] = eqx.field(static=True)
 
     def __init__(
@@ -83,7 +84,7 @@ class Camera(eqx.Module):
         window = (-aspect, aspect, -1.0, 1.0) if window is None else window
         self.window = finite_array("window", window, (4,))
         with jax.ensure_compile_time_eval():
-            self.corner = jnp.zeros(2, jnp.int32)
+            self.corner = jnp.zeros(2)
 
     @classmethod
     def looking_at(
@@ -122,7 +123,7 @@ class Camera(eqx.Module):
         x = [self._column(edge) for edge in (left, left + width)]
         y = [self._row(edge) for edge in (top + height, top)]
         return self._showing(
-            jnp.stack([*x, *y]), (width, height), self.corner + np.array([left, top], np.int32)
+            jnp.stack([*x, *y]), (width, height), self.corner + np.array([left, top], self.corner.dtype)
         )
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
@@ -157,7 +158,7 @@ class Camera(eqx.Module):
         return jnp.stack(origin, axis=-1), jnp.stack(direction, axis=-1)
 
     def _showing(
-        self, window: Float[Array, "4"], size: tuple[int, int], corner: Int[Array, "2"] | None = None
+        self, window: Float[Array, "4"], size: tuple[int, int], corner: Float[Array, "2"] | None = None
     ) -> "Camera":
         shown = Camera(
             self.position,

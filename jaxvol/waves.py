@@ -90,7 +90,7 @@ class _OfPixels(Waves):
         column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
         width, height = self.size
         origin, direction = each_ray(source.ray)(column, row)
-        left, top = source.corner.astype(column.dtype)
+        left, top = jnp.round(source.corner).astype(column.dtype)
         pixel = column + left, row + top
         return entering(space, origin, direction, pixel, (column < width) & (row < height))
 
