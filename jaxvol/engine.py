@@ -24,11 +24,11 @@ from .packed import with_words, words_of
 from .reference import begin, end, samples_across, step
 from .relight import Lit
 from .rendering import Outputs, Picture, Rendering
-from .replay import Cotangents, Replay, Total
+from .replay import Cotangents, Replay, Total, Watch
 from .taps import added, floats, with_voxels, without_voxels
 from .transfer import Transfer
 from .volume import Volume
-from .wavefront import Beams, march_beams
+from .wavefront import Beams, Span, march_beams
 from .waves import OwnRays, Waves, each_ray
 
 
@@ -217,24 +217,30 @@ def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
         return _image(scene, how, known)
 
     @image.def_fwd
-    def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Picture, Picture]:
-        rendering = _image(scene, how, known)
-        return rendering, rendering
+    def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Picture, Any]:
+        rendering, spans = _marched(scene, how, known, watch=True)
+        return rendering, (rendering, spans)
 
     @image.def_bwd
-    def _(rendering: Picture, gradient: Picture, perturbed: Any, scene: Scene, known: Known) -> Any:
+    def _(left: Any, gradient: Picture, perturbed: Any, scene: Scene, known: Known) -> Any:
+        rendering, spans = left
         # None stands for what the loss does not use
         whole = jax.tree.map(
             lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
             *(rendering, gradient),
             is_leaf=lambda leaf: leaf is None,
         )
-        return eqx.filter(_pulled(scene, perturbed, known, rendering, whole), perturbed)
+        return eqx.filter(_pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
 
     return image(scene, jax.lax.stop_gradient(known))
 
 
 def _image(scene: Scene, how: _How, known: Known) -> Picture:
+    return _marched(scene, how, known, watch=False)[0]
+
+
+def _marched(scene: Scene, how: _How, known: Known, *, watch: bool) -> tuple[Picture, Span | None]:
+    """The image; and where rays leap, if it is to be watched, the spans of each wave's rays."""
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
     direct = how.adjoint == "direct"
@@ -242,21 +248,25 @@ def _image(scene: Scene, how: _How, known: Known) -> Picture:
     survey = None if direct else _survey((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
 
-    def wave(number: Int[Array, ""]) -> Picture:
-        rays = waves.rays(source, space, number)
+    def wave(number: Int[Array, ""]) -> tuple[Picture, Span | None]:
+        rays, spans = waves.rays(source, space, number), None
         if direct:
             one = each_ray(lambda ray, at: step(march, ray, volume, seen, at))
             start = each_ray(lambda ray: begin(march, ray, how.outputs))(rays)
             at, _ = jax.lax.scan(lambda at, _: (one(rays, at), None), start, None, length=how.length)
         else:
             beams = Beams(rays, waves.beams, waves.box(source, rays, number))
-            at, _ = march_beams(march, volume, seen, survey, beams, how.outputs)
-        return each_ray(end)(rays, at)
+            watcher = Watch(rays.length.shape) if watch and survey is not None else None
+            at, (spans, *_) = march_beams(march, volume, seen, survey, beams, how.outputs, watcher)
+        return each_ray(end)(rays, at), spans
 
-    return jax.tree.map(waves.assemble, jax.lax.map(wave, jnp.arange(waves.number)))
+    pictures, spans = jax.lax.map(wave, jnp.arange(waves.number))
+    return jax.tree.map(waves.assemble, pictures), spans
 
 
-def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Picture, gradient: Picture) -> Any:
+def _pulled(
+    scene: Scene, perturbed: Any, known: Known, rendering: Picture, spans: Span | None, gradient: Picture
+) -> Any:
     """What every leaf of the scene gets of an image's gradient."""
     volume, transfer, source, march, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
@@ -268,8 +278,8 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Picture, grad
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
 
-    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Picture, Picture]) -> tuple[Any, None]:
-        (total, of_source), (number, rendering, gradient) = sums, given
+    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Span | None, Picture, Picture]) -> Any:
+        (total, of_source), (number, span, rendering, gradient) = sums, given
 
         def made(moving: PyTree) -> Ray:
             volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
@@ -283,8 +293,8 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Picture, grad
             *(rays, Cotangents.of(rays, rendering, gradient), total, light),
             places=places,
         )
-        beams = Beams(rays, waves.beams, waves.box(source, rays, number))
-        _, (of_rays, total) = march_beams(march, packed, seen, survey, beams, None, replay)
+        beams = Beams(rays, waves.beams, waves.box(source, rays, number), span)
+        _, (_, of_rays, total) = march_beams(march, packed, seen, survey, beams, None, replay)
         if not places:
             return (total, of_source), None
         if isinstance(gradient, Rendering):
@@ -304,7 +314,7 @@ def _pulled(scene: Scene, perturbed: Any, known: Known, rendering: Picture, grad
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
     image = jax.tree.map(waves.apart, (rendering, gradient))
-    (total, of_source), _ = jax.lax.scan(wave, start, (jnp.arange(waves.number), *image))
+    (total, of_source), _ = jax.lax.scan(wave, start, (jnp.arange(waves.number), spans, *image))
     of_volume = total.volume
     if total.voxels is not None:
         of_volume = with_voxels(of_volume, total.voxels.reshape(volume.data.shape))

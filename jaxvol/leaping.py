@@ -54,8 +54,9 @@ class SpaceLeaping(Transform):
 
     Which blocks are visible is found again for every image, from the transfer function as it is then.
     What is leapt over has extinction 0, so the image loses nothing. An extinction of 0 has a gradient
-    nevertheless. `adjoint="direct"`, which marches without leaps, sees it; `"replay"` and `"forward"` take
-    it as 0 wherever rays leap. A fit that is to make visible what is not begins above 0, or leaps not.
+    nevertheless. `adjoint="direct"`, which marches without leaps, sees it; `"forward"` takes it as 0 wherever
+    rays leap, and `"replay"` also in front of and behind all that a ray sees. A fit that is to make visible
+    what is not begins above 0, or leaps not.
 
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
     rendering rays of one's own.

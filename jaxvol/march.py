@@ -107,8 +107,9 @@ class Transform(eqx.Module):
 
     def settled(self, memory: Any) -> Bool[Array, ""]:
         """Whether `advance` answers with whole steps from here on, whatever the samples are like. Two
-        transparent samples in a row must settle a ray: over empty space a march leaps in whole steps."""
-        return jnp.asarray(type(self).advance is Transform.advance)
+        transparent samples in a row must settle a ray: over empty space a march leaps in whole steps. Asked
+        where there is an `advance` of its own."""
+        return jnp.zeros((), bool)
 
     def survey(self, occupancy: Occupancy, view: View | None) -> Survey | None:
         """What is known about empty space ahead of rays; None if nothing is. Asked once for each image.
@@ -186,8 +187,12 @@ class March(eqx.Module):
 
     def settled(self, memory: tuple[Any, ...]) -> Bool[Array, ""]:
         """Whether a ray will take whole steps from here on."""
-        answers = [t.settled(remembered) for t, remembered in zip(self.transforms, memory, strict=True)]
-        return jnp.all(jnp.stack(answers), axis=0) if answers else jnp.ones((), bool)
+        settled = jnp.ones((), bool)
+        for transform, remembered in zip(self.transforms, memory, strict=True):
+            # the others are, and XLA would take its time to find that out
+            if type(transform).advance is not Transform.advance:
+                settled &= transform.settled(remembered)
+        return settled
 
     @property
     def leaps(self) -> bool:

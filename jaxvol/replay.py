@@ -32,7 +32,26 @@ from .transfer import Classification, Transfer
 from .triple import Scalar, Triple, along
 from .visible import Weighed, weighed
 from .volume import Volume
-from .wavefront import CELLS, Follower, Samples, over_cells
+from .wavefront import CELLS, Follower, Samples, Span, over_cells
+
+
+class Watch(Follower):
+    """The first march over rays of this shape remembers between which cells each of them sees anything. Where
+    rays leap, the second one leaps over the rest, too."""
+
+    given = sums = total = None
+
+    def __init__(self, shape: tuple[int, ...]):
+        self.kept = Span(jnp.full(shape, jnp.iinfo(jnp.int32).max), jnp.zeros(shape, jnp.int32))
+
+    def follow(
+        self, ray: Ray, at: Progress, samples: Samples, given: None, kept: Span, total: None
+    ) -> tuple[Span, None, None]:
+        cells = at.index[None] + jnp.arange(CELLS, dtype=at.index.dtype)[:, None]
+        seen = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
+        first = jnp.min(jnp.where(seen, cells, kept.first[None]), axis=0)
+        until = jnp.max(jnp.where(seen, cells + 1, kept.until[None]), axis=0)
+        return Span(jnp.minimum(kept.first, first), until), None, None
 
 
 class Cotangents(NamedTuple):

@@ -9,8 +9,8 @@ What makes this fast was measured (on CPU, by XLA's rules), and is what this fil
 - Rays come in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is marched
   segment after segment until a quarter of its groups is finished; then batches are made up anew from the
   groups that are left. Lanes that idle cost as much as those that work.
-- Rays that a transform may still move take a segment in part. They are marched first, in a loop that asks for
-  that; the loop for all others does not.
+- Rays that a transform may still move take a segment in part. Groups with such rays are marched first, by
+  themselves, until none is left; what follows does not ask for them.
 - Where empty space is known (`Survey`), rays leap over it between two segments, each as far as it can.
 
 None of it shows in the result: cells, transforms and the blending are those of `reference`.
@@ -57,17 +57,26 @@ _State: TypeAlias = tuple[Progress, Any]
 """Where all rays are, and what a follower remembers of them, adds up for them, and over all of them."""
 
 
+class Span(NamedTuple):
+    """Between which of its cells a ray sees anything: from `first` on, and before `until`."""
+
+    first: Int[Array, "*rays"]
+    until: Int[Array, "*rays"]
+
+
 class Beams(eqx.Module):
     """Rays that are marched together, in groups of which some make up a beam.
 
     - `rays`: of shape (groups, GROUP).
     - `count`: how many beams. As many groups after each other make up each of them.
     - `box`: the boxes around the beams.
+    - `span`: where that is known, no more of a ray is marched than its span.
     """
 
     rays: Ray
     count: int = eqx.field(static=True)
     box: Callable[[Occupancy], Box] = eqx.field(static=True)
+    span: Span | None = None
 
 
 class Samples(NamedTuple):
@@ -80,7 +89,7 @@ class Samples(NamedTuple):
 
 
 class Follower(ABC):
-    """Something that goes along with a march, and looks at all its samples.
+    """Something that goes along with a march, and looks at all samples.
 
     - `given`, `kept`, `sums`: what it knows of each ray, remembers, and adds up from 0: (groups, GROUP).
     - `total`: what it adds up over all rays.
@@ -107,10 +116,11 @@ def march_beams(
     beams: Beams,
     outputs: Outputs | None = "all",
     follower: Follower | None = None,
-) -> tuple[Progress, Any]:
+) -> tuple[Progress, tuple[Any, Any, Any]]:
     """Where the marches of all rays end, of shape (groups, GROUP), with these outputs or nothing but opacity;
-    and what a follower who went along has added up, for each ray and over all of them."""
+    and what a follower who went along remembers of each ray, has added up for it, and over all of them."""
     rays, groups = beams.rays, beams.rays.length.shape[0]
+    capped = march.max_samples is not None
     size = min(BATCH, groups)
     at = jax.vmap(jax.vmap(lambda ray: begin(march, ray, outputs)))(rays)
     finished = rays.length <= 0
@@ -122,11 +132,19 @@ def march_beams(
     at = _with(at, finished=finished)
     if march.moves and survey is None and follower is None:
         at = _probe(march, volume, seen, rays, at)
+    if beams.span is not None:
+        over = jax.vmap(jax.vmap(partial(_over, march)))
+        at = _until(beams.span, over(rays, at, beams.span.first))
+
+    def wanted(at: Progress, whole: bool) -> Bool[Array, "*rays"]:
+        """Which rays a pass is for: all, or first those that are not settled."""
+        alive = _alive(march, at)
+        return alive if whole or capped else alive & ~_settled(march, at)
 
     def run(
-        rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""]
+        rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""], whole: bool
     ) -> tuple[_State, Bool[Array, " batch"]]:
-        """March the groups in these rows for a while, and tell which are alive; a row past the last one
+        """March the groups in these rows for a while, and tell which are to go on; a row past the last one
         stands for none."""
         known = jnp.minimum(rows, groups - 1)
         beam = jnp.repeat(known // (groups // beams.count), GROUP)
@@ -142,66 +160,57 @@ def march_beams(
         def add(leaf: Array, part: Array) -> Array:
             return leaf.at[rows].add(part.reshape(size, GROUP, *part.shape[1:]), mode="drop")
 
-        some, here = jax.tree.map(take, (rays, state[0]))
+        at, (kept, sums, total) = state
+        given = None if follower is None else follower.given
+        some, here, span, given, mine = jax.tree.map(take, (rays, at, beams.span, given, kept))
         here = _with(here, finished=here.finished | jnp.repeat(rows >= groups, GROUP))
+        more = jax.tree.map(lambda leaf: jnp.zeros((size * GROUP, *leaf.shape[2:]), leaf.dtype), sums)
 
-        def living(here: Progress) -> Bool[Array, " batch"]:
-            return jnp.any(_alive(march, here).reshape(size, GROUP), axis=-1)
+        def going(here: Progress) -> Bool[Array, " batch"]:
+            return jnp.any(wanted(here, whole).reshape(size, GROUP), axis=-1)
 
-        def go_on(here: tuple[Progress, Any]) -> Bool[Array, ""]:
-            return jnp.sum(living(here[0])) > keep
+        def go(state: _State) -> _State:
+            here, along = state
+            here = here if survey is None else _leap(march, survey, notes, beam, some, here)
+            after, samples = _segment(march, volume, seen, some, here, whole=whole)
+            if follower is not None:
+                mine, more, total = along
+                mine, found, total = follower.follow(some, here, samples, given, mine, total)
+                along = mine, jax.tree.map(jnp.add, more, found), total
+            return _until(span, after), along
 
-        def onward(here: Progress) -> Progress:
-            return here if survey is None else _leap(march, survey, notes, beam, some, here)
+        here, (mine, more, total) = jax.lax.while_loop(
+            lambda state: jnp.sum(going(state[0])) > keep, go, (here, (mine, more, total))
+        )
+        along = jax.tree.map(put, kept, mine), jax.tree.map(add, sums, more), total
+        return (jax.tree.map(put, at, here), along), going(here)
 
-        if follower is None:
+    def march_all(state: _State, *, whole: bool) -> _State:
+        """March all groups for as long as they are wanted."""
 
-            def go(here: tuple[Progress, None], *, whole: bool) -> tuple[Progress, None]:
-                return _segment(march, volume, seen, some, onward(here[0]), whole=whole)[0], None
+        def round_(state: tuple[_State, Bool[Array, " groups"]]) -> tuple[_State, Bool[Array, " groups"]]:
+            rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
+            # only full batches, as long as there are any: what remains joins those of the next round
+            batches = jnp.maximum(count // size, 1)
+            keep = jnp.where(count > size, int(KEPT * size), 0)
 
-            def some_may_move(here: tuple[Progress, None]) -> Bool[Array, ""]:
-                return go_on(here) & jnp.any(_alive(march, here[0]) & ~_settled(march, here[0]))
+            def one(i: Int[Array, ""], state: tuple[_State, Array]) -> tuple[_State, Array]:
+                some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
+                after, going = run(some, state[0], keep, whole)
+                return after, state[1].at[some].set(going, mode="drop")
 
-            along, whole = (here, None), march.max_samples is None
-            if whole and march.moves:
-                along = jax.lax.while_loop(some_may_move, partial(go, whole=False), along)
-            here, _ = jax.lax.while_loop(go_on, partial(go, whole=whole), along)
-            return (jax.tree.map(put, state[0], here), None), living(here)
+            return jax.lax.fori_loop(0, batches, one, state)
 
-        companion, (at, (kept, sums, total)) = follower, state
-        whole = not march.moves and march.max_samples is None
-        given = jax.tree.map(take, follower.given)
+        going = jnp.any(wanted(state[0], whole), axis=-1)
+        return jax.lax.while_loop(lambda state: jnp.any(state[1]), round_, (state, going))[0]
 
-        def go_along(here: tuple[Progress, Any]) -> tuple[Progress, Any]:
-            at, (kept, sums, total) = here
-            at = onward(at)
-            after, samples = _segment(march, volume, seen, some, at, whole=whole)
-            kept, more, total = companion.follow(some, at, samples, given, kept, total)
-            return after, (kept, jax.tree.map(jnp.add, sums, more), total)
-
-        zeros = jax.tree.map(lambda leaf: jnp.zeros((size * GROUP, *leaf.shape[2:]), leaf.dtype), sums)
-        along = jax.tree.map(take, kept), zeros, total
-        here, (part, more, total) = jax.lax.while_loop(go_on, go_along, (here, along))
-        along = jax.tree.map(put, kept, part), jax.tree.map(add, sums, more), total
-        return (jax.tree.map(put, at, here), along), living(here)
-
-    def round_(state: tuple[_State, Bool[Array, " groups"]]) -> tuple[_State, Bool[Array, " groups"]]:
-        rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
-        # only full batches, as long as there are any: what remains joins those of the next round
-        batches = jnp.maximum(count // size, 1)
-        keep = jnp.where(count > size, int(KEPT * size), 0)
-
-        def one(i: Int[Array, ""], state: tuple[_State, Array]) -> tuple[_State, Array]:
-            some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
-            after, living = run(some, state[0], keep)
-            return after, state[1].at[some].set(living, mode="drop")
-
-        return jax.lax.fori_loop(0, batches, one, state)
-
-    state: _State = at, None if follower is None else (follower.kept, follower.sums, follower.total)
-    alive = jnp.any(_alive(march, at), axis=-1)
-    (at, along), _ = jax.lax.while_loop(lambda state: jnp.any(state[1]), round_, (state, alive))
-    return at, None if along is None else along[1:]
+    along = (None, None, None) if follower is None else (follower.kept, follower.sums, follower.total)
+    state: _State = at, along
+    if march.moves or capped:
+        state = march_all(state, whole=False)
+    if not capped:
+        state = march_all(state, whole=True)
+    return state
 
 
 def _with(at: Progress, **changes: Array) -> Progress:
@@ -218,8 +227,11 @@ def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
 
 
-def _settled(march: March, at: Progress) -> Bool[Array, " rays"]:
-    return jax.vmap(lambda at: march.settled(at.memory))(at)
+def _settled(march: March, at: Progress) -> Bool[Array, "*rays"]:
+    of_ray = march.settled
+    for _ in at.finished.shape:
+        of_ray = jax.vmap(of_ray)
+    return of_ray(at.memory)
 
 
 def _segment(
@@ -294,8 +306,10 @@ def _taken(
     these."""
     left = march.most_samples - at.index
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    first = 1 + jnp.argmax(transparent, axis=0).astype(left.dtype)
-    moved = ~_settled(march, at) & jnp.any(transparent, axis=0) & (first <= left)
+    # not by argmax, which XLA compares pair by pair
+    upto = jnp.arange(1, CELLS + 1, dtype=left.dtype)[:, None]
+    first = jnp.min(jnp.where(transparent, upto, CELLS + 1), axis=0)
+    moved = ~_settled(march, at) & (first <= jnp.minimum(left, CELLS))
     return jnp.minimum(jnp.where(moved, first, CELLS), left), moved
 
 
@@ -326,6 +340,15 @@ def _leap(
     there = survey.clear(notes, beam, rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     cells = jnp.clip(whole.astype(at.index.dtype), 0, march.most_samples - at.index)
-    leaps = (cells > 0) & ~at.finished
-    gone = jax.vmap(lambda ray, at, cells: move(march, ray, at, jnp.ones((), bool), cells))(rays, at, cells)
-    return jax.tree.map(lambda a, b: jnp.where(leaps, a, b), gone, at)
+    return jax.vmap(partial(_over, march))(rays, at, cells)
+
+
+def _over(march: March, ray: Ray, at: Progress, cells: Int[Array, ""]) -> Progress:
+    """On over so many cells, all of which are transparent."""
+    gone = move(march, ray, at, jnp.ones((), bool), cells)
+    return jax.tree.map(lambda a, b: jnp.where((cells > 0) & ~at.finished, a, b), gone, at)
+
+
+def _until(span: Span | None, at: Progress) -> Progress:
+    """Finished where nothing more is seen."""
+    return at if span is None else _with(at, finished=at.finished | (at.index >= span.until))
