@@ -17,6 +17,16 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def room_for_programs():
+    """Compiled programs take some ten thousand memory maps a module. Linux gives a process 65 530, and past that
+    XLA crashes."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 30_000:
+        jax.clear_caches()
+
+
 @pytest.fixture
 def real_volume():
     """Path of a real volume by file name; skips where the data are not there."""

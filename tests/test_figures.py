@@ -4,6 +4,7 @@ import importlib
 import json
 from pathlib import Path
 
+import jax
 import pytest
 from skimage.io import imread
 
@@ -58,6 +59,7 @@ def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     for experiment in MEASURES.values():
         experiment.main(["--quick", "--output", str(folder)])
+        jax.clear_caches()  # of all their programs together a process would die
     return folder
 
 
