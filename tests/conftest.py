@@ -19,8 +19,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 @pytest.fixture(scope="module", autouse=True)
 def room_for_programs():
-    """Compiled programs take some ten thousand memory maps a module. Linux gives a process 65 530, and past that
-    XLA crashes."""
+    """Compiled programs take memory maps, of which Linux gives a process 65 530; past that XLA crashes."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > 30_000:
