@@ -166,24 +166,11 @@ class TransferFunction(Transfer):
         values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
         if last < FEW:
             return None
-        first, step = values[0], (values[-1] - values[0]) / last
-        even = jnp.all(jnp.abs(values[1:] - values[:-1] - step) < 1e-3 * step)
-
-        def counted(value: Scalar) -> Int[Array, "..."]:
-            """For points that lie evenly: by a division, which may be off by one."""
-            guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
-            return guess + (value >= at(guess + 1)).astype(jnp.int32) - (value < at(guess)).astype(jnp.int32)
-
-        def at(point: Int[Array, "..."]) -> Scalar:
-            return values.at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-        def searched(value: Scalar) -> Int[Array, "..."]:
-            return points_below(values, value) - 1
 
         def search(measured: Measured) -> Measured:
             value = at_least(measured[0], values[0])
-            interval = jnp.clip(jax.lax.cond(even, counted, searched, value), 0, last)
-            return interval, value - at(interval)
+            interval = jnp.clip(points_below(values, value) - 1, 0, last)
+            return interval, value - _at(values, interval)
 
         return search
 
@@ -245,11 +232,31 @@ def points_below(
     values: Float[Array, " n"], value: Float[Array, "*batch"], *, strictly: bool = False
 ) -> Int[Array, "*batch"]:
     """How many control points lie at or below a value, or strictly below it."""
-    # Comparing with every point is one fused kernel, the faster one while there are few points.
-    search = "compare_all" if values.shape[0] <= 32 else "scan_unrolled"
-    values = jax.lax.stop_gradient(values)
-    side = "left" if strictly else "right"
-    return jnp.searchsorted(values, value, side=side, method=search).astype(jnp.int32)
+    values, last = jax.lax.stop_gradient(values), values.shape[0] - 1
+
+    def searched(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
+        # Comparing with every point is one fused kernel, the faster one while there are few points.
+        how, side = "compare_all" if last < 2 * FEW else "scan_unrolled", "left" if strictly else "right"
+        return jnp.searchsorted(values, value, side=side, method=how).astype(jnp.int32)
+
+    if last < FEW:
+        return searched(value)
+    first, step = values[0], (values[-1] - values[0]) / last
+
+    def counted(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
+        """For points that lie evenly: by a division, which may be off by one."""
+        guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
+        reached = [
+            value > at if strictly else value >= at for at in (_at(values, guess), _at(values, guess + 1))
+        ]
+        return guess + sum(each.astype(jnp.int32) for each in reached)
+
+    even = jnp.all(jnp.abs(values[1:] - values[:-1] - step) < 1e-3 * step)
+    return jax.lax.cond(even, counted, searched, value)
+
+
+def _at(values: Float[Array, " n"], point: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+    return values.at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def row_of(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
