@@ -47,8 +47,8 @@ GROUP = 16
 """Rays that live and die together as far as batches go: a quarter of a beam."""
 
 BATCH = 520
-"""Groups marched at a time. Not 512: rows of 8192 floats lie 32 KiB apart, and all of them, of all arrays, would
-fall to the same few lines of the cache."""
+"""Groups marched at a time. Not 512: rows of 8192 floats would lie 32 KiB apart, and all of them, of all
+arrays, fall to the same few lines of the cache."""
 
 KEPT = 0.75
 """The share of a batch's groups that must be alive for it to go on."""
