@@ -229,10 +229,12 @@ def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
 
 
 def _settled(march: March, at: Progress) -> Bool[Array, "*rays"]:
-    of_ray = march.settled
+    def of_ray(at: Progress) -> Bool[Array, "*rays"]:
+        return march.settled(at.memory)
+
     for _ in at.finished.shape:
         of_ray = jax.vmap(of_ray)
-    return of_ray(at.memory)
+    return of_ray(at)
 
 
 def _segment(
