@@ -5,6 +5,8 @@ business; what they see is `reference`'s; and what a loss sees of it, `replay`'s
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any, Literal, TypeAlias, get_args, overload
 
 import equinox as eqx
@@ -16,6 +18,7 @@ from .camera import Camera
 from .checks import Arrayable, finite, require
 from .compiled import compiled
 from .leaping import FirstHit
+from .lighting.deferred import Deferred, lit_picture
 from .lighting.seam import Lighting, Surroundings, classification
 from .locate import Ray
 from .march import March, Survey, View
@@ -23,13 +26,13 @@ from .occupancy import Blocks
 from .packed import with_words, words_of
 from .reference import begin, end, samples_across, step
 from .relight import Lit
-from .rendering import Outputs, Picture, Rendering
+from .rendering import DepthPicture, Found, Outputs, Picture, Rendering
 from .replay import Cotangents, Replay, Total, Watch
 from .taps import added, floats, with_voxels, without_voxels
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, Span, march_beams
-from .waves import OwnRays, Waves, each_ray
+from .waves import OwnRays, Waves, each_ray, line
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
@@ -184,7 +187,7 @@ class Known(eqx.Module):
 class _How(eqx.Module):
     """What is found out, and by which loop rays are marched to their ends."""
 
-    outputs: Outputs = eqx.field(static=True)
+    outputs: Found = eqx.field(static=True)
     adjoint: Adjoint = eqx.field(static=True)
     length: int = eqx.field(static=True)
     """Of the loop of `"direct"`."""
@@ -206,7 +209,21 @@ Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | N
 
 @compiled
 def _render(scene: Scene, how: _How, known: Known) -> Any:
+    if isinstance(scene[-1], Deferred):
+        return _lit_once(scene, how, known)
     return _replayed(scene, how, known) if how.adjoint == "replay" else _image(scene, how, known)
+
+
+def _lit_once(scene: Scene, how: _How, known: Known) -> Picture:
+    """An image that is rendered without light, and lit as a whole."""
+    volume, transfer, source, march, lighting = scene
+    found = "all" if how.outputs == "all" else "depth"
+    rendering = _render((volume, transfer, source, march, None), replace(how, outputs=found), known)
+    volume = with_words(volume, known.words)
+    space = march.locate(volume)
+    seen = classification(volume, transfer, space, lighting)
+    rgba = lit_picture(seen, space, partial(line, source), rendering.rgba, rendering.depth)
+    return Picture(rgba, rendering.exhausted) if how.outputs == "rgba" else replace(rendering, rgba=rgba)
 
 
 def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
@@ -297,7 +314,7 @@ def _pulled(
         _, (_, of_rays, total) = march_beams(march, packed, seen, survey, beams, None, replay)
         if not places:
             return (total, of_source), None
-        if isinstance(gradient, Rendering):
+        if isinstance(gradient, DepthPicture):
             # a depth counts from the ray's origin, a sample's from the entry
             toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
             of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
@@ -380,7 +397,7 @@ def _prepared(lighting: Any, volume: Volume, transfer: Transfer, march: March) -
     if not isinstance(lighting, Lighting):
         message = "lighting must be None or a Lighting, such as ScattererTemplates"
         raise ValueError(f"{message}; got {lighting!r}.")
-    return lighting.prepared(Surroundings(volume, transfer, march.locate(volume)))
+    return lighting.prepared(volume, transfer, march)
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

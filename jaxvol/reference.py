@@ -19,10 +19,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .checks import is_traced
+from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.seam import Lighting, Sample, classification
 from .locate import Ray, enter
 from .march import Cell, March
-from .rendering import Outputs, Picture, Rendering
+from .rendering import DepthPicture, Found, Picture, Rendering
 from .transfer import Classification, Measured, Transfer
 from .triple import Scalar, Triple, along, apart
 from .volume import Volume
@@ -33,30 +34,27 @@ class Progress(eqx.Module):
 
     The front of the next cell lies at `(offset + index) d`. Counting steps, rather than adding them up,
     keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps.
-    What is not asked for is None.
+    `moment` is Σ weight × depth past the entry. What is not asked for is None.
     """
 
     index: Int[Array, ""]
     offset: Scalar
     opacity: Scalar
     color: Triple | None
+    moment: Scalar | None
     met: "Met | None"
     finished: Bool[Array, ""]
     memory: tuple[Any, ...]
 
 
 class Met(eqx.Module):
-    """What a ray has met.
+    """What a ray has met."""
 
-    - `moment`: Σ weight × depth past the entry.
-    """
-
-    moment: Scalar
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
 
 
-def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+def begin(march: March, ray: Ray, outputs: Found | None = "all") -> Progress:
     """A ray at its entry, which will find out so much, or nothing but its opacity."""
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
@@ -65,7 +63,8 @@ def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
         offset=march.start(ray),
         opacity=zero,
         color=None if outputs is None else (zero, zero, zero),
-        met=Met(zero, count, no) if outputs == "all" else None,
+        moment=zero if outputs in ("all", "depth") else None,
+        met=Met(count, no) if outputs == "all" else None,
         finished=no,
         memory=march.remember(ray),
     )
@@ -120,18 +119,18 @@ def blend(
     cell: tuple[tuple[Cell, Triple, Scalar], ...],
 ) -> Progress:
     """What has been accumulated behind a cell. Of its pieces are known colour and opacity."""
-    total, color, met = at.opacity, at.color, at.met
+    total, color, moment, met = at.opacity, at.color, at.moment, at.met
     for piece, own, alpha in cell:
-        depth = march.sample(piece)
         weight = jnp.where(at.finished, 0, (1 - total) * alpha)
         total = total + weight
         if color is not None:
             r, g, b = (sum_ + weight * part for sum_, part in zip(color, own, strict=True))
             color = r, g, b
+        if moment is not None:
+            moment = moment + weight * march.sample(piece)
         if met is not None:
             taken = ~at.finished & counts(march, ray, piece)
             met = Met(
-                met.moment + weight * depth,
                 met.samples + taken.astype(met.samples.dtype),
                 met.aligned | (piece.cut & (weight > 0)),
             )
@@ -139,6 +138,7 @@ def blend(
         at,
         opacity=total,
         color=color,
+        moment=moment,
         met=met,
         finished=at.finished | march.stop(1 - total),
     )
@@ -176,23 +176,20 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
 
 
 def end(ray: Ray, at: Progress) -> Picture:
-    """What the ray has seen: a `Rendering`, if it was to find out all."""
+    """What the ray has seen: with its depth, and with what it met, if it was to find that out."""
     assert at.color is not None
     rgba, exhausted = jnp.stack([*at.color, at.opacity]), ~at.finished
-    if at.met is None:
+    if at.moment is None:
         return Picture(rgba, exhausted)
     seen = at.opacity > 0
     # Of moment and opacity as parts of the opacity, which is so divided by 1: the derivative of a quotient
     # divides by the square, and that of the opacity of a veil is 0 in float32.
     whole = jax.lax.stop_gradient(jnp.where(seen, at.opacity, 1))
-    depth = ray.t_in + (at.met.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
-    return Rendering(
-        rgba=rgba,
-        exhausted=exhausted,
-        depth=jnp.where(seen, depth, jnp.inf),
-        samples=at.met.samples,
-        aligned=at.met.aligned,
-    )
+    depth = ray.t_in + (at.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
+    depth = jnp.where(seen, depth, jnp.inf)
+    if at.met is None:
+        return DepthPicture(rgba, exhausted, depth)
+    return Rendering(rgba, exhausted, depth, at.met.samples, at.met.aligned)
 
 
 def render_ray_reference(
@@ -224,8 +221,10 @@ def render_ray_reference(
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
-    ray = enter(space, apart(origin), apart(direction), pixel)
-    seen = classification(volume, transfer, space, lighting)
+    line = Line(apart(origin), apart(direction), pixel)
+    ray = enter(space, *line)
+    lit = classification(volume, transfer, space, lighting)
+    seen = transfer.over(volume) if isinstance(lighting, Deferred) else lit
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(march, ray, volume, seen, at), None
@@ -233,6 +232,9 @@ def render_ray_reference(
     at, _ = jax.lax.scan(one, begin(march, ray), None, length=samples_across(volume, march))
     rendering = end(ray, at)
     assert isinstance(rendering, Rendering)
+    if isinstance(lighting, Deferred):
+        rgba = lit_once(lit, space, line, rendering.rgba, rendering.depth)
+        rendering = replace(rendering, rgba=rgba)
     return rendering
 
 

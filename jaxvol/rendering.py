@@ -8,7 +8,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 Outputs: TypeAlias = Literal["all", "rgba"]
-"""What is found out about rays: a `Rendering`, or just a `Picture`."""
+"""What is asked for of rays: a `Rendering`, or just a `Picture`."""
+
+Found: TypeAlias = Literal["all", "depth", "rgba"]
+"""What is found out about rays: what is asked for, or a `DepthPicture`."""
 
 
 class Picture(eqx.Module):
@@ -34,16 +37,23 @@ class Picture(eqx.Module):
         return self.rgba[..., :3] + (1 - self.rgba[..., 3:]) * background
 
 
-class Rendering(Picture):
-    """What rays look like, and what they met.
+class DepthPicture(Picture):
+    """What rays look like, and how far away that is.
 
     - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
       adds to the opacity, world length; infinite where nothing is seen.
+    """
+
+    depth: Float[Array, "*rays"]
+
+
+class Rendering(DepthPicture):
+    """What rays look like, and what they met.
+
     - `samples`: samples evaluated, one for each piece into which a cell falls.
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
     """
 
-    depth: Float[Array, "*rays"]
     samples: Int[Array, "*rays"]
     aligned: Bool[Array, "*rays"]

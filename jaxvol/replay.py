@@ -26,7 +26,7 @@ from .locate import Ray
 from .march import March
 from .reference import Progress, contained, front, pieces
 from .relight import LightTotal, Lit, Relit, relit
-from .rendering import Picture, Rendering
+from .rendering import DepthPicture, Picture
 from .taps import Tapped, added, floats, scattered, without_voxels
 from .transfer import Classification, Transfer
 from .triple import Scalar, Triple, along
@@ -69,7 +69,7 @@ class Cotangents(NamedTuple):
         """For rays (groups, rays in a group) and their part of the image, and of its gradient."""
         red, green, blue, opacity = (gradient.rgba[..., i] for i in range(4))
         worth = jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
-        if not (isinstance(rendering, Rendering) and isinstance(gradient, Rendering)):
+        if not (isinstance(rendering, DepthPicture) and isinstance(gradient, DepthPicture)):
             return cls((red, green, blue), opacity, worth)
         seen = rendering.rgba[..., 3] > 0
         middle = jnp.where(seen, rendering.depth - ray.t_in, 0)

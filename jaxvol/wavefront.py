@@ -33,7 +33,7 @@ from .locate import Ray
 from .march import Cell, March, Survey
 from .occupancy import Occupancy
 from .reference import Progress, begin, blend, counts, front, measure, move, opacity, pieces
-from .rendering import Outputs
+from .rendering import Found
 from .transfer import Classification, Measured
 from .triple import Scalar
 from .visible import lit_colors
@@ -115,7 +115,7 @@ def march_beams(
     seen: Classification,
     survey: Survey | None,
     beams: Beams,
-    outputs: Outputs | None = "all",
+    outputs: Found | None = "all",
     follower: Follower | None = None,
 ) -> tuple[Progress, tuple[Any, Any, Any]]:
     """Where the marches of all rays end, of shape (groups, GROUP), with these outputs or nothing but opacity;

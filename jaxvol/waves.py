@@ -7,6 +7,7 @@ wave by wave, as arrays (groups, rays in a group); as many groups after each oth
 import math
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .beams import Box
 from .camera import Camera
+from .lighting.deferred import Line
 from .locate import Ray, Space, enter
 from .occupancy import Occupancy
 from .triple import Triple
@@ -89,10 +91,9 @@ class _OfPixels(Waves):
         column, row = self._pixels(wave, group_y * SIDE + y, group_x * SIDE + x)
         column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
         width, height = self.size
-        origin, direction = each_ray(source.ray)(column, row)
-        left, top = jnp.round(source.corner).astype(column.dtype)
-        pixel = column + left, row + top
-        return entering(space, origin, direction, pixel, (column < width) & (row < height))
+        return entering(
+            space, *each_ray(partial(_of_pixel, source))(column, row), (column < width) & (row < height)
+        )
 
     def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
@@ -150,6 +151,20 @@ class _OfRays(Waves):
         missing = self.number * self.beams * BEAM**2 - count
         padded = jnp.pad(leaf.reshape(count, *rest), [(0, missing)] + [(0, 0)] * len(rest))
         return padded.reshape(self.number, self.beams * BEAM**2 // GROUP, GROUP, *rest)
+
+
+def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
+    """The ray at a place of the flattened image."""
+    if isinstance(source, Camera):
+        width = source.size[0]
+        return _of_pixel(source, place % width, place // width)
+    ends = (tuple(rays.reshape(-1, 3)[place]) for rays in (source.origins, source.directions))
+    return Line(*ends, (place, jnp.zeros_like(place)))
+
+
+def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
+    left, top = jnp.round(source.corner).astype(column.dtype)
+    return Line(*source.ray(column, row), (column + left, row + top))
 
 
 def each_ray(f: Callable[..., Any]) -> Callable[..., Any]:

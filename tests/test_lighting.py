@@ -1,6 +1,7 @@
 """Light: each step of the shading by hand, all engines alike, and gradients by differences."""
 
 import functools
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -13,7 +14,9 @@ from jaxvol import reference, visible
 from jaxvol.engine import _prepared
 from jaxvol.lighting import (
     ConstantLight,
+    Deferred,
     DirectionalLight,
+    Lighting,
     Material,
     PointLight,
     ScattererTemplate,
@@ -23,7 +26,7 @@ from jaxvol.lighting import (
     seam,
 )
 from jaxvol.lighting.baked import BakedLighting
-from jaxvol.lighting.seam import Sample, Surroundings, lit
+from jaxvol.lighting.seam import Sample, Shading, Surroundings, lit
 from jaxvol.locate import Affine
 from jaxvol.triple import apart
 
@@ -562,7 +565,7 @@ def test_baked_light_comes_closer_to_the_blended_one_as_its_grid_gets_finer():
     errors = []
     for resolution in (5, 13, 37):
         lighting = ScattererTemplates(FLESH, SUN, baked=resolution, **how)
-        ready = lighting.prepared(look_around(volume, PLAIN))
+        ready = lighting.prepared(volume, PLAIN, jv.March(0.1))
         assert ready.shape == (resolution,) * 3
         errors.append(np.abs(shade(ready, volume, PLAIN, points) - exact).mean())
     assert errors[0] > errors[1] > errors[2]
@@ -603,7 +606,7 @@ def test_light_is_baked_once_for_what_stays_the_same(monkeypatch):
 def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
     volume, points, how = baked_scene()
     lighting = ScattererTemplates(FLESH, SUN, baked=13, **how)
-    ready = lighting.prepared(look_around(volume, PLAIN))
+    ready = lighting.prepared(volume, PLAIN, jv.March(0.1))
     expected = shade(ready, volume, PLAIN, points)
     # under jit, where nothing is prepared
     np.testing.assert_allclose(shade(lighting, volume, PLAIN, points), expected, atol=2e-3)
@@ -730,6 +733,99 @@ def test_a_baked_image_is_like_the_blended_one():
     np.testing.assert_allclose(image(camera.position), baked, atol=2e-3)
 
 
+class Dimmed(Lighting):
+    """Half the light, everywhere."""
+
+    class Half(Shading):
+        def about(self, around, sample):
+            return None
+
+        def color(self, sample, notes, sums):
+            return tuple(part / 2 for part in sample.color)
+
+    def over(self, around):
+        return Dimmed.Half()
+
+
+@pytest.mark.parametrize("outputs", ["all", "rgba"])
+def test_where_all_samples_are_lit_alike_deferring_does_not_show(outputs):
+    volume = scaled_phantom("sphere", 12)
+    camera, transfer = around(volume, SIZE), soft_transfer(0.1)
+    march = jv.March(0.07, SETS["leapt"], max_samples=80)
+    unlit, each, once = (
+        jv.render(volume, transfer, camera, march, lighting=lighting, outputs=outputs)
+        for lighting in (None, Dimmed(), Deferred(Dimmed()))
+    )
+    assert np.any(unlit.rgba[..., 3] == 0)
+    half = np.asarray(unlit.rgba) * np.array([0.5, 0.5, 0.5, 1.0], np.float32)
+    for image in (each, once):
+        np.testing.assert_allclose(image.rgba, half, atol=1e-6)
+        assert type(image) is type(unlit)
+    if outputs == "all":
+        np.testing.assert_array_equal(once.depth, unlit.depth)
+        np.testing.assert_array_equal(once.samples, unlit.samples)
+
+
+DEFERRED = [
+    pytest.param(name, occlusion, marks=() if (name, occlusion) == ("aligned", "soft") else pytest.mark.slow)
+    for occlusion in ("soft", "hard")
+    for name in SETS
+]
+
+
+@pytest.mark.parametrize(("transforms", "occlusion"), DEFERRED)
+def test_deferred_light_is_that_of_the_reference(transforms, occlusion):
+    volume = scaled_phantom("sphere", 12)
+    camera, transfer, lighting = around(volume, SIZE), soft_transfer(0.1), Deferred(templates(occlusion))
+    march = jv.March(0.07, SETS[transforms], max_samples=80)
+    origins, directions = camera.rays()
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, 0))
+    @partial(jax.vmap, in_axes=(0, None))
+    def reference(column, row):
+        line = volume, transfer, origins[row, column], directions[row, column], march
+        return jv.render_ray_reference(*line, pixel=(column, row), lighting=lighting)
+
+    slow = reference(jnp.arange(SIZE[0]), jnp.arange(SIZE[1]))
+    fast = jv.render(volume, transfer, camera, march, lighting=lighting)
+    assert fast.rgba[..., :3].max() > 0.1
+    off = np.abs(np.asarray(fast.rgba - slow.rgba)).max(axis=-1)
+    if occlusion == "hard":  # rounding may hide a photon
+        off = np.sort(off.reshape(-1))[:-4]
+    assert off.max() <= 5e-5
+
+
+@pytest.mark.slow
+def test_deferred_light_falls_on_rays_of_ones_own():
+    """As on those of a camera, with one template, which is for all pixels."""
+    volume = scaled_phantom("sphere", 12)
+    camera, march, lighting = around(volume, SIZE), jv.March(0.1), Deferred(templates(templates=1))
+    expected = jv.render(volume, soft_transfer(0.1), camera, march, lighting=lighting)
+    found = jv.render_rays(volume, soft_transfer(0.1), *camera.rays(), march, lighting=lighting)
+    np.testing.assert_allclose(found.rgba, expected.rgba, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_one_opaque_surface_is_lit_as_its_samples_are():
+    """The nearer, the more opaque it is."""
+    volume = scaled_phantom("sphere", 24)
+    camera = around(volume, SIZE)
+    march = jv.March(0.02, (jv.AlphaCorrection(),), max_samples=512)
+
+    def off(unit_distance):
+        transfer = soft_transfer(unit_distance)
+        each, once, unlit = (
+            np.asarray(jv.render(volume, transfer, camera, march, lighting=lighting).rgba)
+            for lighting in (templates(blend=True), Deferred(templates(blend=True)), None)
+        )
+        return np.abs(once - each).mean() / np.abs(unlit - each).mean()
+
+    veil, solid = off(0.5), off(0.01)
+    assert solid < 0.1
+    assert solid < veil / 2
+
+
 def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     """All of it goes through one of these, which the programs of images and gradients with a light call."""
     called = []
@@ -806,6 +902,10 @@ def image_scene():
     return volume, transfer, camera, march, templates(materials=materials, light=lights)
 
 
+def deferred(scene):
+    return (*scene[:4], Deferred(scene[4]))
+
+
 def image_loss(adjoint):
     random = np.random.default_rng(5)
     weights = random.normal(size=(5, 6, 4))
@@ -854,18 +954,49 @@ def test_gradients_of_an_image_match_central_differences():
 
 
 @pytest.mark.slow
-def test_replay_direct_and_forward_agree():
+def test_gradients_of_deferred_light_match_central_differences():
+    with in_float64():
+        scene = image_scene()
+        program = eqx.filter_jit(eqx.filter_value_and_grad(lambda s: image_loss("replay")(deferred(s))))
+        expected = differences(lambda s: program(s)[0], scene, LEAVES)
+        assert min(map(abs, expected.values())) > 1e-6
+        check_slopes(program(scene)[1], scene, expected)
+
+
+def test_rays_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
+    volume, transfer = scaled_phantom("sphere", 12), soft_transfer(0.1)
+    march, lighting = jv.March(0.2, (jv.AlphaCorrection(),), max_samples=32), Deferred(templates())
+
+    def loss(camera, path):
+        changed = eqx.tree_at(lambda how: how.lighting.materials[0].mean_free_path, lighting, path)
+        image = jv.render(volume, transfer, camera, march, lighting=changed, outputs="rgba")
+        return jnp.sum(image.rgba**2), image.rgba[..., 3]
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))
+    (of_camera, of_path), opacity = gradient(around(volume, (9, 7)), jnp.asarray(0.15))
+    assert np.any(opacity == 0)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((of_camera, of_path)))
+    assert np.any(of_camera.position != 0)
+    assert of_path != 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [lambda scene: scene, deferred])
+def test_replay_direct_and_forward_agree(how):
     with in_float64():
         scene = image_scene()
         replay, direct = (
-            eqx.filter_jit(eqx.filter_grad(image_loss(adjoint)))(scene) for adjoint in ("replay", "direct")
+            eqx.filter_jit(eqx.filter_grad(lambda s, a=a: image_loss(a)(how(s))))(scene)
+            for a in ("replay", "direct")
         )
         for leaf, where in LEAVES.items():
             size = float(np.abs(where(direct)).max())
             np.testing.assert_allclose(
                 where(replay), where(direct), rtol=1e-7, atol=1e-9 * size, err_msg=leaf
             )
-        forward = eqx.filter_jit(lambda s, t: eqx.filter_jvp(image_loss("forward"), (s,), (t,))[1])
+        forward = eqx.filter_jit(
+            lambda s, t: eqx.filter_jvp(lambda s: image_loss("forward")(how(s)), (s,), (t,))[1]
+        )
         for leaf, along in directions(scene).items():
             still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
             slope = forward(scene, eqx.tree_at(LEAVES[leaf], still, along))
@@ -898,6 +1029,7 @@ BAD = {
         lambda: _prepared(3, nodes({}), TRANSFER, jv.March(0.1)),
         "lighting must be None or a Lighting, such as ScattererTemplates; got 3",
     ),
+    "deferred": (lambda: Deferred(3), "lighting must be a Lighting, such as ScattererTemplates; got 3"),
     "labels": (
         lambda: shade(
             ScattererTemplates(Material(0.5, 1.0, label=1), SUN, given=given(PAIR)),

@@ -1,5 +1,6 @@
 """How does light fall on what is seen? Lights, and the materials that scatter it."""
 
+from .deferred import Deferred as Deferred
 from .lights import (
     ConstantLight as ConstantLight,
     DirectionalLight as DirectionalLight,

@@ -18,8 +18,12 @@ from jaxtyping import Array, Float, Int
 
 from ..checks import integer, is_traced, number
 from ..kept import kept
+from ..march import March, Transform
 from ..noise import hashed_uniforms
+from ..taps import without_voxels
+from ..transfer import Transfer
 from ..triple import Scalar, Triple, along
+from ..volume import Volume
 from .baked import BakedLighting, bake
 from .lights import ConstantLight, Light, LocatedLight, lights_of
 from .materials import Material, Optics, materials_of, shares, smoothstep
@@ -185,17 +189,19 @@ class ScattererTemplates(Lighting):
             templates = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
         return templates.brightest(self.photons * (self.templates if blend else 1))
 
-    def prepared(self, around: Surroundings) -> Lighting:
+    def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
         if not self.baked:
             return self
-        rest = eqx.tree_at(lambda a: a.volume.data, around, None)
-        leaves, tree = jax.tree.flatten((self, rest))
-        if is_traced(leaves, around.volume.data):
+        # of a march, light depends on how places are found alone
+        spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
+        leaves, tree = jax.tree.flatten((self, without_voxels(volume), transfer, spaces))
+        if is_traced(leaves, volume.data):
             return self
-        memory = kept(around.volume.data, _memory)
+        memory = kept(volume.data, _memory)
         known = memory.get(tree)
         if known is None or not all(_same(a, b) for a, b in zip(known[0], leaves, strict=True)):
             memory.clear()
+            around = Surroundings(volume, transfer, march.locate(volume))
             memory[tree] = known = leaves, _baked(self, around)
         return known[1]
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from ..compiled import in_memory
 from ..locate import Space
+from ..march import March
 from ..transfer import Classification, Measured, Transfer
 from ..triple import Scalar, Triple
 from ..volume import Volume
@@ -125,7 +126,7 @@ class Lighting(eqx.Module):
     def over(self, around: Surroundings) -> Shading:
         """Ready for one image. What does not depend on the sample is computed here, once."""
 
-    def prepared(self, around: Surroundings) -> "Lighting":
+    def prepared(self, volume: Volume, transfer: Transfer, march: March) -> "Lighting":
         """What is worth being computed once for several images, where nothing is traced."""
         return self
 
