@@ -1,13 +1,15 @@
-"""What do photons, templates, occlusion and baking cost, and what do they buy?
+"""What do photons, templates, occlusion, baking and deferring cost, and what do they buy?
 
 The head phantom under opaque skin, lit from the side, by so many photons of a template, by so many templates
-blended, under either occlusion, and by light that was baked before. Each frame is rendered in turn with that
-of the unlit head, and told as the median of their ratios; beside it stands the image's RMSE against one
-that blends many templates under soft occlusion. Lee, Kwon and Shin report 20-24 frames per second lit and
-42-56 unlit, which is 2.2 times the time; the goal for baked light is 1.2 times.
+blended, under either occlusion, by light that was baked before, and by light that falls on each ray once.
+Each frame is rendered in turn with that of the unlit head, and told as the median of their ratios; beside it
+stands the image's RMSE against one that blends many templates under soft occlusion and lights all samples.
+Lee, Kwon and Shin report 20-24 frames per second lit and 42-56 unlit, which is 2.2 times the time; the goal
+for baked light is 1.2 times.
 
-Beside that: the noise of a flat face, seen and lit obliquely, against the number of templates blended; and
-the energy of a template against the material's opacity, for the form that conserves it and the printed one.
+Beside that: how far off deferred light is under skin that is more and more translucent; the noise of a flat
+face, seen and lit obliquely, against the number of templates blended; and the energy of a template against
+the material's opacity, for the form that conserves it and the printed one.
 """
 
 import time
@@ -26,6 +28,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 import jaxvol as jv
 from jaxvol.lighting import (
     ConstantLight,
+    Deferred,
     DirectionalLight,
     Lighting,
     ScattererTemplate,
@@ -44,6 +47,7 @@ FLESH = jv.Material(0.5, 0.05, 1.4)
 LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (4.0, 4.0, 4.0)), ConstantLight((0.1, 0.1, 0.1))
 UNLIT = "unlit"
 PHOTONS, BLENDED, BAKED, HARD = "photons", "templates blended", "baked", "hard occlusion"
+ONCE, BAKED_ONCE = "photons, deferred", "baked, deferred"
 ENERGIES: dict[str, dict[str, Any]] = {
     "conserving": {"energy": "conserving"},
     "printed": {"energy": "printed"},
@@ -61,16 +65,20 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
     """Lightings by what is varied in them, each with its number."""
     of = partial(ScattererTemplates, FLESH, LIGHTS)
     whole = of().photons
+    photons = (*(n for n in photons if n < whole), whole)
     return {
-        PHOTONS: [(n, of(photons=n)) for n in (*(n for n in photons if n < whole), whole)],
+        PHOTONS: [(n, of(photons=n)) for n in photons],
         BLENDED: [(n, of(templates=n, blend=True)) for n in blended],
         HARD: [(whole, of(occlusion="hard"))],
         BAKED: [(n, of(baked=n)) for n in baked],
+        ONCE: [(n, Deferred(of(photons=n))) for n in photons],
+        BAKED_ONCE: [(n, Deferred(of(baked=n))) for n in baked],
     }
 
 
-def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
-    return jv.render(scene.volume, scene.transfer, scene.camera, march(scene, seed), lighting=lighting)
+def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Picture:
+    how = march(scene, seed)
+    return jv.render(scene.volume, scene.transfer, scene.camera, how, lighting=lighting, outputs="rgba")
 
 
 def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetitions: int, seed: int) -> Any:
@@ -103,6 +111,20 @@ def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
     start = time.perf_counter()
     jax.block_until_ready(frame(scene, dimmed, seed).rgba)
     return time.perf_counter() - start
+
+
+def deferring(scene: Scene, thinned: Sequence[float], seed: int) -> list[dict[str, float]]:
+    """How far light that falls on each ray once is from light on all samples, and how far no light is, with
+    the extinction of everything so many times what it is."""
+    each = ScattererTemplates(FLESH, LIGHTS, photons=8)
+    rows = []
+    for times in thinned:
+        thin = eqx.tree_at(lambda t: t.extinction, scene.transfer, replace_fn=lambda e, by=times: e * by)
+        under = scene._replace(transfer=thin)
+        truth, once, unlit = (frame(under, how, seed).rgba for how in (each, Deferred(each), None))
+        errors = {"rmse": float(rmse(once, truth)), "rmse of no light": float(rmse(unlit, truth))}
+        rows.append({"extinction": times, "opacity": float(np.mean(truth[..., 3])), **errors})
+    return rows
 
 
 def noise(counts: Sequence[int], trials: int, seed: int) -> dict[str, Any]:
@@ -140,8 +162,10 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    figure, (cost, spread, energy) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for (kind, rows), style in zip(result["frames"].items(), ("C0o-", "C1s-", "C3D", "C2^-"), strict=True):
+    figure, axes = plt.subplots(2, 2, figsize=(11, 8.5), layout="constrained")
+    cost, deferred, spread, energy = axes.flat
+    styles = "C0o-", "C1s-", "C3D", "C2^-", "C4o--", "C5^--"
+    for (kind, rows), style in zip(result["frames"].items(), styles, strict=True):
         error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
         cost.plot(error, ratio, style, label=kind)
         for row, x, y in zip(rows, error, ratio, strict=True):
@@ -162,6 +186,15 @@ def draw(result: dict[str, Any], path: Path) -> None:
     cost.xaxis.set_major_formatter("{x:g}")
     cost.xaxis.set_minor_formatter(NullFormatter())
     cost.legend(fontsize=8)
+
+    rows = result["deferring"]
+    for key, label, style in (("rmse", "deferred", "C4o--"), ("rmse of no light", "no light", "ko-")):
+        deferred.plot([row["extinction"] for row in rows], [row[key] for row in rows], style, label=label)
+    deferred.set(xscale="log", yscale="log", xlabel="extinction, times that of opaque skin")
+    deferred.set(ylabel="RMSE against light on all samples")
+    for axis in (deferred.xaxis, deferred.yaxis):
+        axis.set_major_formatter("{x:g}")
+    deferred.legend(fontsize=8)
 
     rows = result["noise"]["blended"]
     count, deviation = [row["templates"] for row in rows], [row["deviation"] for row in rows]
@@ -193,10 +226,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     given = record.arguments(argv)
     chosen = parser.parse_args(given)
     photons, blended, baked, many, trials = (1, 4, 8, 16), (1, 2, 4, 8), (32, 64, 128), 32, 24
-    opacities = [round(0.1 * i, 1) for i in range(1, 10)]
+    opacities, thinned = [round(0.1 * i, 1) for i in range(1, 10)], (1.0, 0.3, 0.1, 0.03, 0.01)
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.repetitions = 24, 24, 2
         photons, blended, baked, many, trials, opacities = (2,), (2,), (16,), 4, 3, [0.3, 0.7]
+        thinned = (1.0, 0.1)
 
     scene = skin_head(chosen.size, chosen.resolution)
     result = {
@@ -206,17 +240,20 @@ def main(argv: Sequence[str] | None = None) -> None:
         "repetitions": chosen.repetitions,
         "templates blended in the reference": many,
         "frames": measure(scene, variants(photons, blended, baked), many, chosen.repetitions, chosen.seed),
+        "deferring": deferring(scene, thinned, chosen.seed),
         "noise": noise(blended, trials, chosen.seed),
         "energy": {"opacity": opacities, "forms": energies(opacities, chosen.seed)},
     }
     path = record.write(
         chosen.output / "lighting.json",
-        "What do photons, templates, occlusion and baking cost, and what do they buy?",
+        "What do photons, templates, occlusion, baking and deferring cost, and what do they buy?",
         result,
         seed=chosen.seed,
         command=["experiments.lighting", *given],
     )
     draw(result, path.with_suffix(".png"))
+    for row in result["deferring"]:
+        print("deferred, " + ", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     for row in result["noise"]["blended"]:
         print(f"{row['templates']} templates blended: {row['deviation']:.2%} between sets")
     print(f"one template for each pixel: {result['noise']['one for each pixel']:.2%} between pixels")

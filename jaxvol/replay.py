@@ -42,7 +42,7 @@ class Watch(Follower):
     given = sums = total = None
 
     def __init__(self, shape: tuple[int, ...]):
-        self.kept = Span(jnp.full(shape, jnp.iinfo(jnp.int32).max), jnp.zeros(shape, jnp.int32))
+        self.kept = Span(jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32))
 
     def follow(
         self, ray: Ray, at: Progress, samples: Samples, given: None, kept: Span, total: None

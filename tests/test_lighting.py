@@ -747,7 +747,7 @@ class Dimmed(Lighting):
         return Dimmed.Half()
 
 
-@pytest.mark.parametrize("outputs", ["all", "rgba"])
+@pytest.mark.parametrize("outputs", ["all", pytest.param("rgba", marks=pytest.mark.slow)])
 def test_where_all_samples_are_lit_alike_deferring_does_not_show(outputs):
     volume = scaled_phantom("sphere", 12)
     camera, transfer = around(volume, SIZE), soft_transfer(0.1)
