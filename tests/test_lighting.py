@@ -716,14 +716,17 @@ def test_a_curved_grid_and_labels_are_lit_alike():
 
 @pytest.mark.slow
 def test_a_baked_image_is_like_the_blended_one():
+    """The more so, the finer the grid."""
     volume = scaled_phantom("sphere", 24)
     camera, transfer = around(volume, SIZE), soft_transfer(0.1)
     march = jv.March(0.05, (jv.AlphaCorrection(),), max_samples=128)
-    exact, baked, unlit = (
+    exact, baked, finer, unlit = (
         np.asarray(jv.render(volume, transfer, camera, march, lighting=lighting).rgba)
-        for lighting in (templates(blend=True), templates(baked=48), None)
+        for lighting in (templates(blend=True), templates(baked=48), templates(baked=96), None)
     )
-    assert np.abs(baked - exact).mean() < 0.05 * np.abs(unlit - exact).mean()
+    coarse, fine, whole = (np.abs(image - exact).mean() for image in (baked, finer, unlit))
+    assert fine < 0.6 * coarse
+    assert fine < 0.1 * whole
 
     @jax.jit
     def image(position):
