@@ -91,9 +91,8 @@ class _OfPixels(Waves):
         column, row = self._pixels(wave, group_y * SIDE + y, group_x * SIDE + x)
         column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
         width, height = self.size
-        return entering(
-            space, *each_ray(partial(_of_pixel, source))(column, row), (column < width) & (row < height)
-        )
+        origin, direction, pixel = each_ray(partial(_of_pixel, source))(column, row)
+        return entering(space, origin, direction, pixel, (column < width) & (row < height))
 
     def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
@@ -158,8 +157,8 @@ def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
     if isinstance(source, Camera):
         width = source.size[0]
         return _of_pixel(source, place % width, place // width)
-    ends = (tuple(rays.reshape(-1, 3)[place]) for rays in (source.origins, source.directions))
-    return Line(*ends, (place, jnp.zeros_like(place)))
+    (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[place] for rays in (source.origins, source.directions))
+    return Line((x, y, z), (dx, dy, dz), (place, jnp.zeros_like(place)))
 
 
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
