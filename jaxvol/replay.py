@@ -13,6 +13,9 @@ The sum over what lies behind is what the sums in front leave of Î£ w_j q_j = cÌ
 tells, so nothing need be kept from the first march, and nothing is divided by a transmittance, which may
 be 0. What the optical depths, colours and depths owe to the transfer function, the voxels, the ray and the
 step is left to JAX, a segment at a time.
+
+Where rays leap over what cannot be seen, the first march also watches between which cells each ray sees
+anything, and the second one leaps over the rest: two fifths of a head's samples.
 """
 
 from typing import Any, NamedTuple
@@ -36,8 +39,7 @@ from .wavefront import CELLS, Follower, Samples, Span, over_cells
 
 
 class Watch(Follower):
-    """The first march over rays of this shape remembers between which cells each of them sees anything. Where
-    rays leap, the second one leaps over the rest, too."""
+    """Goes along with the first march, over rays of this shape, and remembers the span of each."""
 
     given = sums = total = None
 
