@@ -346,6 +346,8 @@ def test_values_and_gradients_are_finite_and_agree_at_the_extremes(name):
             of_leaf, random = where(gradient), np.random.default_rng(2)
             assert np.isfinite(of_leaf).all(), (case, leaf)
             along = jnp.asarray(random.normal(size=of_leaf.shape), jnp.float32)
+            if march.leaps and leaf == "extinction":  # one of 0 has no gradient there to agree on
+                along = jnp.where(scene[1].extinction > 0, along, 0)
             still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
             again, slope = pushed(scene, eqx.tree_at(where, still, along))
             np.testing.assert_allclose(again, value, rtol=1e-6, err_msg=case)
