@@ -107,5 +107,5 @@ def lit_picture(
         places = jax.lax.dynamic_slice_in_dim(place, number * CHUNK, CHUNK)
         return jax.lax.cond(number * CHUNK <= last, lit, lambda _: jnp.zeros((CHUNK, 4), flat.dtype), places)
 
-    found = jax.lax.map(chunk, jnp.arange(place.size // CHUNK)).reshape(-1, 4)
+    found = jax.lax.map(chunk, jnp.arange(place.size // CHUNK, dtype=jnp.int32)).reshape(-1, 4)
     return jnp.zeros_like(flat).at[place].set(found, mode="drop").reshape(rgba.shape)
