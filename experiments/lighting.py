@@ -43,11 +43,12 @@ from .scenes import Scene, skin_head
 
 
 GOALS = {"templates": 2.2, "baked": 1.2}
+FEW = 8  # photons of each template, where several are blended and deferred
 FLESH = jv.Material(0.5, 0.05, 1.4)
 LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (4.0, 4.0, 4.0)), ConstantLight((0.1, 0.1, 0.1))
 UNLIT = "unlit"
 PHOTONS, BLENDED, BAKED, HARD = "photons", "templates blended", "baked", "hard occlusion"
-ONCE, BAKED_ONCE = "photons, deferred", "baked, deferred"
+ONCE, BLENDED_ONCE, BAKED_ONCE = "photons, deferred", "templates blended, deferred", "baked, deferred"
 ENERGIES: dict[str, dict[str, Any]] = {
     "conserving": {"energy": "conserving"},
     "printed": {"energy": "printed"},
@@ -72,6 +73,7 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
         HARD: [(whole, of(occlusion="hard"))],
         BAKED: [(n, of(baked=n)) for n in baked],
         ONCE: [(n, Deferred(of(photons=n))) for n in photons],
+        BLENDED_ONCE: [(n, Deferred(of(templates=n, blend=True, photons=FEW))) for n in blended],
         BAKED_ONCE: [(n, Deferred(of(baked=n))) for n in baked],
     }
 
@@ -98,7 +100,7 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetition
                 row["seconds to bake"] = round(baking(scene, lighting, seed) - row["seconds"], 4)
             found[kind].append(row)
             print(
-                f"{kind:18} {number:4} {row['seconds']:8.3f} s  {row['ratio']['median']:7.2f} x unlit"
+                f"{kind:27} {number:4} {row['seconds']:8.3f} s  {row['ratio']['median']:7.2f} x unlit"
                 f"  RMSE {error:.5f}",
                 flush=True,
             )
@@ -164,7 +166,7 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
 def draw(result: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(11, 8.5), layout="constrained")
     cost, deferred, spread, energy = axes.flat
-    styles = "C0o-", "C1s-", "C3D", "C2^-", "C4o--", "C5^--"
+    styles = "C0o-", "C1s-", "C3D", "C2^-", "C4o--", "C6s--", "C5^--"
     for (kind, rows), style in zip(result["frames"].items(), styles, strict=True):
         error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
         cost.plot(error, ratio, style, label=kind)

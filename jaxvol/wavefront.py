@@ -10,7 +10,8 @@ What makes this fast was measured (on CPU, by XLA's rules), and is what this fil
   segment after segment until a quarter of its groups is finished; then batches are made up anew from the
   groups that are left. Lanes that idle cost as much as those that work.
 - Rays that a transform may still move take a segment in part. Groups with such rays are marched first, by
-  themselves, until none is left; what follows does not ask for them.
+  themselves, until none is left; what follows does not ask for them. But where most groups have them, all
+  are marched so: apart from their neighbours, rays would find little of what they fetch in the cache.
 - Where empty space is known (`Survey`), rays leap over it between two segments, each as far as it can.
 
 None of it shows in the result: cells, transforms and the blending are those of `reference`.
@@ -131,8 +132,10 @@ def march_beams(
         hopeful = jnp.broadcast_to(survey.seen(notes), (beams.count,))
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
     at = _with(at, finished=finished)
+    together = jnp.zeros((), bool)
     if march.moves and survey is None and follower is None:
         at = _probe(march, volume, seen, rays, at)
+        together = _mostly(_alive(march, at) & ~_settled(march, at), of=_alive(march, at))
     if beams.span is not None:
         over = jax.vmap(jax.vmap(partial(_over, march)))
         at = _until(beams.span, over(rays, at, beams.span.first))
@@ -140,7 +143,7 @@ def march_beams(
     def wanted(at: Progress, whole: bool) -> Bool[Array, "*rays"]:
         """Which rays a pass is for: all, or first those that are not settled."""
         alive = _alive(march, at)
-        return alive if whole or capped else alive & ~_settled(march, at)
+        return alive if whole or capped else alive & (together | ~_settled(march, at))
 
     def run(
         rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""], whole: bool
@@ -226,6 +229,11 @@ def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
 def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     """A function of one ray, of arrays (rays,) and, where `of_cells`, (CELLS, rays)."""
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
+
+
+def _mostly(some: Bool[Array, "groups rays"], of: Bool[Array, "groups rays"]) -> Bool[Array, ""]:
+    """Whether most groups with any ray of the one kind have one of the other."""
+    return 2 * jnp.sum(jnp.any(some, axis=-1)) > jnp.sum(jnp.any(of, axis=-1))
 
 
 def _settled(march: March, at: Progress) -> Bool[Array, "*rays"]:
