@@ -171,7 +171,8 @@ def march_beams(
         more = jax.tree.map(lambda leaf: jnp.zeros((size * GROUP, *leaf.shape[2:]), leaf.dtype), sums)
 
         def going(here: Progress) -> Bool[Array, " batch"]:
-            return jnp.any(wanted(here, whole).reshape(size, GROUP), axis=-1)
+            # XLA finds the largest of several floats at once, but looks at one truth after the other
+            return jnp.max(wanted(here, whole).astype(jnp.float32).reshape(size, GROUP), axis=-1) > 0
 
         def go(state: _State) -> _State:
             here, along = state
@@ -251,7 +252,6 @@ def _segment(
     """The next cells of each ray, on to where it is finished, or has moved off the places sampled here.
     `whole` tells that all rays are settled, and may take all the cells."""
     ahead = jnp.arange(CELLS, dtype=at.index.dtype)
-    live = _alive(march, at)
 
     def every(at: Progress) -> tuple[Cell, ...]:
         def one(ray: Ray, at: Progress, k: Int[Array, ""]) -> tuple[Cell, ...]:
@@ -277,12 +277,13 @@ def _segment(
         )
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
-    any_live = jnp.any(live)
-    values = in_memory(any_live, measured, at, given)
+    # true, but not for XLA; loops go on while any ray is alive, and to ask each time takes 1 % of a frame
+    live = at.index[0] >= 0
+    values = in_memory(live, measured, at, given)
     if seen.search is not None:
-        found = in_memory(any_live, lambda values: [over_cells(seen.search)(v) for v in values], values)
+        found = in_memory(live, lambda values: [over_cells(seen.search)(v) for v in values], values)
         values = [(*read, *more) for read, more in zip(values, found, strict=True)]
-    alphas = in_memory(any_live, opacities, at, given, values)
+    alphas = in_memory(live, opacities, at, given, values)
     samples = Samples(list(cells(at, given)), values, alphas)
     taken, moved = CELLS, None
     if not whole:

@@ -22,18 +22,24 @@ PAPER = {  # seconds, 1024 x 1024 pixels, in the order of the table's columns
 def table(measured: dict[str, Any]) -> str:
     """The record of `experiments/overhead.py`, and the paper's table, as one in Markdown."""
     lines = [
-        f"| volume | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
-        "|---|" + "---|" * (len(COLUMNS) + 3),
+        f"| volume | pixels | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
+        "|---|" + "---|" * (len(COLUMNS) + 4),
     ]
-    for name, rows in measured["result"]["volumes"].items():
-        cells = [f"{rows[PLAIN]['seconds']:.3f} s"]
+    result = measured["result"]
+    each = [
+        (name, size, result["volumes"][name][str(size)])
+        for size in result["sizes"]
+        for name in result["volumes"]
+    ]
+    for name, size, rows in each:
+        cells = [f"{size}²", f"{rows[PLAIN]['seconds']:.3f} s"]
         for column in COLUMNS:
             ratio = rows[column]["ratio"]
             cells.append(f"{ratio['median']:.3f} [{ratio['low']:.3f}, {ratio['high']:.3f}]")
         cells += [f"{rows[march]['rmse']:.5f}" for march in (PLAIN, BOTH)]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     for name, (plain, *others) in PAPER.items():
-        cells = [f"{plain:.3f} s", *(f"{other / plain:.3f}" for other in others), "–", "–"]
+        cells = ["1024²", f"{plain:.3f} s", *(f"{other / plain:.3f}" for other in others), "–", "–"]
         lines.append(f"| *paper: {name}* | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
