@@ -1,10 +1,9 @@
 """How is an image rendered, and differentiated?
 
 Rays are made wave by wave, in the order of `waves`. How the rays of a wave are marched is `wavefront`'s
-business; what they see is `reference`'s; and what a loss sees of it, `replay`'s.
+business; what they see is `reference`'s; and what a loss sees of it, `backward`'s.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, TypeAlias, get_args, overload
@@ -12,23 +11,20 @@ from typing import Any, Literal, TypeAlias, get_args, overload
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree, UInt32
+from jaxtyping import Array, Float, Int
 
+from .backward import pulled
 from .camera import Camera
 from .checks import Arrayable, finite, require
 from .compiled import compiled
-from .leaping import FirstHit
 from .lighting.deferred import Deferred, lit_picture
-from .lighting.seam import Lighting, Surroundings, classification
-from .locate import Ray
-from .march import March, Survey, View
-from .occupancy import Blocks
-from .packed import with_words, words_of
+from .lighting.seam import Lighting, classification
+from .march import March
+from .packed import with_words
 from .reference import begin, end, samples_across, step
-from .relight import Lit
-from .rendering import DepthPicture, Found, Outputs, Picture, Rendering
-from .replay import Cotangents, Replay, Total, Watch
-from .taps import added, floats, with_voxels, without_voxels
+from .rendering import Found, Outputs, Picture, Rendering
+from .replay import Watch
+from .scene import Known, Scene, survey_of
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, Span, march_beams
@@ -36,9 +32,6 @@ from .waves import OwnRays, Waves, each_ray, line
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
-
-WAVE = 4096
-"""Beams in a wave: 262 144 rays."""
 
 DIRECT_WAVE = 64
 """Beams in a wave of `"direct"`, which keeps all its states to be differentiated."""
@@ -173,17 +166,6 @@ def render_rays(
     return _render((volume, transfer, source, march, lighting), how, Known.of(volume, march))
 
 
-class Known(eqx.Module):
-    """What was found out about a volume before, and is found out anew for other voxels."""
-
-    words: UInt32[Array, " voxels"] | None
-    blocks: Blocks | None
-
-    @classmethod
-    def of(cls, volume: Volume, march: March) -> "Known":
-        return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
-
-
 class _How(eqx.Module):
     """What is found out, and by which loop rays are marched to their ends."""
 
@@ -204,17 +186,14 @@ class _How(eqx.Module):
         return cls(outputs, adjoint, min(-(-length // 64) * 64, march.most_samples))
 
 
-Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
-
-
 @compiled
 def _render(scene: Scene, how: _How, known: Known) -> Any:
     if isinstance(scene[-1], Deferred):
-        return _lit_once(scene, how, known)
+        return _deferred(scene, how, known)
     return _replayed(scene, how, known) if how.adjoint == "replay" else _image(scene, how, known)
 
 
-def _lit_once(scene: Scene, how: _How, known: Known) -> Picture:
+def _deferred(scene: Scene, how: _How, known: Known) -> Picture:
     """An image that is rendered without light, and lit as a whole."""
     volume, transfer, source, march, lighting = scene
     found = "all" if how.outputs == "all" else "depth"
@@ -247,7 +226,7 @@ def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
             *(rendering, gradient),
             is_leaf=lambda leaf: leaf is None,
         )
-        return eqx.filter(_pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
+        return eqx.filter(pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
 
     return image(scene, jax.lax.stop_gradient(known))
 
@@ -261,8 +240,8 @@ def _marched(scene: Scene, how: _How, known: Known, *, watch: bool) -> tuple[Pic
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
     direct = how.adjoint == "direct"
-    waves, space = Waves.of(source, DIRECT_WAVE if direct else WAVE), march.locate(volume)
-    survey = None if direct else _survey((volume, transfer, source, march, None), known)
+    waves, space = Waves.of(source, DIRECT_WAVE if direct else None), march.locate(volume)
+    survey = None if direct else survey_of((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
 
     def wave(number: Int[Array, ""]) -> tuple[Picture, Span | None]:
@@ -279,116 +258,6 @@ def _marched(scene: Scene, how: _How, known: Known, *, watch: bool) -> tuple[Pic
 
     pictures, spans = jax.lax.map(wave, jnp.arange(waves.number))
     return jax.tree.map(waves.assemble, pictures), spans
-
-
-def _pulled(
-    scene: Scene, perturbed: Any, known: Known, rendering: Picture, spans: Span | None, gradient: Picture
-) -> Any:
-    """What every leaf of the scene gets of an image's gradient."""
-    volume, transfer, source, march, lighting = scene
-    of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
-    places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
-    packed = with_words(volume, known.words)
-    waves, survey = Waves.of(source, WAVE), _survey(scene, known)
-    seen = transfer.over(packed)
-    light, pull_light = None, None
-    if lighting is not None:
-        light, pull_light = _light(scene, packed, voxels=of_voxels)
-
-    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Span | None, Picture, Picture]) -> Any:
-        (total, of_source), (number, span, rendering, gradient) = sums, given
-
-        def made(moving: PyTree) -> Ray:
-            volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
-            return waves.rays(source_, march_.locate(with_voxels(volume_, volume.data)), number)
-
-        moving = floats((without_voxels(volume), source, march))
-        rays, pull = eqx.filter_vjp(made, moving)
-        replay = Replay(
-            (packed, transfer, march),
-            seen,
-            *(rays, Cotangents.of(rays, rendering, gradient), total, light),
-            places=places,
-        )
-        beams = Beams(rays, waves.beams, waves.box(source, rays, number), span)
-        _, (_, of_rays, total) = march_beams(march, packed, seen, survey, beams, None, replay)
-        if not places:
-            return (total, of_source), None
-        if isinstance(gradient, DepthPicture):
-            # a depth counts from the ray's origin, a sample's from the entry
-            toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
-            of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
-        of_volume, of_rays_source, of_march = pull(of_rays)[0]
-        total = eqx.tree_at(
-            lambda t: (t.volume, t.march),
-            total,
-            (added(total.volume, of_volume), added(total.march, of_march)),
-        )
-        return (total, added(of_source, of_rays_source)), None
-
-    start = (
-        Total.zeros(volume, transfer, march, light, voxels=of_voxels),
-        jax.tree.map(jnp.zeros_like, floats(source)),
-    )
-    image = jax.tree.map(waves.apart, (rendering, gradient))
-    (total, of_source), _ = jax.lax.scan(wave, start, (jnp.arange(waves.number), spans, *image))
-    of_volume = total.volume
-    if total.voxels is not None:
-        of_volume = with_voxels(of_volume, total.voxels.reshape(volume.data.shape))
-    if pull_light is None:
-        return of_volume, total.transfer, of_source, total.march, None
-    more_volume, more_transfer, more_march, of_lighting = pull_light(total.light)[0]
-    return (
-        added(of_volume, more_volume),
-        added(total.transfer, more_transfer),
-        of_source,
-        added(total.march, more_march),
-        of_lighting,
-    )
-
-
-def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable[[PyTree], Any]]:
-    """By what an image is lit; and what volume, transfer function, march and lighting get of the gradient of
-    that."""
-    volume, transfer, _, march, lighting = scene
-    parts = volume if voxels else without_voxels(volume), transfer, march, lighting
-    moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
-
-    def made(moving: PyTree) -> tuple[PyTree, Lit]:
-        moved, transfer, march, lighting = eqx.combine(moving, fixed)
-        # the packed copy is for fetching alone
-        whole = moved if voxels else with_voxels(moved, volume.data)
-        around = Surroundings(whole, transfer, march.locate(whole))
-        light = Lit(lighting.over(around), around)
-        return floats(light.leaves), light
-
-    _, pull, light = jax.vjp(made, moving, has_aux=True)
-    return light._replace(around=Surroundings(packed, transfer, march.locate(volume))), pull
-
-
-def _survey(scene: Scene, known: Known) -> Survey | None:
-    """What is known of empty space. Nothing of it has a gradient."""
-    volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
-    if known.blocks is None:
-        return None
-    space = march.locate(volume)
-    occupancy = space.occupancy(transfer.visible(known.blocks))
-    if isinstance(source, OwnRays):
-        return march.survey(occupancy, None)
-
-    def first_hit(survey: Survey, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
-        first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
-        ends = jax.vmap(source.ray)(columns.reshape(-1), rows.reshape(-1))
-        own, none = OwnRays(*(jnp.stack(end, axis=-1) for end in ends)), jnp.zeros((), jnp.int32)
-        waves = Waves.of(own, columns.size)
-        rays = waves.rays(own, space, none)
-        beams = Beams(rays, waves.beams, waves.box(own, rays, none))
-        at, _ = march_beams(first, volume, transfer.over(volume), survey, beams)
-        seen = each_ray(end)(rays, at)
-        assert isinstance(seen, Rendering)
-        return waves.assemble(seen.depth[None]).reshape(columns.shape)
-
-    return march.survey(occupancy, View(source.ray, source.size, first_hit))
 
 
 def _prepared(lighting: Any, volume: Volume, transfer: Transfer, march: March) -> Lighting | None:

@@ -77,8 +77,7 @@ def pieces(march: March, ray: Ray, volume: Volume, front: Scalar) -> tuple[Cell,
 
 def measure(march: March, ray: Ray, seen: Classification, piece: Cell) -> Measured:
     """What is read from the volume at the piece's sample, and what the transfer function finds of it."""
-    measured = seen.measure(ray.path(march.sample(piece)))
-    return measured if seen.search is None else (*measured, *seen.search(measured))
+    return seen.searched(seen.measure(ray.path(march.sample(piece))))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:

@@ -43,6 +43,10 @@ class Classification(NamedTuple):
     light: Callable[[Any], Triple] | None = None
     """From a sample (`lighting.seam.Sample`) to its colour as lit. None where colours are as classified."""
 
+    def searched(self, measured: Measured) -> Measured:
+        """What was measured, and after it what is found of that."""
+        return measured if self.search is None else (*measured, *self.search(measured))
+
 
 class Transfer(eqx.Module):
     """What a renderer asks of a transfer function, of whatever kind."""

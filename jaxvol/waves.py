@@ -30,6 +30,9 @@ SIDE = math.isqrt(GROUP)
 BEAM = 2 * SIDE
 """Pixels along the side of a beam, which is 2 x 2 groups."""
 
+WAVE = 4096
+"""Beams in a wave: 262 144 rays."""
+
 Lanes = Int[Array, "groups rays"]
 
 
@@ -50,8 +53,9 @@ class Waves(eqx.Module):
     beams: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, source: Camera | OwnRays, most_beams: int) -> "Waves":
+    def of(cls, source: Camera | OwnRays, most_beams: int | None = None) -> "Waves":
         """Those of a camera's pixels, or of one's own rays, with at most so many beams in a wave."""
+        most_beams = WAVE if most_beams is None else most_beams
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // BEAM), -(-height // BEAM)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol import engine
+from jaxvol import engine, waves
 
 from .scenes import anisotropic_noise, around, counting, soft_transfer
 
@@ -29,7 +29,7 @@ def test_waves_do_not_show(size, monkeypatch):
     whole = jv.render(volume, soft_transfer(), camera, MARCH)
     assert whole.rgba.shape == (size[1], size[0], 4)
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
-    monkeypatch.setattr(engine, "WAVE", 4)
+    monkeypatch.setattr(waves, "WAVE", 4)
     jax.clear_caches()
     assert_same(whole, jv.render(volume, soft_transfer(), camera, MARCH))
     jax.clear_caches()

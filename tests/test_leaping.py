@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
-from jaxvol import engine, packed, wavefront
+from jaxvol import packed, wavefront, waves
 from jaxvol.phantoms import toroidal_phantom
 from jaxvol.triple import apart
 
@@ -196,7 +196,7 @@ def test_sizes_of_tiles_do_not_show(cells, batch, wave, monkeypatch):
     assert float(whole.rgba[..., 3].max()) > 0.1
     monkeypatch.setattr(wavefront, "CELLS", cells)
     monkeypatch.setattr(wavefront, "BATCH", batch)
-    monkeypatch.setattr(engine, "WAVE", wave)
+    monkeypatch.setattr(waves, "WAVE", wave)
 
     class Anew(Counting):
         """Another type, so another program."""
@@ -215,7 +215,7 @@ def test_sizes_of_tiles_do_not_show(cells, batch, wave, monkeypatch):
     [
         *((wavefront, "CELLS", n) for n in (4, 16)),
         *((wavefront, "BATCH", n) for n in (4, 64)),
-        *((engine, "WAVE", n) for n in (2, 16)),
+        *((waves, "WAVE", n) for n in (2, 16)),
     ],
 )
 def test_no_size_shows_under_jitter_and_termination(where, name, size, method, monkeypatch):

@@ -99,13 +99,12 @@ def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighti
             i.astype(around.volume.spacing.dtype) * ((n - 1) / (m - 1))
             for i, n, m in zip(places, around.volume.shape, (nx, ny, nz), strict=True)
         )
-        measured = classification.measure((x, y, z))
-        found = measured if classification.search is None else (*measured, *classification.search(measured))
-        color, extinction = classification.classify(found)
+        measured = classification.searched(classification.measure((x, y, z)))
+        color, extinction = classification.classify(measured)
         still, one = jnp.zeros_like(extinction), jnp.ones_like(extinction)
         none = jnp.zeros((), jnp.int32)
         point = around.space.point((x, y, z))
-        return Sample(point, (still, still, still), found, color, extinction, one, (none, none))
+        return Sample(point, (still, still, still), measured, color, extinction, one, (none, none))
 
     def ratio(number: Int[Array, ""]) -> Triple:
         sample = node(number)

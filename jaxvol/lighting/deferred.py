@@ -73,9 +73,7 @@ def lit_once(
     visible = opacity > 0
     red, green, blue = (rgba[i] / jnp.where(visible, opacity, 1) for i in range(3))
     point = along(line.origin, line.direction, jnp.where(visible, depth, 0))
-    measured = seen.measure(space.coordinate(point))
-    if seen.search is not None:
-        measured = (*measured, *seen.search(measured))
+    measured = seen.searched(seen.measure(space.coordinate(point)))
     _, extinction = seen.classify(measured)
     one = jnp.ones_like(opacity)
     sample = Sample(point, line.direction, measured, (red, green, blue), extinction, one, line.pixel)

@@ -22,6 +22,7 @@ class Optics(NamedTuple):
 
     @property
     def optics(self) -> "Optics":
+        """Itself, so that it may stand where a `Material` does."""
         return self
 
 

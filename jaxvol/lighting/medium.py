@@ -38,9 +38,7 @@ class Medium(NamedTuple):
 
         def meet(measured: Measured) -> tuple[Scalar, Triple]:
             share, measured = measured[: len(materials)], measured[len(materials) :]
-            if seen.search is not None:
-                measured = (*measured, *seen.search(measured))
-            color, extinction = seen.classify(measured)
+            color, extinction = seen.classify(seen.searched(measured))
             kept = jnp.ones_like(extinction)
             visible = extinction > 0
             for part, material in zip(share, materials, strict=True):

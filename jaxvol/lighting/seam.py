@@ -86,8 +86,7 @@ class Surroundings(eqx.Module):
         )
 
         def measured(coordinate: Triple) -> Measured:
-            found = seen.measure(coordinate)
-            return found if seen.search is None else (*found, *seen.search(found))
+            return seen.searched(seen.measure(coordinate))
 
         return x * y * z, coordinate, self._in_memory(measured, coordinate)
 
