@@ -32,6 +32,8 @@ class Camera(eqx.Module):
     - `window`: the part of the image plane that the image shows, (left, right, bottom, top) from its
       middle, in units of half the height of the whole view. The default is the whole view,
       (-width/height, width/height, -1, 1). `crop` and `zoom` set it.
+    - `corner`: column and row of the first pixel in the image that this one was cropped from, by default
+      (0, 0): what is random along a ray is keyed by its pixel there. `crop` sets it.
 
     **Raises:** `ValueError` for a camera at its focal point, `view_up` along the view, an angle, a
     scale or a size out of range.
@@ -44,9 +46,7 @@ class Camera(eqx.Module):
     parallel_scale: Float[Array, ""] | None
     window: Float[Array, "4"]
     corner: Float[Array, "2"]
-    """Column and row of the first pixel in the image that this one was cropped from: what is random along a
-    ray is keyed by its pixel there. Whole numbers, kept as floats so that `jax.grad` takes a camera as it is;
-    their gradient is 0."""
+    """Whole numbers, kept as floats so that `jax.grad` takes a camera as it is; their gradient is 0."""
     size: tuple[int, int] = eqx.field(static=True)
 
     def __init__(
@@ -59,6 +59,7 @@ class Camera(eqx.Module):
         size: tuple[int, int] | Any = (512, 512),
         parallel_scale: Arrayable | None = None,
         window: Arrayable | None = None,
+        corner: Arrayable | None = None,
     ):
         self.size = width, height = _image_size(size)
         self.focal_point = finite_array("focal_point", focal_point, (3,))
@@ -83,8 +84,11 @@ class Camera(eqx.Module):
         aspect = width / height
         window = (-aspect, aspect, -1.0, 1.0) if window is None else window
         self.window = finite_array("window", window, (4,))
-        with jax.ensure_compile_time_eval():
-            self.corner = jnp.zeros(2)
+        if corner is None:
+            with jax.ensure_compile_time_eval():
+                self.corner = jnp.zeros(2)
+        else:
+            self.corner = finite_array("corner", corner, (2,))
 
     @classmethod
     def looking_at(

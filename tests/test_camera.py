@@ -1,5 +1,7 @@
 """Which ray belongs to which pixel."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,6 +73,16 @@ def test_zoom_magnifies_around_a_point():
 
 def unit_each(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def test_one_field_can_be_replaced():
+    crop = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=(8, 6)).crop(2, 1, 4, 3)
+    other = replace(crop, view_angle=20)
+    assert float(other.view_angle) == 20
+    np.testing.assert_array_equal(other.corner, (2, 1))
+    same = replace(other, view_angle=crop.view_angle)
+    for one, two in zip(jax.tree.leaves(same), jax.tree.leaves(crop), strict=True):
+        np.testing.assert_array_equal(one, two)
 
 
 def test_looking_at_sees_every_corner_of_the_volume():

@@ -806,22 +806,24 @@ def test_deferred_light_falls_on_rays_of_ones_own():
 
 @pytest.mark.slow
 def test_one_opaque_surface_is_lit_as_its_samples_are():
-    """The nearer, the more opaque it is."""
-    volume = scaled_phantom("sphere", 24)
-    camera = around(volume, SIZE)
-    march = jv.March(0.02, (jv.AlphaCorrection(),), max_samples=512)
+    """The nearer, the more opaque it is, and the closer together its samples lie."""
+    volume = jv.phantom("constant", 8)
+    lighting = templates(blend=True, materials=Material(0.5, 0.5, 1.4))
 
-    def off(unit_distance):
-        transfer = soft_transfer(unit_distance)
+    def off(extinction):
+        """Over what light makes of the image."""
+        transfer = jv.TransferFunction([0.0, 1.0], [[0.7, 0.5, 0.4]] * 2, [extinction] * 2)
+        march = jv.March(0.25 / extinction, (jv.AlphaCorrection(), jv.EarlyTermination()))
         each, once, unlit = (
-            np.asarray(jv.render(volume, transfer, camera, march, lighting=lighting).rgba)
-            for lighting in (templates(blend=True), Deferred(templates(blend=True)), None)
+            np.asarray(jv.render(volume, transfer, around(volume, SIZE), march, lighting=how).rgba)
+            for how in (lighting, Deferred(lighting), None)
         )
         return np.abs(once - each).mean() / np.abs(unlit - each).mean()
 
-    veil, solid = off(0.5), off(0.01)
-    assert solid < 0.1
+    veil, solid, wall = (off(extinction) for extinction in (20.0, 80.0, 320.0))
     assert solid < veil / 2
+    assert wall < solid / 2
+    assert wall < 0.005
 
 
 def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):

@@ -30,7 +30,9 @@ class Deferred(Lighting):
     varies. Where it sees several, one through the other, the mean depth lies between them: perhaps where
     there is nothing of any material, and the pixel stays unlit. Of baked light, which is not evened out over
     the samples of a ray, the grid shows as faint rings. How far off it is on an opaque head, and on a
-    translucent one, is measured by `experiments/lighting.py`.
+    translucent one, is measured by `experiments/lighting.py`. There two templates blended, of eight
+    photons each, come as near to many of them as one does with all its photons on all samples, in a
+    fourteenth of the time: `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))`.
 
     Its gradients are those of the image that it makes. That of voxels takes an array like them for each place
     that light is looked up in, of each 2048 pixels: slow for large volumes.
