@@ -10,16 +10,16 @@ from jaxtyping import Array, Float
 from .checks import Arrayable
 
 
-def to_srgb(linear: Float[Array, "*image"]) -> Float[Array, "*image"]:
+def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
     """Linear colour to sRGB display values, both in [0, 1]; what lies outside is clipped."""
-    linear = jnp.clip(linear, 0, 1)
+    linear = jnp.clip(jnp.asarray(linear), 0, 1)
     curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
-def from_srgb(display: Float[Array, "*image"]) -> Float[Array, "*image"]:
+def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
     """sRGB display values (as of a matplotlib colormap) to linear colour, both in [0, 1]."""
-    display = jnp.clip(display, 0, 1)
+    display = jnp.clip(jnp.asarray(display), 0, 1)
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 
@@ -37,7 +37,5 @@ def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
         raise ValueError(f"image must not hold NaN; got {int(np.isnan(image).sum())} in {image.size} values.")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    imsave(
-        path, np.asarray(jnp.round(to_srgb(jnp.asarray(image)) * 255)).astype(np.uint8), check_contrast=False
-    )
+    imsave(path, np.asarray(jnp.round(to_srgb(image) * 255)).astype(np.uint8), check_contrast=False)
     return path

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
@@ -161,7 +160,7 @@ class Page:
         bottom = self.height - HEAD - row * (self.side + TEXT) - self.side
         box = left / self.width, bottom / self.height, self.side / self.width, self.side / self.height
         axes = self.figure.add_axes(box)
-        axes.imshow(np.asarray(jv.to_srgb(jnp.asarray(linear))), interpolation="none")
+        axes.imshow(np.asarray(jv.to_srgb(linear)), interpolation="none")
         axes.axis("off")
         axes.text(0, -4 / self.side, below, va="top", fontsize=7.5, transform=axes.transAxes, linespacing=1.1)
         if above:
