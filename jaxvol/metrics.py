@@ -34,7 +34,7 @@ def rmse(image: Any, reference: Any) -> float:
     return float(np.sqrt(np.mean((image - reference) ** 2)))
 
 
-def psnr(image: Any, reference: Any, data_range: float = 1.0) -> float:
+def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Peak signal to noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
 
     **Raises:** as `rmse`, and `ValueError` for a `data_range` that is not positive.
@@ -47,7 +47,7 @@ def psnr(image: Any, reference: Any, data_range: float = 1.0) -> float:
     return float(peak_signal_noise_ratio(reference, image, data_range=_positive("data_range", data_range)))
 
 
-def ssim(image: Any, reference: Any, data_range: float = 1.0) -> float:
+def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Mean structural similarity over windows of 7 x 7 pixels, then over channels; 1 for equal images.
 
     **Raises:** as `psnr`, and `ValueError` for an image with fewer than 7 pixels along a side.
