@@ -141,7 +141,7 @@ def march_beams(
         at = _until(beams.span, over(rays, at, beams.span.first))
 
     def wanted(at: Progress, whole: bool) -> Bool[Array, "*rays"]:
-        """Which rays a pass is for: all, or first those that are not settled."""
+        """Which rays a pass is for: all, or first those that are not settled, unless they are most."""
         alive = _alive(march, at)
         return alive if whole or capped else alive & (together | ~_settled(march, at))
 
