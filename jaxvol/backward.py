@@ -48,7 +48,7 @@ def pulled(
         moving = floats((without_voxels(volume), source, march))
         rays, pull = eqx.filter_vjp(made, moving)
         replay = Replay(
-            (packed, transfer, march),
+            (volume, known.words, transfer, march),
             seen,
             *(rays, Cotangents.of(rays, rendering, gradient), total, light),
             places=places,
@@ -77,7 +77,8 @@ def pulled(
     (total, of_source), _ = jax.lax.scan(wave, start, (jnp.arange(waves.number), spans, *image))
     of_volume = total.volume
     if total.voxels is not None:
-        of_volume = with_voxels(of_volume, total.voxels.reshape(volume.data.shape))
+        voxels = total.voxels.reshape(volume.data.shape).astype(volume.data.dtype)
+        of_volume = with_voxels(of_volume, voxels)
     if pull_light is None:
         return of_volume, total.transfer, of_source, total.march, None
     more_volume, more_transfer, more_march, of_lighting = pull_light(total.light)[0]

@@ -55,6 +55,12 @@ def finite(values: Any) -> Any:
     return abs(values) < np.inf
 
 
+def all_finite(tree: Any) -> Array:
+    """Whether no float of a tree's arrays is NaN or infinite; found when the program runs."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves])) if leaves else jnp.array(True)
+
+
 def finite_array(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> Array:
     """`value` as an array of JAX's default float type, of this shape (None: any length)."""
     spelled = str(shape).replace("None", "n")

@@ -16,15 +16,16 @@ from jaxtyping import Array, Float, Int
 from .backward import pulled
 from .camera import Camera
 from .checks import Arrayable, finite, require
-from .compiled import compiled
+from .compiled import compiled, recomputed
 from .lighting.deferred import Deferred, lit_picture
 from .lighting.seam import Lighting, classification
+from .locate import invalid
 from .march import March
 from .packed import with_words
 from .reference import begin, end, samples_across, step
 from .rendering import Found, Outputs, Picture, Rendering
 from .replay import Watch
-from .scene import Known, Scene, survey_of
+from .scene import Known, Scene, has_fault, survey_of
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, Span, march_beams
@@ -186,7 +187,6 @@ class _How(eqx.Module):
         return cls(outputs, adjoint, min(-(-length // 64) * 64, march.most_samples))
 
 
-@compiled
 def _render(scene: Scene, how: _How, known: Known) -> Any:
     if isinstance(scene[-1], Deferred):
         return _deferred(scene, how, known)
@@ -195,14 +195,21 @@ def _render(scene: Scene, how: _How, known: Known) -> Any:
 
 def _deferred(scene: Scene, how: _How, known: Known) -> Picture:
     """An image that is rendered without light, and lit as a whole."""
-    volume, transfer, source, march, lighting = scene
     found = "all" if how.outputs == "all" else "depth"
-    rendering = _render((volume, transfer, source, march, None), replace(how, outputs=found), known)
+    rendering = _render((*scene[:-1], None), replace(how, outputs=found), known)
+    lit = _lit_replayed if how.adjoint == "replay" else _lit
+    rgba = lit(scene, known, rendering.rgba, rendering.depth)
+    return Picture(rgba, rendering.exhausted) if how.outputs == "rgba" else replace(rendering, rgba=rgba)
+
+
+def _light(
+    scene: Scene, known: Known, rgba: Float[Array, "*rays 4"], depth: Float[Array, "*rays"]
+) -> Float[Array, "*rays 4"]:
+    volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
     space = march.locate(volume)
     seen = classification(volume, transfer, space, lighting)
-    rgba = lit_picture(seen, space, partial(line, source), rendering.rgba, rendering.depth)
-    return Picture(rgba, rendering.exhausted) if how.outputs == "rgba" else replace(rendering, rgba=rgba)
+    return lit_picture(seen, space, partial(line, source), rgba, depth)
 
 
 def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
@@ -210,32 +217,21 @@ def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
 
     @eqx.filter_custom_vjp
     def image(scene: Scene, known: Known) -> Picture:
-        return _image(scene, how, known)
+        return _image_in_turn(scene, how, known)
 
     @image.def_fwd
     def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Picture, Any]:
-        rendering, spans = _marched(scene, how, known, watch=True)
+        rendering, spans = _watched(scene, how, known)
         return rendering, (rendering, spans)
 
     @image.def_bwd
     def _(left: Any, gradient: Picture, perturbed: Any, scene: Scene, known: Known) -> Any:
-        rendering, spans = left
-        # None stands for what the loss does not use
-        whole = jax.tree.map(
-            lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
-            *(rendering, gradient),
-            is_leaf=lambda leaf: leaf is None,
-        )
-        return eqx.filter(pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
+        return _pulled(scene, perturbed, known, left, gradient)
 
     return image(scene, jax.lax.stop_gradient(known))
 
 
-def _image(scene: Scene, how: _How, known: Known) -> Picture:
-    return _marched(scene, how, known, watch=False)[0]
-
-
-def _marched(scene: Scene, how: _How, known: Known, *, watch: bool) -> tuple[Picture, Span | None]:
+def _marched(scene: Scene, how: _How, known: Known, *, watch: bool = False) -> tuple[Picture, Span | None]:
     """The image; and where rays leap, if it is to be watched, the spans of each wave's rays."""
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
@@ -243,9 +239,10 @@ def _marched(scene: Scene, how: _How, known: Known, *, watch: bool) -> tuple[Pic
     waves, space = Waves.of(source, DIRECT_WAVE if direct else None), march.locate(volume)
     survey = None if direct else survey_of((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
+    fault = has_fault(scene)
 
     def wave(number: Int[Array, ""]) -> tuple[Picture, Span | None]:
-        rays, spans = waves.rays(source, space, number), None
+        rays, spans = invalid(waves.rays(source, space, number), fault), None
         if direct:
             one = each_ray(lambda ray, at: step(march, ray, volume, seen, at))
             start = each_ray(lambda ray: begin(march, ray, how.outputs))(rays)
@@ -258,6 +255,35 @@ def _marched(scene: Scene, how: _How, known: Known, *, watch: bool) -> tuple[Pic
 
     pictures, spans = jax.lax.map(wave, jnp.arange(waves.number))
     return jax.tree.map(waves.assemble, pictures), spans
+
+
+def _only_marched(scene: Scene, how: _How, known: Known) -> Picture:
+    return _marched(scene, how, known)[0]
+
+
+def _pull(
+    scene: Scene, perturbed: Any, known: Known, left: tuple[Picture, Span | None], gradient: Any
+) -> Any:
+    rendering, spans = left
+    # None stands for what the loss does not use
+    whole = jax.tree.map(
+        lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
+        *(rendering, gradient),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    found = eqx.filter(pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
+    fault = has_fault(scene)
+    return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
+
+
+# One image is one program, or two with its gradient; that they are whole programs is what `compiled` is about.
+
+_image = compiled(_only_marched, has_jvp=True)
+_image_in_turn = compiled(_only_marched)
+_watched = compiled(partial(_marched, watch=True))
+_pulled = compiled(_pull)
+_lit = compiled(_light, has_jvp=True)
+_lit_replayed = recomputed(_light)
 
 
 def _prepared(lighting: Any, volume: Volume, transfer: Transfer, march: March) -> Lighting | None:

@@ -6,6 +6,7 @@ one is never asked for again. So nothing kept here goes stale, and nothing outli
 
 import weakref
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar
 
 import jax
@@ -19,15 +20,31 @@ T = TypeVar("T")
 
 
 def kept(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
-    """`compute(array)`, computed once in the lifetime of a concrete array. It carries no gradient."""
-    if is_traced(array) or not isinstance(array, jax.Array):  # a NumPy array may change
-        return compute(jax.lax.stop_gradient(array))
+    """`compute(array)`, computed once in the lifetime of a concrete array. It carries no gradient. Under
+    `jax.vmap`, it is computed once in the lifetime of the batch."""
+    if not isinstance(array, jax.Array):  # a NumPy array may change
+        return compute(array)
+    if is_traced(array):
+        return _of_batch(compute)(jax.lax.stop_gradient(array))
     key = id(array), compute
     if key not in _MEMORY:
         with jax.ensure_compile_time_eval():
             _MEMORY[key] = compute(array)
         weakref.finalize(array, _MEMORY.pop, key, None)
     return _MEMORY[key]
+
+
+@cache
+def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`compute` of one array, with a rule that keeps the results of a batch of them."""
+    one, several = jax.custom_batching.custom_vmap(compute), jax.vmap(compute)
+
+    @one.def_vmap
+    def _(size: int, batched: list[bool], arrays: Array) -> Any:
+        found = kept(arrays, several)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return one
 
 
 _MEMORY: dict = {}

@@ -89,7 +89,8 @@ class Ray(eqx.Module):
 def enter(
     space: Space, origin: Triple, direction: Triple, pixel: tuple[Int[Array, ""], Int[Array, ""]]
 ) -> Ray:
-    """The part of a ray inside the volume and not behind its origin, which may lie inside."""
+    """The part of a ray inside the volume and not behind its origin, which may lie inside. Where NaN or
+    infinity are among the numbers of ray or space, the ray is `invalid`."""
     # Float32 rounds the distance of a far camera by more than the volume can stand. So the ray begins
     # anew near the volume, from where distances are short.
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
@@ -101,7 +102,16 @@ def enter(
     start = jnp.where(hit, start, 0)  # a miss has infinite distances, whose products are NaN
     entry = along(close, direction, start)
     length = jnp.where(hit, far - start, 0)
-    return Ray(entry, direction, base + start, length, space.path(entry, direction), pixel)
+    ray = Ray(entry, direction, base + start, length, space.path(entry, direction), pixel)
+    return invalid(ray, jnp.isnan(near) | jnp.isnan(far))
+
+
+def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
+    """The ray; where there is a fault, one that is never marched, and of which nothing but NaN is seen.
+
+    Comparisons with NaN are false, so that a march would take it for a miss, or never end."""
+    t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
+    return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
 
 
 class Straight(Path):

@@ -44,7 +44,14 @@ class Blocks(eqx.Module):
         """The blocks of a volume, from memory where its voxels and labels have been seen before."""
         labels = None if volume.labels is None else kept(volume.labels, _label_bits)
         low, high = kept(volume.data, _ranges)
+        if type(volume).value is not Volume.value:  # then its values are not those between its voxels
+            low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         return cls(low, high, labels)
+
+    @property
+    def unordered(self) -> Bool[Array, "bx by bz"]:
+        """Which blocks hold NaN: nothing is known of them."""
+        return ~(self.low <= self.high)
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
         """Which blocks may hold this label."""

@@ -61,6 +61,8 @@ class PackedVolume(Volume):
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     """The packed copy of a volume's voxels; None where it is no use, or takes too much memory."""
     data = volume.data
+    if type(volume) is not Volume:  # it may fetch its voxels in its own way
+        return None
     small = data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
     if not small or is_traced(data) or not isinstance(data, jax.Array) or 4 * data.size > LIMIT:
         return None

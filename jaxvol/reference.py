@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .checks import is_traced
+from .checks import all_finite, is_traced
 from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.seam import Lighting, Sample, classification
-from .locate import Ray, enter
+from .locate import Ray, enter, invalid
 from .march import Cell, March
 from .rendering import DepthPicture, Found, Picture, Rendering
+from .taps import without_voxels
 from .transfer import Classification, Measured, Transfer
 from .triple import Scalar, Triple, along, apart
 from .volume import Volume
@@ -177,15 +178,17 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
 def end(ray: Ray, at: Progress) -> Picture:
     """What the ray has seen: with its depth, and with what it met, if it was to find that out."""
     assert at.color is not None
-    rgba, exhausted = jnp.stack([*at.color, at.opacity]), ~at.finished
+    valid = ~jnp.isnan(ray.t_in)
+    rgba, exhausted = jnp.where(valid, jnp.stack([*at.color, at.opacity]), jnp.nan), ~at.finished
     if at.moment is None:
         return Picture(rgba, exhausted)
-    seen = at.opacity > 0
+    # of NaN neither more nor less than 0 is true, and it is handed on
+    seen = ~(at.opacity <= 0)
     # Of moment and opacity as parts of the opacity, which is so divided by 1: the derivative of a quotient
     # divides by the square, and that of the opacity of a veil is 0 in float32.
     whole = jax.lax.stop_gradient(jnp.where(seen, at.opacity, 1))
     depth = ray.t_in + (at.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
-    depth = jnp.where(seen, depth, jnp.inf)
+    depth = jnp.where(seen | ~valid, depth, jnp.inf)
     if at.met is None:
         return DepthPicture(rgba, exhausted, depth)
     return Rendering(rgba, exhausted, depth, at.met.samples, at.met.aligned)
@@ -221,7 +224,7 @@ def render_ray_reference(
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
-    ray = enter(space, *line)
+    ray = invalid(enter(space, *line), ~all_finite((without_voxels(volume), transfer, march, lighting)))
     lit = classification(volume, transfer, space, lighting)
     seen = transfer.over(volume) if isinstance(lighting, Deferred) else lit
 

@@ -23,14 +23,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, UInt32
 
 from .locate import Ray
 from .march import March
+from .packed import with_words
 from .reference import Progress, contained, front, pieces
 from .relight import LightTotal, Lit, Relit, relit
 from .rendering import DepthPicture, Picture
-from .taps import Tapped, added, floats, scattered, without_voxels
+from .taps import Tapped, added, floats, scattered, with_voxels, without_voxels
 from .transfer import Classification, Transfer
 from .triple import Scalar, Triple, along
 from .visible import Weighed, weighed
@@ -39,7 +40,8 @@ from .wavefront import CELLS, Follower, Samples, Span, over_cells
 
 
 class Watch(Follower):
-    """Goes along with the first march, over rays of this shape, and remembers the span of each."""
+    """Records the first and the last visible cell of each ray of a march, over rays of this shape. A ray
+    without any has `until` = 0, and a `first` that is none of its cells."""
 
     given = sums = total = None
 
@@ -98,8 +100,9 @@ class Total(eqx.Module):
         lit = None if light is None else light.leaves
         parts = transfer, march, without_voxels(volume), lit
         transfer, march, volume_, lit = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
-        data = volume.data
-        return cls(transfer, march, volume_, jnp.zeros(data.size, data.dtype) if voxels else None, lit)
+        # many small parts are added up, which 16 bits would lose
+        sums = jnp.zeros(volume.data.size, jnp.promote_types(volume.data.dtype, jnp.float32))
+        return cls(transfer, march, volume_, sums if voxels else None, lit)
 
 
 class Replay(Follower):
@@ -107,6 +110,7 @@ class Replay(Follower):
 
     **Arguments:**
 
+    - `scene`: volume, the packed copy of its voxels, transfer function and march.
     - `total`: to be added to.
     - `light`: by what the samples are lit.
     - `places`: whether the gradient of anything but the transfer function is asked for.
@@ -114,7 +118,7 @@ class Replay(Follower):
 
     def __init__(
         self,
-        scene: tuple[Volume, Transfer, March],
+        scene: tuple[Volume, UInt32[Array, " voxels"] | None, Transfer, March],
         seen: Classification,
         rays: Ray,
         given: Cotangents,
@@ -123,7 +127,7 @@ class Replay(Follower):
         *,
         places: bool,
     ):
-        self.volume, self.transfer, self.march = scene
+        self.volume, self.words, self.transfer, self.march = scene
         self.seen, self.places, self.light = seen, places, light
         self.given, self.total = given, total
         self.kept = jnp.zeros_like(given.worth)  # of the samples in front
@@ -186,15 +190,16 @@ class Replay(Follower):
             march: PyTree, volume: PyTree, ray: PyTree, taps: Any, ray_rest: PyTree, at: Progress, k: Array
         ):
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
-            tapped = Tapped(eqx.combine(volume, volume_rest), self.volume, taps if voxels else None)
+            placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
+            here = Tapped(placed, placed, taps) if voxels else with_words(placed, self.words)
             found = []
-            for piece in pieces(march, ray, tapped, front(march, at, k)):
+            for piece in pieces(march, ray, here, front(march, at, k)):
                 depth = march.sample(piece)
-                measured = self.transfer.measured(tapped, ray.path(depth))
+                measured = self.transfer.measured(here, ray.path(depth))
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
                 asked = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, asked, point))
-            return found, tapped.asked
+            return found, here.asked if isinstance(here, Tapped) else []
 
         ahead = jnp.arange(CELLS, dtype=at.index.dtype)
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))

@@ -5,9 +5,10 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
 from .camera import Camera
+from .checks import all_finite
 from .leaping import FirstHit
 from .lighting.seam import Lighting
 from .march import March, Survey, View
@@ -15,6 +16,7 @@ from .occupancy import Blocks
 from .packed import words_of
 from .reference import end
 from .rendering import Rendering
+from .taps import without_voxels
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, march_beams
@@ -35,13 +37,21 @@ class Known(eqx.Module):
         return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
 
 
+def has_fault(scene: Scene) -> Bool[Array, ""]:
+    """Whether any number on which all pixels depend is NaN or infinite. A comparison with one is false, and
+    turns it into nothing seen: a fit that has diverged would look like one that has converged. Of rays and
+    voxels it is found out ray by ray."""
+    volume, transfer, _, march, lighting = scene
+    return ~all_finite((without_voxels(volume), transfer, march, lighting))
+
+
 def survey_of(scene: Scene, known: Known) -> Survey | None:
     """What is known of empty space. Nothing of it has a gradient."""
     volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
     if known.blocks is None:
         return None
     space = march.locate(volume)
-    occupancy = space.occupancy(transfer.visible(known.blocks))
+    occupancy = space.occupancy(transfer.visible(known.blocks) | known.blocks.unordered)
     if isinstance(source, OwnRays):
         return march.survey(occupancy, None)
 

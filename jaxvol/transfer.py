@@ -214,7 +214,7 @@ class TransferFunction(Transfer):
         leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
         transfer = eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), self, leaves)
         of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
-        return transfer, (jnp.where(value >= self.values[0], of_value, 0),)
+        return transfer, (jnp.where(value < self.values[0], 0, of_value),)
 
     def rows(self) -> Float[Array, "points 10"]:
         """A table with one row for each point: all that a sample needs which lies past it, but not past the
@@ -228,8 +228,9 @@ class TransferFunction(Transfer):
 
 
 def at_least(value: Scalar, least: Scalar) -> Scalar:
-    # by comparing, which takes less than a maximum, since that must hand NaN on
-    return jnp.where(value >= least, value, least)
+    """The larger of the two; NaN stays NaN."""
+    # by comparing, which takes less time than a maximum
+    return jnp.where(value < least, least, value)
 
 
 def points_below(
@@ -275,8 +276,8 @@ def row_of(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
 def interpolated(row: Row, past: Scalar) -> tuple[Triple, Scalar]:
     """Colour and extinction of a value so far past a point, from its row."""
     r, g, b, extinction = (at + past * slope for at, slope in zip(row[1:5], row[5:9], strict=True))
-    # where it falls to 0 it may be rounded to less
-    return (r, g, b), jnp.where(extinction >= 0, extinction, 0)
+    # where it falls to 0 it may be rounded to less; NaN stays NaN
+    return (r, g, b), jnp.where(extinction < 0, 0, extinction)
 
 
 def seen_between(

@@ -138,7 +138,8 @@ def march_beams(
         together = _mostly(_alive(march, at) & ~_settled(march, at), of=_alive(march, at))
     if beams.span is not None:
         over = jax.vmap(jax.vmap(partial(_over, march)))
-        at = _until(beams.span, over(rays, at, beams.span.first))
+        # those that see nothing are finished first, and so stay where they are: `first` is no index of theirs
+        at = over(rays, _until(beams.span, at), beams.span.first)
 
     def wanted(at: Progress, whole: bool) -> Bool[Array, "*rays"]:
         """Which rays a pass is for: all, or first those that are not settled, unless they are most."""
@@ -277,7 +278,9 @@ def _segment(
         )
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
-    # true, but not for XLA; loops go on while any ray is alive, and to ask each time takes 1 % of a frame
+    # Always true, but opaque to XLA, so that the branches survive. An index grows by at most CELLS a segment,
+    # finished or not, and there are no more segments in a pass than `march.most_samples`, which is at most
+    # 2**24: it never overflows. Whether any ray is alive would take 1 % of a frame to find out each time.
     live = at.index[0] >= 0
     values = in_memory(live, measured, at, given)
     if seen.search is not None:
@@ -351,7 +354,10 @@ def _leap(
     here = front(march, at)
     there = survey.clear(notes, beam, rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
-    cells = jnp.clip(whole.astype(at.index.dtype), 0, march.most_samples - at.index)
+    # limited before it becomes an integer, of which it may exceed the largest
+    cells = jnp.minimum(
+        jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype), march.most_samples - at.index
+    )
     return jax.vmap(partial(_over, march))(rays, at, cells)
 
 
