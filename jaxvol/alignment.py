@@ -1,4 +1,5 @@
-"""How wide is a cell that meets a face? Sampling alignment, also called alpha correction (Kye 2013)."""
+"""How wide is a cell that meets a face? Sampling alignment, also called alpha correction (Kye 2013), for the
+exit; the same idea for faces of labels and of gaps."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -30,8 +31,8 @@ class AlphaCorrection(Transform):
     """Cut the cells of a ray at the faces that they reach across.
 
     The last sample's cell reaches past the exit, by a different part of a step in every pixel, which
-    makes the back face of a non-transparent volume bumpy. Here that sample stands just for the width
-    e up to the exact exit: its opacity becomes `1 - exp(-extinction e)`, which is the paper's
+    makes the back face of a non-transparent volume bumpy. Here that sample stands for the width e up to
+    the exact exit alone: its opacity becomes `1 - exp(-extinction e)`, which is the paper's
     `1 - (1 - α)^(e/d)`. A volume of constant extinction comes out exact at any step.
 
     Where a ray may leave the volume and come back, as under `ToroidalMap`, the faces of such gaps are
@@ -53,7 +54,9 @@ class AlphaCorrection(Transform):
 
     **Raises:** `ValueError` when rendering with `labels=True` a volume that has none.
 
-    Source: Kye 2013, section 3.2 (sampling position alignment); faces of labels are its open question.
+    Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit. The cuts at faces
+    of labels and of gaps are not in the paper, which names the noise that jitter makes at the faces of a
+    segmentation as future work.
     """
 
     labels: bool = eqx.field(static=True, default=False)

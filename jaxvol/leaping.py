@@ -1,7 +1,7 @@
-"""How far ahead is nothing to be seen? Space leaping (Chae and Shin; KISTI report 2005).
+"""How far ahead is nothing visible? Space leaping (Chae and Shin; KISTI report 2005).
 
-All methods ask the same grid of occupied cells (`Occupancy`), which follows the transfer function. They
-differ in what they ask, and for whom:
+All methods query the same grid of occupied cells (`Occupancy`), which follows the transfer function. They
+differ in the query, and in the rays that share its answer:
 
 - beams of 8 x 8 pixels, stretch by stretch, whether the box around it is empty (`"hierarchy"`);
 - rays one by one, how far away the nearest occupied cell is (`"distance"`);
@@ -61,8 +61,11 @@ class SpaceLeaping(Transform):
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
     rendering rays of one's own.
 
-    Source: Chae and Shin, space leaping with a minimum-distance grid (`"distance"`, `"min_distance"`);
-    `"hierarchy"` stands for the octree of the KISTI report 2005.
+    Source: `"min_distance"` is the grid of Chae and Shin, over the distance map that they start from
+    (`"distance"`). Theirs holds a distance for each voxel, ours the chessboard distance
+    for each block of 4³ voxels; theirs does not march the rays at the corners of cells again, ours does.
+    `"hierarchy"` stands for the octree of the KISTI report 2005, which designs one and does not get it to
+    work. `"beam"` is not published: it is the bound that `"min_distance"` is not.
     """
 
     method: Method = eqx.field(static=True)

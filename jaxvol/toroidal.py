@@ -59,8 +59,9 @@ class ToroidalMap(Transform):
 
     **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
 
-    Source: Kim, Kwon and Shin 2008, equation 1, which prints `atan`; `atan2` is the same where z > 0 and
-    R > 0, and outside of every sector elsewhere.
+    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), which print `atan`; `atan2` is the same where
+    z > 0 and R > 0, and outside every sector elsewhere. Two misprints there: (2.4) has τ for γ, and the
+    derivation of (2.2) has y/2 for y/z. ρ is our name for R + a.
     """
 
     a: Float[Array, ""]

@@ -1,8 +1,9 @@
 """Lee, Kwon and Shin, Fig. 6: without light, and lit by scatterer templates. The defaults are the head
 phantom, and a frog whose translucent body and organs are each a material; `--data` adds CT of a head.
 
-In the middle as published: hidden photons are left out, and each pixel uses one of eight templates. On the
-right occlusion is soft, and four templates of more packets are blended.
+In the middle hidden photons are left out, as published (hard occlusion), and each pixel uses one of eight
+templates, chosen at random; the paper makes eight of each material, and does not say which of them a sample
+uses. On the right occlusion is soft, and four templates of more packets are blended. The lights are the same.
 """
 
 from collections.abc import Sequence
@@ -17,16 +18,15 @@ from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 from .common import BLACK, Page, options
 
 
+IRRADIANCE = (3.0, 3.0, 3.0)
 AROUND = ConstantLight((0.1, 0.1, 0.1))
-COLUMNS: dict[str, tuple[float, dict[str, Any]] | None] = {
+BLENDED = {"templates": 4, "blend": True, "packets": 16, "threshold": 0.004, "reach": (2, 4, 8)}
+COLUMNS: dict[str, dict[str, Any] | None] = {
     "no light": None,
-    "as published": (3, {"occlusion": "hard"}),
-    "soft, 4 templates blended": (
-        7,
-        {"templates": 4, "blend": True, "packets": 16, "threshold": 0.004, "reach": (2, 4, 8)},
-    ),
+    "hard, one of 8 for each pixel": {"occlusion": "hard"},
+    "soft, 4 templates blended": BLENDED,
 }
-"""How each column is lit: the irradiance, since soft occlusion dims what lies under skin, and the rest."""
+"""How the templates of each column are used."""
 
 
 class Subject(NamedTuple):
@@ -89,11 +89,10 @@ def draw(page: Page, row: int, name: str, subject: Subject) -> None:
     for column, (title, how) in enumerate(COLUMNS.items()):
         lighting = None
         if how is not None:
-            irradiance, more = how
-            lights = DirectionalLight(direction, (irradiance,) * 3), AROUND
-            lighting = ScattererTemplates(materials, lights, **more)
+            lights = DirectionalLight(direction, IRRADIANCE), AROUND
+            lighting = ScattererTemplates(materials, lights, **how)
         rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
-        told = name if lighting is None else f"{lighting.photons} photons in each template"
+        told = name if lighting is None else f"{lighting.photons} photon slots a template"
         page.draw(row, column, rendering.image(BLACK), told, title if row == 0 else "")
 
 

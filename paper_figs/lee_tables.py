@@ -1,5 +1,6 @@
-"""Lee, Kwon and Shin, Tables 1 to 3: the brightest photons of templates, in the paper's form. Grown here,
-lengths in mean free paths, beside the intensities that the paper has at their places."""
+"""Lee, Kwon and Shin, Tables 1 to 3: the brightest photons of templates, brightest first. Generated here in
+the conserving form, which the paper's own tables have (README.md), lengths in mean free paths, beside the
+intensities that the paper prints in the same rows."""
 
 from collections.abc import Sequence
 
@@ -26,7 +27,7 @@ PAPER = {
     THIN: (0.12291, 0.12241, 0.07501, 0.07500, 0.48284, 0.48282, 0.03076, 0.03060),
     DENSE: (0.22145, 0.17421, 0.17500, 0.17120, 0.04829, 0.04805, 0.04728, 0.01339),
 }
-"""Intensities as printed; not all are sorted."""
+"""Intensities as printed. 0.00945, 0.48284 and 0.48282 lack a zero: 0.000945, 0.048284, 0.048282."""
 
 
 def table() -> str:

@@ -189,9 +189,10 @@ def test_table_1_is_told_from_the_record(measured, tmp_path):
     assert "| *paper: vessels* | 1024² | 1.192 s | 1.003 | 1.006 | 1.020 |" in told
 
 
-def test_the_table_in_the_readme_is_that_of_the_kept_record():
+def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     assert table1.table(record.read(record.RESULTS / "overhead.json")) in told
+    assert kisti_table.table(record.read(record.RESULTS / "kisti.json")) in told
 
 
 def test_the_templates_in_the_readme_are_those_that_grow():
