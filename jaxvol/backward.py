@@ -18,6 +18,7 @@ from .relight import Lit
 from .rendering import DepthPicture, Picture
 from .replay import Cotangents, Replay, Total
 from .scene import Known, Scene, survey_of
+from .sharding import varying
 from .taps import added, floats, with_voxels, without_voxels
 from .volume import Volume
 from .wavefront import Beams, Span, march_beams
@@ -74,7 +75,9 @@ def pulled(
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
     image = jax.tree.map(waves.apart, (rendering, gradient))
-    (total, of_source), _ = jax.lax.scan(wave, start, (jnp.arange(waves.number), spans, *image))
+    (total, of_source), _ = jax.lax.scan(
+        wave, varying(start, image), (jnp.arange(waves.number), spans, *image)
+    )
     of_volume = total.volume
     if total.voxels is not None:
         voxels = total.voxels.reshape(volume.data.shape).astype(volume.data.dtype)

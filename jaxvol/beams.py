@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .locate import Ray
 from .occupancy import Index, Occupancy, Sums
+from .sharding import varying
 from .triple import Scalar, Triple, along
 
 
@@ -143,5 +144,5 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
 
     none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
     table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int32)
-    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, ask, (number, none, table))
+    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, ask, varying((number, none, table)))
     return Stretches(box.near, length, table)

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .sharding import varies_over
+
 
 T = TypeVar("T")
 
@@ -39,9 +41,12 @@ def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> 
 
     **Returns:** the value. Use what is returned: a check on a traced value vanishes without it.
 
-    **Raises:** `ValueError` at once for a concrete value, an Equinox runtime error for a traced one.
+    **Raises:** `ValueError` at once for a concrete value, an Equinox runtime error for a traced one. Inside
+    `jax.shard_map`, which Equinox's errors do not work in, a traced value becomes NaN instead.
     """
     if is_traced(value, *others):
+        if any(map(varies_over, jax.tree.leaves((value, others)))):
+            return jax.tree.map(lambda leaf: jnp.where(jnp.all(holds(value, *others)), leaf, jnp.nan), value)
         message = message.format(got="a value known only when the program runs")
         return eqx.error_if(value, ~jnp.all(holds(value, *others)), message)
     # by NumPy, which compiles nothing

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from .sharding import varying
+
 
 CHUNK = 2048
 """Things that are taken at a time."""
@@ -37,7 +39,7 @@ class Chosen(NamedTuple):
             i, carry = state
             return i + 1, one(jax.lax.dynamic_slice_in_dim(self.place, i * CHUNK, CHUNK), carry)
 
-        begin = jnp.zeros((), jnp.int32), start
+        begin = varying((jnp.zeros((), jnp.int32), start), self.number)
         return jax.lax.while_loop(lambda state: state[0] * CHUNK < self.number, chunk, begin)[1]
 
     def take(self, arrays: list[PyTree], places: Int[Array, " chunk"]) -> PyTree:

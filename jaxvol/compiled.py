@@ -7,9 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, PyTree
 
 from .checks import is_traced
+from .sharding import varying
 
 
 OPTIONS = {
@@ -28,9 +31,9 @@ def compiled(function: Callable[..., Any], *, has_jvp: bool = False) -> Callable
     Batching its operations instead would turn every branch into both of its sides, and keep each loop going
     until the last element is finished: 3 to 18 times slower.
 
-    `has_jvp`: the function is to be differentiated by JAX itself. JAX cannot linearize what is batched by a
-    rule, so then the rule is used only where `jax.vmap` is all that is seen to be done to the arguments; where
-    they are also differentiated, or where a `jax.jit` stands between, operations are batched.
+    `has_jvp`: the function is to be differentiated by JAX itself. JAX cannot linearize what has a rule for
+    batching, so the rule is then used only where `jax.vmap` is all that is seen to be done to the arguments.
+    Where they are also differentiated, or a `jax.jit` stands between, operations are batched.
     """
     options: Any = {"compiler_options": OPTIONS}
     inner, alone = eqx.filter_jit(function), eqx.filter_jit(function, **options)
@@ -47,9 +50,18 @@ def compiled(function: Callable[..., Any], *, has_jvp: bool = False) -> Callable
 
 def _only_vmapped(args: PyTree) -> bool:
     """Whether `jax.vmap` is the innermost transformation of every traced argument."""
-    traced = [leaf for leaf in jax.tree.leaves(args) if is_traced(leaf)]
-    # by name, since JAX does not export the class
-    return bool(traced) and all(type(leaf).__name__ == "BatchTracer" for leaf in traced)
+    kinds = {transformations(leaf)[0] for leaf in jax.tree.leaves(args) if is_traced(leaf)}
+    return kinds == {"BatchTracer"}
+
+
+def transformations(leaf: Any) -> list[str]:
+    """By which of JAX's tracers an array is traced, the innermost first. By name, since JAX does not export
+    their classes; what is outside of a `jax.jit` is not seen."""
+    names = []
+    while is_traced(leaf):
+        names.append(type(leaf).__name__)
+        leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
+    return names
 
 
 def _is_array(leaf: Any) -> bool:
@@ -121,6 +133,33 @@ def _pulled(function: Callable[..., Any], perturbed: PyTree, args: tuple[Any, ..
     return pull(cotangent)[0]
 
 
+def forward_only(tree: PyTree, message: str) -> PyTree:
+    """The tree as it is; under reverse mode, `ValueError` with this message."""
+
+    @jax.custom_jvp
+    def same(leaf: Array) -> Array:
+        return leaf
+
+    @same.defjvp
+    def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
+        return primal[0], _TANGENT.bind(*tangent, message=message)
+
+    return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def _refuse(cotangent: Any, tangent: Any, *, message: str) -> Any:
+    raise ValueError(message)
+
+
+# The identity, with an error for a transpose. (`jax.custom_derivatives.linear_call` cannot be batched.)
+_TANGENT = Primitive("forward_only")
+_TANGENT.def_impl(lambda tangent, *, message: tangent)
+_TANGENT.def_abstract_eval(lambda tangent, *, message: tangent)
+mlir.register_lowering(_TANGENT, lambda context, tangent, *, message: [tangent])
+batching.defvectorized(_TANGENT)
+ad.deflinear2(_TANGENT, _refuse)
+
+
 def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
     """`f(*arguments)`, computed once and put in memory for all who use it.
 
@@ -133,6 +172,6 @@ def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> 
             fill = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
             return jnp.full(leaf.shape, fill, leaf.dtype)
 
-        return jax.tree.map(filled, jax.eval_shape(f, *arguments))
+        return varying(jax.tree.map(filled, jax.eval_shape(f, *arguments)), arguments)
 
     return jax.lax.cond(live, f, never, *arguments)

@@ -4,6 +4,7 @@ Rays are made wave by wave, in the order of `waves`. How the rays of a wave are 
 business; what they see is `reference`'s; and what a loss sees of it, `backward`'s.
 """
 
+import math
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, TypeAlias, get_args, overload
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from .backward import pulled
 from .camera import Camera
 from .checks import Arrayable, finite, require
-from .compiled import compiled, recomputed
+from .compiled import compiled, forward_only, recomputed, transformations
 from .lighting.deferred import Deferred, lit_picture
 from .lighting.seam import Lighting, classification
 from .locate import invalid
@@ -26,6 +27,7 @@ from .reference import begin, end, samples_across, step
 from .rendering import Found, Outputs, Picture, Rendering
 from .replay import Watch
 from .scene import Known, Scene, has_fault, survey_of
+from .sharding import shard_number, varying
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, Span, march_beams
@@ -33,6 +35,13 @@ from .waves import OwnRays, Waves, each_ray, line
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
+
+WRONG_WAY = {
+    "replay": 'adjoint="replay" is for reverse mode (jax.grad, jax.vjp). For forward mode (jax.jvp, '
+    'jax.jacfwd) pass adjoint="forward"; for both, and for higher derivatives, adjoint="direct".',
+    "forward": 'adjoint="forward" is for forward mode (jax.jvp, jax.jacfwd). For reverse mode (jax.grad, '
+    'jax.vjp) pass adjoint="replay", the default; for both, adjoint="direct".',
+}
 
 DIRECT_WAVE = 64
 """Beams in a wave of `"direct"`, which keeps all its states to be differentiated."""
@@ -112,6 +121,7 @@ def render_rays(
     directions: Arrayable,
     march: March,
     *,
+    pixels: Arrayable | None = None,
     lighting: Lighting | None = None,
     outputs: Literal["all"] = "all",
     adjoint: Adjoint = "replay",
@@ -126,6 +136,7 @@ def render_rays(
     directions: Arrayable,
     march: March,
     *,
+    pixels: Arrayable | None = None,
     lighting: Lighting | None = None,
     outputs: Literal["rgba"],
     adjoint: Adjoint = "replay",
@@ -139,6 +150,7 @@ def render_rays(
     directions: Arrayable,
     march: March,
     *,
+    pixels: Arrayable | None = None,
     lighting: Lighting | None = None,
     outputs: Any = "all",
     adjoint: Adjoint = "replay",
@@ -147,9 +159,12 @@ def render_rays(
 
     - `origins`, `directions`: (*rays, 3) world points, and directions of any length but 0. Distances
       are measured in world length whatever the length of a direction.
+    - `pixels`: (*rays, 2) integers, (column, row), by which all that is random along a ray is keyed. By
+      default (place, 0), with the ray's place in the flattened array. Inside `jax.shard_map` over the first
+      axis of the rays that is the place in the whole array; under `check_vma=False`, where JAX does not tell
+      a shard that it is one, give pixels, or each shard draws the same numbers.
 
-    **Returns:** as `render`, with leading shape `*rays`. What is random along a ray is keyed by its
-    place in the flattened array, as pixel (place, 0).
+    **Returns:** as `render`, with leading shape `*rays`.
 
     **Raises:** as `render`, and `ValueError` for shapes that differ or do not end in 3, NaN or
     infinity, and directions of length 0.
@@ -163,7 +178,8 @@ def render_rays(
     directions = require(directions, lambda d: (d != 0).any(axis=-1), message)
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     how, lighting = _How.of(outputs, adjoint, volume, march), _prepared(lighting, volume, transfer, march)
-    source = OwnRays(origins, directions)
+    count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
+    source = OwnRays(origins, directions, _pixels(pixels, origins), shard_number(origins, directions) * count)
     return _render((volume, transfer, source, march, lighting), how, Known.of(volume, march))
 
 
@@ -188,9 +204,13 @@ class _How(eqx.Module):
 
 
 def _render(scene: Scene, how: _How, known: Known) -> Any:
+    scene, known = varying((scene, known))
     if isinstance(scene[-1], Deferred):
         return _deferred(scene, how, known)
-    return _replayed(scene, how, known) if how.adjoint == "replay" else _image(scene, how, known)
+    if how.adjoint == "replay":
+        return _replayed(scene, how, known)
+    picture = _image(scene, how, known)
+    return forward_only(picture, WRONG_WAY["forward"]) if how.adjoint == "forward" else picture
 
 
 def _deferred(scene: Scene, how: _How, known: Known) -> Picture:
@@ -228,6 +248,8 @@ def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
     def _(left: Any, gradient: Picture, perturbed: Any, scene: Scene, known: Known) -> Any:
         return _pulled(scene, perturbed, known, left, gradient)
 
+    if any("JVPTracer" in transformations(leaf) for leaf in jax.tree.leaves(scene)):
+        raise ValueError(WRONG_WAY["replay"])  # JAX's own error names neither argument nor remedy
     return image(scene, jax.lax.stop_gradient(known))
 
 
@@ -246,7 +268,9 @@ def _marched(scene: Scene, how: _How, known: Known, *, watch: bool = False) -> t
         if direct:
             one = each_ray(lambda ray, at: step(march, ray, volume, seen, at))
             start = each_ray(lambda ray: begin(march, ray, how.outputs))(rays)
-            at, _ = jax.lax.scan(lambda at, _: (one(rays, at), None), start, None, length=how.length)
+            at, _ = jax.lax.scan(
+                lambda at, _: (one(rays, at), None), varying(start, rays), None, length=how.length
+            )
         else:
             beams = Beams(rays, waves.beams, waves.box(source, rays, number))
             watcher = Watch(rays.length.shape) if watch and survey is not None else None
@@ -276,7 +300,7 @@ def _pull(
     return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
 
 
-# One image is one program, or two with its gradient; that they are whole programs is what `compiled` is about.
+# An image is one program, and its gradient another.
 
 _image = compiled(_only_marched, has_jvp=True)
 _image_in_turn = compiled(_only_marched)
@@ -293,6 +317,15 @@ def _prepared(lighting: Any, volume: Volume, transfer: Transfer, march: March) -
         message = "lighting must be None or a Lighting, such as ScattererTemplates"
         raise ValueError(f"{message}; got {lighting!r}.")
     return lighting.prepared(volume, transfer, march)
+
+
+def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:
+    if pixels is None:
+        return None
+    pixels, shape = jnp.asarray(pixels), (*origins.shape[:-1], 2)
+    if pixels.shape != shape or not jnp.issubdtype(pixels.dtype, jnp.integer):
+        raise ValueError(f"pixels must be integers of shape {shape}; got {pixels.dtype} of {pixels.shape}.")
+    return pixels.astype(jnp.int32)
 
 
 def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from .kept import kept
+from .sharding import varying
 from .triple import Triple
 from .volume import Volume
 
@@ -71,7 +72,7 @@ class Sums(eqx.Module):
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
         for _ in range(3):
             # Sum along the first axis, and put it last. XLA's own cumulative sums are slow windows on CPU.
-            _, sums = jax.lax.scan(_add, jnp.zeros_like(table[0]), table)
+            _, sums = jax.lax.scan(_add, varying(jnp.zeros_like(table[0]), table), table)
             table = jnp.moveaxis(sums, 0, 2)
         nx, ny, nz = occupied.shape
         return cls(table.reshape(-1), (nx, ny, nz))
@@ -129,7 +130,7 @@ class Occupancy(eqx.Module):
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
-        _, distance, _ = jax.lax.while_loop(go_on, grow, start)
+        _, distance, _ = jax.lax.while_loop(go_on, grow, varying(start))
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Triple) -> Triple:

@@ -24,6 +24,7 @@ from .lighting.seam import Lighting, Sample, classification
 from .locate import Ray, enter, invalid
 from .march import Cell, March
 from .rendering import DepthPicture, Found, Picture, Rendering
+from .sharding import varying
 from .taps import without_voxels
 from .transfer import Classification, Measured, Transfer
 from .triple import Scalar, Triple, along, apart
@@ -231,7 +232,7 @@ def render_ray_reference(
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(march, ray, volume, seen, at), None
 
-    at, _ = jax.lax.scan(one, begin(march, ray), None, length=samples_across(volume, march))
+    at, _ = jax.lax.scan(one, varying(begin(march, ray), ray), None, length=samples_across(volume, march))
     rendering = end(ray, at)
     assert isinstance(rendering, Rendering)
     if isinstance(lighting, Deferred):

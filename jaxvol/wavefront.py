@@ -35,6 +35,7 @@ from .march import Cell, March, Survey
 from .occupancy import Occupancy
 from .reference import Progress, begin, blend, counts, front, measure, move, opacity, pieces
 from .rendering import Found
+from .sharding import varying
 from .transfer import Classification, Measured
 from .triple import Scalar
 from .visible import lit_colors
@@ -170,6 +171,7 @@ def march_beams(
         some, here, span, given, mine = jax.tree.map(take, (rays, at, beams.span, given, kept))
         here = _with(here, finished=here.finished | jnp.repeat(rows >= groups, GROUP))
         more = jax.tree.map(lambda leaf: jnp.zeros((size * GROUP, *leaf.shape[2:]), leaf.dtype), sums)
+        more = varying(more, some)
 
         def going(here: Progress) -> Bool[Array, " batch"]:
             # XLA finds the largest of several floats at once, but looks at one truth after the other
@@ -211,7 +213,7 @@ def march_beams(
         return jax.lax.while_loop(lambda state: jnp.any(state[1]), round_, (state, going))[0]
 
     along = (None, None, None) if follower is None else (follower.kept, follower.sums, follower.total)
-    state: _State = at, along
+    state: _State = varying((at, along), rays)
     if march.moves or capped:
         state = march_all(state, whole=False)
     if not capped:

@@ -37,10 +37,22 @@ Lanes = Int[Array, "groups rays"]
 
 
 class OwnRays(eqx.Module):
-    """Rays of one's own: world origins, and unit directions."""
+    """Rays of one's own: world origins, and unit directions.
+
+    What is random along a ray is keyed by its pixel, (column, row), which without `pixels` is
+    (`first` + place in the flattened array, 0)."""
 
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
+    pixels: Int[Array, "*rays 2"] | None = None
+    first: Int[Array, ""] | int = 0
+
+    def pixel(self, place: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
+        """The pixels of the rays at these places."""
+        if self.pixels is None:
+            return self.first + place, jnp.zeros_like(place)
+        flat = self.pixels.reshape(-1, 2)
+        return flat[place, 0], flat[place, 1]
 
 
 class Waves(eqx.Module):
@@ -134,12 +146,12 @@ class _OfRays(Waves):
     def rays(self, source: OwnRays, space: Space, wave: Int[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
-            source = jax.tree.map(lambda leaf: jnp.ones((1, 3), leaf.dtype), source)
+            source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
         place = wave * self.beams * BEAM**2 + jnp.arange(self.beams * BEAM**2).reshape(-1, GROUP)
         known = jnp.minimum(place, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
-        return entering(space, (x, y, z), (dx, dy, dz), (place, jnp.zeros_like(place)), place < count)
+        return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), place < count)
 
     def box(self, source: OwnRays, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beams, -1), rays)
@@ -162,7 +174,7 @@ def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
         width = source.size[0]
         return _of_pixel(source, place % width, place // width)
     (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[place] for rays in (source.origins, source.directions))
-    return Line((x, y, z), (dx, dy, dz), (place, jnp.zeros_like(place)))
+    return Line((x, y, z), (dx, dy, dz), source.pixel(place))
 
 
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
