@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float, Int, Num
 
 from .checks import Arrayable, finite_array, number, require
 from .triple import Triple, along, apart
@@ -160,6 +160,12 @@ class Camera(eqx.Module):
         over_row = jax.vmap(self.ray, in_axes=(0, None))
         origin, direction = jax.vmap(over_row, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
         return jnp.stack(origin, axis=-1), jnp.stack(direction, axis=-1)
+
+    @property
+    def first_pixel(self) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """Column and row by which the first pixel is keyed: `corner` as whole numbers."""
+        left, top = jnp.round(self.corner).astype(jnp.int32)
+        return left, top
 
     def _showing(
         self, window: Float[Array, "4"], size: tuple[int, int], corner: Float[Array, "2"] | None = None

@@ -47,7 +47,8 @@ def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> 
     if is_traced(value, *others):
         if any(map(varies_over, jax.tree.leaves((value, others)))):
             return jax.tree.map(lambda leaf: jnp.where(jnp.all(holds(value, *others)), leaf, jnp.nan), value)
-        message = message.format(got="a value known only when the program runs")
+        # apart from what Equinox says around it, which under a plain `jax.jit` is long
+        message = f"\n\n{message.format(got='a value known only when the program runs')}\n"
         return eqx.error_if(value, ~jnp.all(holds(value, *others)), message)
     # by NumPy, which compiles nothing
     if not np.all(holds(*(np.asarray(given) for given in (value, *others)))):

@@ -81,7 +81,7 @@ class SpaceLeaping(Transform):
         occupancy = jax.lax.stop_gradient(occupancy)
         if self.method == "hierarchy":
             return _Beams(occupancy, occupancy.sums())
-        distances = _Distances(occupancy, occupancy.distance(), None, self.cell)
+        distances = _Distances(occupancy, occupancy.distance(), None, None, self.cell)
         if self.method == "distance":
             return distances
         if view is None:
@@ -91,7 +91,7 @@ class SpaceLeaping(Transform):
             )
         published = self.method == "min_distance"
         starts = self._published(distances, view) if published else self._proven(occupancy, view)
-        return replace(distances, starts=jax.lax.stop_gradient(starts))
+        return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
     def _corners(self, view: View) -> tuple[Int[Array, "cols"], Int[Array, "rows"]]:
         width, height = view.size
@@ -166,6 +166,8 @@ class _Distances(Survey):
     distance: UInt8[Array, " cells"]
     starts: Float[Array, "rows cols"] | None
     """Distance from the origin before which nothing is to be seen, for each cell of pixels."""
+    corner: tuple[Int[Array, ""], Int[Array, ""]] | None
+    """Pixel in the corner of the first cell."""
     cell: int = eqx.field(static=True)
 
     def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
@@ -180,9 +182,13 @@ class _Distances(Survey):
         start = self.occupancy.cell(rays.entry)
         rate = [r / size for r, size in zip(rays.direction, self.occupancy.size, strict=True)]
         if self.starts is not None:
-            column, row = rays.pixel
-            rows, columns = self.starts.shape
-            x, y = jnp.minimum(column // self.cell, columns - 1), jnp.minimum(row // self.cell, rows - 1)
+            assert self.corner is not None
+            last = (n - 1 for n in reversed(self.starts.shape))
+            # those that only fill up groups lie past the image
+            x, y = (
+                jnp.minimum((pixel - first) // self.cell, n)
+                for pixel, first, n in zip(rays.pixel, self.corner, last, strict=True)
+            )
             depth = jnp.maximum(depth, self.starts[y, x] - rays.t_in)
         for _ in range(LEAPS):
             depth = self._leap(start, rate, rays.length, depth)

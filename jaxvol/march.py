@@ -46,12 +46,14 @@ class View(NamedTuple):
 
     - `ray`: origin and unit direction of the ray through a column and a row.
     - `size`: (width, height).
+    - `corner`: pixel (column, row) by which the ray through column 0 and row 0 is keyed; others follow.
     - `first_hit`: distances along the rays of columns and rows to the first sample that is seen, infinite
       where there is none; found with the help of what is known already.
     """
 
     ray: Callable[[Scalar, Scalar], tuple[Triple, Triple]]
     size: tuple[int, int]
+    corner: tuple[Int[Array, ""], Int[Array, ""]]
     first_hit: Callable[["Survey", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
 
 

@@ -67,4 +67,4 @@ def survey_of(scene: Scene, known: Known) -> Survey | None:
         assert isinstance(seen, Rendering)
         return waves.assemble(seen.depth[None]).reshape(columns.shape)
 
-    return march.survey(occupancy, View(source.ray, source.size, first_hit))
+    return march.survey(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))
