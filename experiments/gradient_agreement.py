@@ -1,0 +1,208 @@
+"""Is the gradient of the second march that of forward mode, on real volumes, under every way of leaping?
+
+For each scene, method of `SpaceLeaping` and leaf: the gradient g by `adjoint="replay"`, and the slopes of
+the same loss along directions d by `adjoint="forward"`, another program with another rule of
+differentiation. Told is the greatest |g·d - slope| / |g| over unit directions d: all axes of a leaf of at
+most 4 numbers; for larger ones the direction of g itself, and random ones. Beside it stands how far g is from
+that without leaps; what leaping leaves out by its nature, extinctions of 0, does not count there, and
+neither does "min_distance", which is another image.
+
+The loss is a random linear function of all pixels' colour and opacity, smooth over the image; everything is
+at its default and in float32, with early termination, both proposed methods of Kye 2013, and volumes in the
+types of their files. Float voxels are a leaf of a second scene, the same volume in float32.
+
+Real volumes are read from the folder that JAXVOL_DATA names; without one, the phantom is measured alone.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+import jaxvol as jv
+
+from . import common, marches, record
+from .common import plt
+from .scenes import PHANTOM, SCENES, Scene
+
+
+METHODS = ("none", "hierarchy", "distance", "beam", "min_distance")
+GOAL = 1e-4
+FEW = 4
+"""Up to so many numbers of a leaf, the slope along each is asked for."""
+
+LEAVES: dict[str, Callable[[Any], Any]] = {
+    "colors": lambda s: s.transfer.colors,
+    "extinction": lambda s: s.transfer.extinction,
+    "position": lambda s: s.camera.position,
+    "focal point": lambda s: s.camera.focal_point,
+    "view up": lambda s: s.camera.view_up,
+    "view angle": lambda s: s.camera.view_angle,
+    "window": lambda s: s.camera.window,
+    "spacing": lambda s: s.volume.spacing,
+    "origin": lambda s: s.volume.origin,
+    "step": lambda s: s.march.step,
+}
+VOXELS = {"voxels": lambda s: s.volume.data}
+
+
+class Marched(eqx.Module):
+    """What is rendered: a scene and its march."""
+
+    volume: jv.Volume
+    transfer: jv.TransferFunction
+    camera: jv.Camera
+    march: jv.March
+
+
+def small(name: str) -> Callable[[Path, int], Scene]:
+    """One of the smaller volumes of the Open SciVis collection, seen whole, all but its darkest tenth."""
+
+    def scene(folder: Path, size: int) -> Scene:
+        volume = jv.load(next(folder.glob(f"{name}_*")))
+        camera = jv.Camera.looking_at(volume, (0.5, -1, 0.4), (0, 0, 1), size=(size, size)).zoom(1.3)
+        points = [(25, (0.1, 0.2, 0.5), 0.0), (90, (0.7, 0.8, 0.3), 0.02), (255, (1.0, 0.9, 0.8), 0.4)]
+        return Scene(volume, jv.TransferFunction.from_points(points), camera, 1.0)
+
+    return scene
+
+
+ALL = {**SCENES, **{name: small(name) for name in ("nucleon", "fuel", "tooth")}}
+
+
+def marched(scene: Scene, method: str, seed: int) -> Marched:
+    leaps = () if method == "none" else (jv.SpaceLeaping(method),)
+    transforms = (*marches.transforms(marches.BOTH, seed), *leaps, jv.EarlyTermination(1 / 255))
+    return Marched(scene.volume, scene.transfer, scene.camera, jv.March(scene.step, transforms))
+
+
+def loss_of(adjoint: str, size: int, seed: int) -> Callable[[Marched], Any]:
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=(size, size, 4)), (3, 3, 0))
+    weights = jnp.asarray(noise, jnp.float32)
+
+    def loss(scene: Marched) -> Any:
+        picture = jv.render(
+            scene.volume, scene.transfer, scene.camera, scene.march, outputs="rgba", adjoint=adjoint
+        )
+        return jnp.vdot(picture.rgba, weights)
+
+    return loss
+
+
+def directions(gradient: np.ndarray, seed: int) -> list[np.ndarray]:
+    """Unit directions of a leaf with this gradient."""
+    if gradient.size <= FEW:
+        return list(np.eye(gradient.size, dtype=np.float32).reshape(-1, *gradient.shape))
+    random = np.random.default_rng(seed).normal(size=(2, *gradient.shape)) * (gradient != 0)
+    found = [gradient, *random]
+    return [(each / np.linalg.norm(each)).astype(np.float32) for each in found if np.any(each)]
+
+
+def of_scene(
+    scene: Scene, method: str, leaves: dict[str, Callable[[Any], Any]], size: int, seed: int
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """For each leaf, how far replay is from forward mode; and replay's gradients."""
+    whole = marched(scene, method, seed)
+    wanted = jax.tree.map(lambda _: False, whole)
+    wanted = eqx.tree_at(lambda s: [where(s) for where in leaves.values()], wanted, [True] * len(leaves))
+    moving, fixed = eqx.partition(whole, wanted)
+    replay, forward = loss_of("replay", size, seed), loss_of("forward", size, seed)
+    gradient = jax.grad(lambda moving: replay(eqx.combine(moving, fixed)))(moving)
+
+    @jax.jit
+    def slope(moving: Any, along: Any) -> Any:
+        return jax.jvp(lambda moving: forward(eqx.combine(moving, fixed)), (moving,), (along,))[1]
+
+    still = jax.tree.map(jnp.zeros_like, moving)
+    errors, gradients = {}, {}
+    for name, where in leaves.items():
+        gradients[name] = g = np.asarray(where(gradient), np.float64)
+        norm, worst = np.linalg.norm(g), 0.0
+        for d in directions(g, seed):
+            along = eqx.tree_at(where, still, jnp.asarray(d))
+            worst = max(worst, abs(float(slope(moving, along)) - float(np.vdot(g, d))))
+        errors[name] = worst / norm if norm > 0 else worst
+    return errors, gradients
+
+
+def measure(scene: Scene, methods: Sequence[str], size: int, seed: int) -> dict[str, Any]:
+    """Every leaf under every method: the volume as it is, then its voxels as floats."""
+    volume = scene.volume
+    floating = jv.Volume(volume.data.astype(jnp.float32), volume.spacing, volume.origin)
+    kinds = ((scene, LEAVES), (scene._replace(volume=floating), VOXELS))
+    visible = np.asarray(scene.transfer.extinction) > 0
+    rows: dict[str, Any] = {}
+    plain: dict[str, np.ndarray] = {}
+    for method in methods:
+        row: dict[str, Any] = {"from forward": {}, "from no leaps": {}}
+        for kind, leaves in kinds:
+            errors, gradients = of_scene(kind, method, leaves, size, seed)
+            row["from forward"].update(errors)
+            if method == "none":
+                plain.update(gradients)
+            elif plain and method != "min_distance":
+                for name, g in gradients.items():
+                    apart = np.linalg.norm((g - plain[name])[visible if name == "extinction" else ...])
+                    row["from no leaps"][name] = float(apart / max(np.linalg.norm(plain[name]), 1e-30))
+            jax.clear_caches()
+        rows[method] = row
+    return rows
+
+
+def draw(scenes: dict[str, Any], path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(7, 0.5 * len(scenes) + 1.8), layout="constrained")
+    for number, rows in enumerate(scenes.values()):
+        for shift, (method, row) in enumerate(rows.items()):
+            values, y = list(row["from forward"].values()), number + 0.14 * (shift - 2)
+            label = method if number == 0 else None
+            axes.plot(values, [y] * len(values), "o", color=f"C{shift}", markersize=3, label=label)
+    axes.axvline(GOAL, color="k", linestyle=":", linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(scenes)), list(scenes))
+    axes.invert_yaxis()
+    axes.set_xlabel("|g·d - slope| / |g|, a point for each leaf; dotted: the goal", fontsize=9)
+    figure.legend(loc="outside upper center", ncols=5, fontsize=8)
+    common.save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = common.options(__doc__, repetitions=1)
+    parser.add_argument("--size", type=int, default=256, help="pixels along a side")
+    parser.add_argument("--only", nargs="+", choices=ALL, default=list(ALL), metavar="VOLUME")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="METHOD")
+    given = record.arguments(argv)
+    chosen = parser.parse_args(given)
+    folder, names, more = common.data(), chosen.only, {}
+    if folder is None or chosen.quick:
+        names = [PHANTOM]
+    if chosen.quick:
+        chosen.size, chosen.methods, more = 24, ["none", "hierarchy"], {"resolution": 24}
+
+    scenes: dict[str, Any] = {}
+    for name in names:
+        scene = ALL[name](folder, chosen.size, **more)
+        scenes[name] = measure(scene, chosen.methods, chosen.size, chosen.seed)
+        for method, row in scenes[name].items():
+            leaf, worst = max(row["from forward"].items(), key=lambda item: item[1])
+            apart = max(row["from no leaps"].values(), default=float("nan"))
+            print(
+                f"{name:16} {method:13} from forward at most {worst:.1e} ({leaf}), from no leaps {apart:.1e}",
+                flush=True,
+            )
+        path = record.write(
+            chosen.output / "gradient_agreement.json",
+            "Is replay's gradient that of forward mode, and that without leaps?",
+            {"size": chosen.size, "goal": GOAL, "scenes": scenes},
+            seed=chosen.seed,
+            command=["experiments.gradient_agreement", *given],
+        )
+        draw(scenes, path.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()
