@@ -192,7 +192,7 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
     cmap = jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, cmap)
     try:
         given = colors.to_rgba_array(cmap)[:, :3]
-        if len(given) == 0:
+        if len(given) == 0 or given.min() < 0 or given.max() > 1:
             raise ValueError
     except (ValueError, TypeError) as fault:
         near = get_close_matches(cmap.lower(), list(colormaps), 3) if isinstance(cmap, str) else []

@@ -135,8 +135,8 @@ class TransferFunction(Transfer):
     @classmethod
     def from_points(
         cls,
-        points: Sequence[tuple[float, tuple[float, float, float], float]],
-        unit_distance: float = 1.0,
+        points: Sequence[tuple[float, Sequence[float], float]] | Any,
+        unit_distance: Arrayable = 1.0,
     ) -> "TransferFunction":
         """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
 

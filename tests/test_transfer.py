@@ -37,6 +37,16 @@ def test_opacity_of_a_unit_distance_converts_exactly():
     np.testing.assert_allclose(transfer.opacity(1.25), 1 - np.sqrt(1 - np.array(opacities)), atol=1e-7)
 
 
+def test_numbers_of_any_library_are_taken():
+    plain = jv.TransferFunction.from_points([(0, (1, 0, 0), 0), (2, (0, 0, 1), 0.5)], 2)
+    mixed = jv.TransferFunction.from_points(
+        [(np.int16(0), [1, 0, 0], jnp.zeros(())), (jnp.float32(2), np.array([0, 0, 1]), np.float64(0.5))],
+        jnp.asarray(2.0),
+    )
+    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(mixed), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_opacity_one_is_the_largest_float_below():
     transfer = jv.TransferFunction.from_points([(0, (1, 1, 1), 0.0), (1, (1, 1, 1), 1.0)])
     assert np.isfinite(transfer.extinction).all()
@@ -170,7 +180,7 @@ def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
     step = jv.TransferFunction.from_points(
         [(0, (0, 0, 0), 0), (60, (0.1, 0.2, 0.9), 0), (60, (0.9, 0.5, 0.1), 0.3), (255, (1, 1, 1), 0.6)]
     )
-    camera = jv.Camera.looking_at(volume, (1, 0.3, 0.2), size=(24, 24))
+    camera = jv.Camera.looking_at(volume, (1, 0.3, 0.2), size=(24, 24)).zoom(1.6)
     leaping, plain = jv.March(0.5, (jv.SpaceLeaping(),)), jv.March(0.5)
 
     def image(transfer, march, adjoint="replay"):
