@@ -124,8 +124,8 @@ class ImageResidual(Residual):
 
     A Jacobian that is too large is made in tiles of whole rows of an image.
 
-    **Raises:** `ValueError` for no views, an image of another size than its camera's, NaN or infinite
-    pixels, and a scene that returns something else.
+    **Raises:** `ValueError` for no views, an image of another size than its camera's or of integers, NaN or
+    infinite pixels, and a scene that returns something else.
     """
 
     scene: Scene
@@ -233,7 +233,13 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
             f"views[{number}] must be a pair (camera, image); got {type(camera).__name__} first."
         )
     width, height = camera.size
-    image = np.asarray(image, np.float32)
+    image = np.asarray(image)
+    if image.dtype.kind not in "fV":  # V: JAX's own short floats
+        raise ValueError(
+            f"views[{number}]: the image must be linear RGB, floats in [0, 1]; got {image.dtype}. Pixels of "
+            "a picture file become that by jv.read_views, or by jv.from_srgb(image / 255)."
+        )
+    image = image.astype(np.float32)
     if image.shape not in ((height, width, 3), (height, width, 4)):
         raise ValueError(
             f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, "
