@@ -30,7 +30,7 @@ WANTED: dict[str, tuple[tuple[type, ...], str, str]] = {
     "march": ((March,), "a jaxvol March", "Pass jv.March(step) or jv.March(step, transforms)."),
     "lighting": (
         (Lighting, NoneType),
-        "None or a Lighting",
+        "None or a Lighting, such as ScattererTemplates",
         "Pass lights as jv.lighting.ScattererTemplates(materials, lights).",
     ),
 }
