@@ -147,6 +147,8 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
     try:
         if path.is_dir():
             raise IsADirectoryError("it is a folder")
+        if path.parent.exists() and not path.parent.is_dir():
+            raise NotADirectoryError(f"{path.parent} is no folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass

@@ -100,8 +100,8 @@ def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
 def _save_tiff(path: Path, image: Float[np.ndarray, "..."]) -> None:
     from tifffile import imwrite
 
-    extra = {"extrasamples": ["assocalpha"]} if image.shape[2:] == (4,) else {}
-    imwrite(path, image, photometric="rgb" if image.ndim == 3 else "minisblack", **extra)
+    extra = ["assocalpha"] if image.shape[2:] == (4,) else None
+    imwrite(path, image, photometric="rgb" if image.ndim == 3 else "minisblack", extrasamples=extra)
 
 
 def _save_display(path: Path, image: Float[np.ndarray, "height width channels"]) -> None:

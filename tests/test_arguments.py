@@ -10,7 +10,7 @@ from jaxvol.lighting import ConstantLight
 
 
 VOLUME = jv.phantom("sphere", 8)
-TRANSFER = jv.colormap("gray", (0, 255), unit_distance=0.1)
+TRANSFER = jv.colormap("gray", (0, 255), unit_distance=0.01)
 CAMERA = jv.Camera.looking_at(VOLUME, size=(4, 4))
 MARCH = jv.March(0.1)
 LIGHT = ConstantLight()

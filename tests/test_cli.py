@@ -128,9 +128,11 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
 
 
 STARTED = """
+import signal
 import sys
 import jaxvol.cli
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, whoever runs the tests
 render = jaxvol.cli.render
 def told(*scene):
     print("under way", flush=True)

@@ -289,7 +289,7 @@ BAD = {
     ),
     "checkpoint": (
         lambda: jv.fit(unreachable, BEGIN, checkpoint="/dev/null/a"),
-        r"checkpoint: /dev/null/a cannot be written \(Not a directory\)",
+        r"checkpoint: /dev/null/a cannot be written \(/dev/null is no folder\)",
     ),
     "checkpoint a folder": (
         lambda: jv.fit(unreachable, BEGIN, checkpoint=Path(__file__).parent),
