@@ -44,7 +44,6 @@ examples:
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
 
-
 INTERRUPTED = 130
 """The exit code after Ctrl-C, as shells have it."""
 
@@ -97,8 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    version = f"%(prog)s {metadata.version('jaxvol')} (jax {jax.__version__})"
-    parser.add_argument("--version", action="version", version=version)
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument(
         "--programs",
@@ -252,6 +250,15 @@ def _scene_options() -> argparse.ArgumentParser:
         "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
     )
     return scene
+
+
+def _version() -> str:
+    """Of jaxvol, as installed, and of JAX."""
+    try:
+        own = metadata.version("jaxvol")
+    except metadata.PackageNotFoundError:  # run from a checkout
+        own = "(not installed)"
+    return f"{own} (jax {jax.__version__})"
 
 
 def _programs() -> Path:

@@ -1,6 +1,5 @@
 """Which looks have names? Transfer functions for kinds of data, and any matplotlib colormap."""
 
-from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -127,7 +126,9 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
 }
 
 
-def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float = 1.0) -> TransferFunction:
+def preset(
+    name: str | Any, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0
+) -> TransferFunction:
     """A transfer function by name.
 
     **Arguments:**
@@ -140,7 +141,7 @@ def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float 
 
     **Raises:** `ValueError` for a name that is not there, and a `clim` that does not increase.
     """
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
     _, (own_low, own_high), points = PRESETS[name]
     low, high = _range((own_low, own_high) if clim is None else clim)
@@ -151,10 +152,10 @@ def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float 
 
 def colormap(
     cmap: str | Any,
-    clim: Sequence[float],
+    clim: Arrayable,
     opacity: str | Arrayable = "linear",
-    unit_distance: float = 1.0,
-    n_colors: int = 256,
+    unit_distance: Arrayable = 1.0,
+    n_colors: int | Any = 256,
 ) -> TransferFunction:
     """A transfer function from a matplotlib colormap and an opacity ramp, as PyVista's `add_volume`.
 

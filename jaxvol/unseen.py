@@ -26,7 +26,7 @@ def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, picture: Pict
     Nothing shows where no pixel's opacity reaches 1/510, half a level of a picture of 8 bits. Values are
     looked up at some 4096 rays, 128 points each, on the volume's own grid.
     """
-    most = float(jnp.max(picture.rgba[..., 3]))
+    most = float(np.asarray(picture.rgba)[..., 3].max())
     if most >= LEAST:
         return None
     hit, values = (np.asarray(part) for part in _values_along(volume, camera))

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -166,6 +167,29 @@ def test_ctrl_c_ends_a_command_at_once_with_one_line(volume_file, tmp_path):
     assert run.returncode == 130
     assert told == "\njaxvol render: interrupted\n"
     assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.slow
+def test_a_fit_that_is_interrupted_goes_on_from_its_checkpoint(volume_file, seen, tmp_path):
+    kept, cameras = tmp_path / "fit.npz", str(tmp_path / "cameras.json")
+    words = ["fit", str(volume_file), "--images", *seen, "--cameras", cameras, "--checkpoint", str(kept)]
+    command = [sys.executable, "-c", STARTED, *words, "-o", str(tmp_path / "t.json")]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not kept.exists() and run.poll() is None:
+        time.sleep(0.1)
+    run.send_signal(signal.SIGINT)
+    begun = time.monotonic()
+    told = run.communicate(timeout=60)[1]
+    assert time.monotonic() - begun < 2
+    assert run.returncode == 130
+    assert told.splitlines()[-1] == f"jaxvol fit: interrupted; the same command goes on from {kept}"
+    assert not (tmp_path / "t.json").exists()
+    with np.load(kept) as file:
+        steps = len(file["losses"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what the pictures do not determine
+        assert main([*words, "--max-steps", str(steps), "-o", str(tmp_path / "t.json")]) == 0
+    assert jv.read_transfer(tmp_path / "t.json").values.shape == (8,)
 
 
 def test_version_is_told(capsys):

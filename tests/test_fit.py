@@ -309,6 +309,10 @@ BAD = {
     ),
     "solver": (lambda: jv.fit(curve, BEGIN, solver="newton"), "solver must be one of levenberg.*'newton'"),
     "residual": (lambda: jv.fit(VIEWS, GREY), "residual must be an ImageResidual, or a function"),
+    "residual and parameters swapped": (
+        lambda: jv.fit(GREY, RESIDUAL),
+        r"residual must be .*; got a TransferFunction\. The order is fit\(residual, parameters\)",
+    ),
     "start": (
         lambda: jv.fit(curve, {**BEGIN, "top": jnp.asarray(np.nan)}),
         r"parameters\['top'\] must be finite",

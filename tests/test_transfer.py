@@ -274,6 +274,7 @@ BAD = {
         "unit_distance must be greater than 0; got 0",
     ),
     "unknown preset": (lambda: jv.preset("ct-bone"), "preset must be one of ct_bone.*got 'ct-bone'"),
+    "a list for a preset": (lambda: jv.preset(["engine"]), r"preset must be one of .*; got \['engine'\]"),
     "unknown colormap": (
         lambda: jv.colormap("viridi", (0, 1)),
         r"cmap must be a matplotlib colormap .*; got 'viridi'\. Did you mean viridis",

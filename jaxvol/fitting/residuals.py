@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..camera import Camera
-from ..checks import Arrayable, finite, finite_array
+from ..checks import Arrayable, described, finite, finite_array
 from ..engine import Adjoint, render
 from ..lighting.seam import Lighting
 from ..march import March
@@ -69,10 +69,10 @@ class OwnResidual(Residual):
 
     @classmethod
     def of(cls, function: Any, parameters: PyTree) -> "OwnResidual":
-        if not callable(function):
+        if not callable(function) or isinstance(function, Transfer):
             raise ValueError(
                 "residual must be an ImageResidual, or a function from parameters to arrays; "
-                f"got {type(function).__name__}."
+                f"got {described(function)}. The order is fit(residual, parameters)."
             )
         shapes = jax.tree.leaves(eqx.filter_eval_shape(function, parameters))
         count = sum(math.prod(leaf.shape) for leaf in shapes)
