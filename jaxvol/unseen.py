@@ -48,9 +48,15 @@ def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, picture: Pict
         return f"{where}, and the transfer function shows nothing, or another label's."
     if not shown:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
-    told = " or ".join(f"from {a:g} to {b:g}" for a, b in shown)
+    told = " or ".join(_told(*ends) for ends in shown)
     advice = f" A clim from {low:g} to {high:g} would show something." if low < high else ""
     return f"{where}, and the transfer function shows values {told}.{advice}"
+
+
+def _told(low: float, high: float) -> str:
+    if high == np.inf:
+        return f"from {low:g} on" if low > -np.inf else "of any kind"
+    return f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}"
 
 
 def _shown(transfer: Transfer) -> list[tuple[float, float]] | None:

@@ -114,11 +114,14 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
     for words, message in [
         (
             ["--preset", "ct_bone"],
-            r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values from 130 to inf\. A clim from",
+            r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values from 130 on\. A clim from",
         ),
-        (["--camera", "90", "90", "90", "200", "200", "200"], "nothing is seen: no ray of the camera meets"),
         (
-            ["--unit-distance", "1e6"],
+            ["--preset", "ct_bone", "--camera", *["90"] * 3, *["200"] * 3],
+            "nothing is seen: no ray of the camera meets",
+        ),
+        (
+            ["--preset", "ct_bone", "--clim", "20", "90", "--unit-distance", "1e6"],
             r"nothing is seen: the opacity is .* at most\. Give a shorter unit distance",
         ),
         shown,

@@ -21,7 +21,7 @@ from ..checks import integer, output_file
 from . import checkpoints
 from .constraints import Free, Where
 from .damping import LevenbergMarquardt
-from .residuals import OwnResidual, Problem, Residual, tile_entries
+from .residuals import OwnResidual, Problem, Residual, check_residual, tile_entries
 from .uncertainty import Uncertainty, uncertainty
 
 
@@ -138,6 +138,7 @@ def fit(
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
         if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
+    check_residual(residual)
     file = None if checkpoint is None else output_file("checkpoint", checkpoint)
     max_steps, max_jacobian = integer("max_steps", max_steps, 1), integer("max_jacobian", max_jacobian, 1)
     solver, patient = _solver(solver, rtol, atol)

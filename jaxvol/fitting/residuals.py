@@ -61,6 +61,15 @@ class Residual(eqx.Module):
         return 0.0
 
 
+def check_residual(residual: Any) -> None:
+    """Refuse what is no residual: a transfer function is a function, too."""
+    if isinstance(residual, Transfer) or not (callable(residual) or isinstance(residual, Residual)):
+        raise ValueError(
+            "residual must be an ImageResidual, or a function from parameters to arrays; "
+            f"got {described(residual)}. The order is fit(residual, parameters)."
+        )
+
+
 class OwnResidual(Residual):
     """A function from parameters to arrays, in one piece."""
 
@@ -69,11 +78,6 @@ class OwnResidual(Residual):
 
     @classmethod
     def of(cls, function: Any, parameters: PyTree) -> "OwnResidual":
-        if not callable(function) or isinstance(function, Transfer):
-            raise ValueError(
-                "residual must be an ImageResidual, or a function from parameters to arrays; "
-                f"got {described(function)}. The order is fit(residual, parameters)."
-            )
         shapes = jax.tree.leaves(eqx.filter_eval_shape(function, parameters))
         count = sum(math.prod(leaf.shape) for leaf in shapes)
         if count == 0:
