@@ -8,7 +8,12 @@ back into a `Rendering`.
 from . import lighting as lighting, metrics as metrics
 from .alignment import AlphaCorrection as AlphaCorrection
 from .camera import Camera as Camera
-from .display import from_srgb as from_srgb, save_png as save_png, to_srgb as to_srgb
+from .display import (
+    from_srgb as from_srgb,
+    save_image as save_image,
+    save_png as save_png,
+    to_srgb as to_srgb,
+)
 from .engine import render as render, render_rays as render_rays
 from .fitting import (
     Fit as Fit,

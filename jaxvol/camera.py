@@ -12,9 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from .checks import Arrayable, finite_array, number, require
+from .checks import Arrayable, described, finite_array, integer, number, require
 from .triple import Triple, along, apart
 from .volume import Volume
+
+
+ALONG = 1e-3
+"""Sine of the angle between two directions up to which `looking_at` takes them for one."""
 
 
 class Camera(eqx.Module):
@@ -93,30 +97,53 @@ class Camera(eqx.Module):
     @classmethod
     def looking_at(
         cls,
-        volume: Volume,
+        volume: Volume | Any,
         direction: Arrayable = (0.5, -1.0, 0.4),
         view_up: Arrayable = (0.0, 0.0, 1.0),
         view_angle: Arrayable = 30.0,
         *,
+        parallel: bool = False,
         size: tuple[int, int] | Any = (512, 512),
     ) -> "Camera":
-        """A perspective camera that sees the whole volume from the side that `direction` points to.
+        """A camera that sees the whole volume from the side that `direction` points to.
 
         As VTK's `ResetCamera`: the sphere around the volume's bounds just fits into the view.
+
+        **Arguments:**
+
+        - `direction`: from the middle of the volume to the camera, of any length.
+        - `view_up`: as in `Camera`; where it lies within 0.06° of the direction, y points up in its place, or
+          -z where that does, too: seen from above, x runs to the right.
+        - `view_angle`: degrees; that of an orthographic camera just sets how far away it stands.
+        - `parallel`: whether the camera is orthographic.
+
+        **Raises:** `ValueError` as `Camera` does, for a direction or a `view_up` of 0, and for what is no
+        volume.
         """
+        if not isinstance(volume, Volume):
+            raise ValueError(
+                f"volume must be a jaxvol Volume; got {described(volume)}. "
+                "Pass jv.Volume(data, spacing=...) for an array."
+            )
         direction = finite_array("direction", direction, (3,))
         direction = require(direction, lambda d: (d != 0).any(), "direction must not be zero.")
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
+        view_up = finite_array("view_up", view_up, (3,))
+        view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
         width, height = _image_size(size)
-        position, center = _seeing_all(volume, direction, view_angle, min(1, width / height))
-        return cls(position, center, view_up, view_angle, size=size)
+        position, center, up, scale = _seeing_all(
+            volume, direction, view_up, view_angle, min(1, width / height)
+        )
+        return cls(position, center, up, view_angle, size=size, parallel_scale=scale if parallel else None)
 
-    def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
+    def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """The camera that renders just this rectangle of the image: the same pixels, jitter included, in an
         image of their own. `left` and `top` are the column and row of its first pixel.
 
         **Raises:** `ValueError` for a rectangle that is empty or leaves the image.
         """
+        left, top = integer("left", left, 0), integer("top", top, 0)
+        width, height = integer("width", width, 1), integer("height", height, 1)
         full_width, full_height = self.size
         fits = 0 <= left < left + width <= full_width and 0 <= top < top + height <= full_height
         if not fits:
@@ -203,14 +230,22 @@ class Camera(eqx.Module):
 
 @eqx.filter_jit
 def _seeing_all(
-    volume: Volume, direction: Float[Array, "3"], view_angle: Float[Array, ""], aspect: float
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """From where a view of this angle, times `aspect` across, holds the sphere around a volume, and its
-    middle."""
+    volume: Volume,
+    direction: Float[Array, "3"],
+    view_up: Float[Array, "3"],
+    view_angle: Float[Array, ""],
+    aspect: float,
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
+    """From where a view of this angle, times `aspect` across, holds the sphere around a volume; the volume's
+    middle; what points up; and the scale of an orthographic view that holds the sphere."""
     low, high = volume.corners
+    radius = jnp.linalg.norm(high - low) / 2
     half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
-    away = jnp.linalg.norm(high - low) / 2 / jnp.sin(half)
-    return volume.center + direction / jnp.linalg.norm(direction) * away, volume.center
+    position = volume.center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
+    y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
+    other = jnp.where(_sine(y, direction) > ALONG, y, minus_z)
+    up = jnp.where(_sine(view_up, direction) > ALONG, view_up, other)
+    return position, volume.center, up, radius / aspect
 
 
 @jax.jit

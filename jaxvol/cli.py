@@ -4,8 +4,10 @@ of Python."""
 import argparse
 import os
 import sys
+import threading
 import time
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 
 import jax
@@ -13,7 +15,8 @@ import numpy as np
 
 from .alignment import AlphaCorrection
 from .camera import Camera
-from .display import save_png
+from .checks import output_file
+from .display import image_file, save_image
 from .engine import render
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
@@ -21,9 +24,9 @@ from .leaping import SpaceLeaping
 from .march import March
 from .phantoms import phantom
 from .presets import PRESETS, colormap, preset
-from .rendering import Rendering
 from .termination import EarlyTermination
 from .transfer import TransferFunction
+from .unseen import why_unseen
 from .volume import Volume
 
 
@@ -35,23 +38,55 @@ examples:
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
   jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
+  jaxvol render engine_256x256x128_uint8.raw.gz --transfer transfer.json --transparent --depth depth.npy
 """
 
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
 
+INTERRUPTED = 130
+"""The exit code after Ctrl-C, as shells have it."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0, or 2 for bad input, told in one line."""
+    """Run the command line.
+
+    **Returns:** the exit code: 0, or 2 for bad input, told in one line. Ctrl-C is told in one line, too, and
+    ends the process at once, by `os._exit`, with 130: XLA does not stop compiling or computing for a signal.
+    """
     options = _parser().parse_args(arguments)
     jax.config.update("jax_compilation_cache_dir", str(options.programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     try:
-        options.run(options)
+        _apart(options)
     except (ValueError, OSError, ImportError) as fault:
         print(f"jaxvol {options.command}: error: {' '.join(str(fault).split())}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        kept = getattr(options, "checkpoint", None)
+        left = f"; the same command goes on from {kept}" if kept and kept.exists() else ""
+        print(f"\njaxvol {options.command}: interrupted{left}", file=sys.stderr, flush=True)
+        sys.stdout.flush()
+        os._exit(INTERRUPTED)
     return 0
+
+
+def _apart(options: argparse.Namespace) -> None:
+    """Run a command in a thread of its own, so that the main one, to which Python gives signals, just waits
+    and can take them while XLA is at work."""
+    faults: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            options.run(options)
+        except BaseException as fault:
+            faults.append(fault)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join()
+    if faults:
+        raise faults[0]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -61,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument(
         "--programs",
@@ -83,13 +119,30 @@ def _parser() -> argparse.ArgumentParser:
     one = commands.add_parser(
         "render",
         parents=[shared, scene],
-        help="render a volume file to a PNG",
-        description="Render a volume file to a PNG.",
+        help="render a volume file to a picture",
+        description="Render a volume file to a picture.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument(
-        "-o", "--output", type=Path, default=Path("out.png"), help="picture to write (default: %(default)s)"
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("out.png"),
+        metavar="FILE",
+        help="picture to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); "
+        "default: %(default)s",
+    )
+    one.add_argument(
+        "--transparent",
+        action="store_true",
+        help="write opacity in place of a background: .png (straight alpha), .tif or .npy (premultiplied)",
+    )
+    one.add_argument(
+        "--depth",
+        type=Path,
+        metavar="FILE",
+        help="write the mean distance to what is seen, infinite where nothing is: .npy or .tif, float32",
     )
     one.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
 
@@ -97,14 +150,17 @@ def _parser() -> argparse.ArgumentParser:
     kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
     chosen = look.add_mutually_exclusive_group()
     chosen.add_argument("--preset", metavar="NAME", help=kinds)
-    chosen.add_argument("--cmap", metavar="NAME", help="a matplotlib colormap over --clim (default: gray)")
-    look.add_argument("--opacity", default="linear", metavar="RAMP", help="with --cmap: linear or sigmoid")
+    chosen.add_argument(
+        "--cmap", metavar="NAME", help="a matplotlib colormap, or a colour, over --clim (default: gray)"
+    )
+    chosen.add_argument(
+        "--transfer", type=Path, metavar="JSON", help="a transfer function, as jaxvol fit writes it"
+    )
+    look.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
     look.add_argument(
         "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values to stretch it over"
     )
-    look.add_argument(
-        "--unit-distance", type=float, default=1.0, help="length over which opacities count (default: 1)"
-    )
+    look.add_argument("--unit-distance", type=float, help="length over which opacities count (default: 1)")
 
     view = one.add_argument_group("the camera")
     view.add_argument(
@@ -126,6 +182,7 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument(
         "--view-angle", type=float, default=30, help="degrees between lower and upper edge (default: 30)"
     )
+    view.add_argument("--parallel", action="store_true", help="orthographic; goes with --direction")
     view.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
     one.set_defaults(run=_render)
 
@@ -164,7 +221,9 @@ def _parser() -> argparse.ArgumentParser:
     how = found.add_argument_group("the solver")
     how.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
     how.add_argument("--max-steps", type=int, default=100)
-    how.add_argument("--checkpoint", type=Path, metavar="FILE", help="go on from here after a break")
+    how.add_argument(
+        "--checkpoint", type=Path, metavar="FILE", help="keep every step; go on from here after a break"
+    )
     how.add_argument("--progress", action="store_true", help="show a progress bar")
     found.set_defaults(run=_fit)
     return parser
@@ -193,6 +252,15 @@ def _scene_options() -> argparse.ArgumentParser:
     return scene
 
 
+def _version() -> str:
+    """Of jaxvol, as installed, and of JAX."""
+    try:
+        own = metadata.version("jaxvol")
+    except metadata.PackageNotFoundError:  # run from a checkout
+        own = "(not installed)"
+    return f"{own} (jax {jax.__version__})"
+
+
 def _programs() -> Path:
     """The folder of compiled programs: JAX's own where that is set, else one in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
@@ -202,10 +270,11 @@ def _programs() -> Path:
 
 def _demo(options: argparse.Namespace) -> None:
     size = tuple(options.size)
+    output_file("--output", options.output / "head.png")
     head = phantom("head", options.resolution)
     camera = Camera.looking_at(head, (0.65, -1, 0.15), size=size).zoom(1.45)
     march = March(float(head.spacing[0]) / 2, FAST, "midpoint")
-    _timed(head, preset("head", unit_distance=0.01), camera, march, options.output / "head.png")
+    _picture(head, preset("head", unit_distance=0.01), camera, march, options.output / "head.png")
 
     # A translucent cube at a step far too long: the last cell of each ray reaches past the cube by
     # another part of a step, which shows as terraces, until it is cut at the exit.
@@ -213,25 +282,48 @@ def _demo(options: argparse.Namespace) -> None:
     transfer = TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
     camera = Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=size).zoom(1.3)
     for name, transforms in (("before", ()), ("after", (AlphaCorrection(),))):
-        _timed(cube, transfer, camera, March(0.25, transforms), options.output / f"{name}.png", (0, 0, 0))
+        path = options.output / f"{name}.png"
+        _picture(cube, transfer, camera, March(0.25, transforms), path, background=(0, 0, 0))
 
 
 def _render(options: argparse.Namespace) -> None:
+    image_file("--output", options.output, 4 if options.transparent else 3)
+    if options.depth:
+        image_file("--depth", options.depth, 0)
     volume, march = _scene(options)
-    if options.preset:
-        transfer = preset(options.preset, options.clim, options.unit_distance)
-    else:
-        clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
-        transfer = colormap(options.cmap or "gray", clim, options.opacity, options.unit_distance)
+    transfer = _look(options, volume)
     view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
+    if options.camera and options.parallel:
+        raise ValueError(
+            "--parallel goes with --direction, from which the whole volume is seen; leave out --camera."
+        )
     if options.camera:
         camera = Camera(options.camera[:3], options.camera[3:], **view)
     else:
-        camera = Camera.looking_at(volume, options.direction, **view)
-    _timed(volume, transfer, camera.zoom(options.zoom), march, options.output, options.background)
+        camera = Camera.looking_at(volume, options.direction, parallel=options.parallel, **view)
+    background = None if options.transparent else options.background
+    camera = camera.zoom(options.zoom)
+    _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
+
+
+def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
+    """The transfer function that the options ask for."""
+    if options.transfer:
+        for name in ("clim", "opacity", "unit_distance"):
+            if getattr(options, name) is not None:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} is for presets and colormaps; --transfer says it all itself."
+                )
+        return read_transfer(options.transfer)
+    unit_distance = 1.0 if options.unit_distance is None else options.unit_distance
+    if options.preset:
+        return preset(options.preset, options.clim, unit_distance)
+    clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
+    return colormap(options.cmap or "gray", clim, options.opacity or "linear", unit_distance)
 
 
 def _fit(options: argparse.Namespace) -> None:
+    output_file("--output", options.output)
     volume, march = _scene(options)
     views = read_views(options.images, options.cameras)
     given = options.start
@@ -242,6 +334,7 @@ def _fit(options: argparse.Namespace) -> None:
         solver=options.solver,
         max_steps=options.max_steps,
         checkpoint=options.checkpoint,
+        checkpoint_seconds=0,  # Ctrl-C may come at any time, and what is kept is small
         progress=options.progress,
     )
     path = write_transfer(options.output, found.parameters)
@@ -256,30 +349,31 @@ def _scene(options: argparse.Namespace) -> tuple[Volume, March]:
     return volume, March(step, FAST, "midpoint")
 
 
-def _timed(
+def _picture(
     volume: Volume,
     transfer: TransferFunction,
     camera: Camera,
     march: March,
     output: Path,
-    background: Sequence[float] = (1, 1, 1),
+    *,
+    background: Sequence[float] | None = (1, 1, 1),
+    depth: Path | None = None,
 ) -> None:
-    """Render to a file, and tell where it is and what it took, compilation apart."""
-
-    def image() -> tuple[Rendering, float]:
-        begun = time.perf_counter()
-        rendering = jax.block_until_ready(render(volume, transfer, camera, march))
-        return rendering, time.perf_counter() - begun
-
-    _, first = image()  # compiled with the first image, and not again
-    rendering, again = image()
-    path = save_png(output, rendering.image(background))
+    """Render to files, with opacity where there is no background; tell where they are and what it took."""
+    begun = time.perf_counter()
+    rendering = jax.block_until_ready(render(volume, transfer, camera, march))
+    took = time.perf_counter() - begun
+    path = save_image(output, rendering.rgba if background is None else rendering.image(background))
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     print(
         f"{path}: {' x '.join(map(str, camera.size))} pixels of {' x '.join(map(str, volume.shape))} voxels, "
-        f"{millions:.1f} million samples in {again:.2f} s "
-        f"({first:.2f} s with compilation), on {device.device_kind} ({device.platform})"
+        f"{millions:.1f} million samples in {took:.2f} s with compilation, "
+        f"on {device.device_kind} ({device.platform})"
     )
+    if depth:
+        print(f"{save_image(depth, rendering.depth)}: distances, world length")
     if np.any(rendering.exhausted):
         print(f"{path}: incomplete: rays ran out of their {march.most_samples} samples; take a longer step")
+    if (why := why_unseen(volume, transfer, camera, rendering)) is not None:
+        print(f"{path}: nothing is seen: {why}")

@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .arguments import check_scene
 from .backward import pulled
 from .camera import Camera
-from .checks import Arrayable, finite, require
+from .checks import Arrayable, finite_array, require
 from .compiled import compiled, forward_only, recomputed, transformations
 from .lighting.deferred import Deferred, lit_picture
 from .lighting.seam import Lighting, classification
@@ -74,12 +75,12 @@ def render(
 
 
 def render(
-    volume: Volume,
-    transfer: Transfer,
-    camera: Camera,
-    march: March,
+    volume: Volume | Any,
+    transfer: Transfer | Any,
+    camera: Camera | Any,
+    march: March | Any,
     *,
-    lighting: Lighting | None = None,
+    lighting: Lighting | Any | None = None,
     outputs: Any = "all",
     adjoint: Adjoint = "replay",
 ) -> Any:
@@ -103,12 +104,15 @@ def render(
     **Returns:** a `Rendering` with leading shape (height, width), in float32; or, for the image alone, a
     `Picture`.
 
-    **Raises:** `ValueError` for unknown outputs or an unknown adjoint, and for `"direct"` where the march or
-    the spacing is traced and `march.max_samples` is not given.
+    **Raises:** `ValueError`, naming the argument, for one that is something else than its name says (an array
+    for a `Volume`, a camera in the march's place), for unknown outputs or an unknown adjoint, and for
+    `"direct"` where the march or the spacing is traced and `march.max_samples` is not given.
 
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
     """
+    order = "render(volume, transfer, camera, march)"
+    check_scene(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
     how, lighting = _How.of(outputs, adjoint, volume, march), _prepared(lighting, volume, transfer, march)
     return _render((volume, transfer, camera, march, lighting), how, Known.of(volume, march))
 
@@ -144,14 +148,14 @@ def render_rays(
 
 
 def render_rays(
-    volume: Volume,
-    transfer: Transfer,
+    volume: Volume | Any,
+    transfer: Transfer | Any,
     origins: Arrayable,
     directions: Arrayable,
-    march: March,
+    march: March | Any,
     *,
     pixels: Arrayable | None = None,
-    lighting: Lighting | None = None,
+    lighting: Lighting | Any | None = None,
     outputs: Any = "all",
     adjoint: Adjoint = "replay",
 ) -> Any:
@@ -169,7 +173,10 @@ def render_rays(
     **Raises:** as `render`, and `ValueError` for shapes that differ or do not end in 3, NaN or
     infinity, and directions of length 0.
     """
-    origins, directions = _rays("origins", origins), _rays("directions", directions)
+    order = "render_rays(volume, transfer, origins, directions, march)"
+    check_scene(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
+    origins = finite_array("origins", origins, (..., 3))
+    directions = finite_array("directions", directions, (..., 3))
     if origins.shape != directions.shape:
         raise ValueError(
             f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}."
@@ -310,13 +317,8 @@ _lit = compiled(_light, has_jvp=True)
 _lit_replayed = recomputed(_light)
 
 
-def _prepared(lighting: Any, volume: Volume, transfer: Transfer, march: March) -> Lighting | None:
-    if lighting is None:
-        return None
-    if not isinstance(lighting, Lighting):
-        message = "lighting must be None or a Lighting, such as ScattererTemplates"
-        raise ValueError(f"{message}; got {lighting!r}.")
-    return lighting.prepared(volume, transfer, march)
+def _prepared(lighting: Lighting | None, volume: Volume, transfer: Transfer, march: March) -> Lighting | None:
+    return None if lighting is None else lighting.prepared(volume, transfer, march)
 
 
 def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:
@@ -326,10 +328,3 @@ def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[A
     if pixels.shape != shape or not jnp.issubdtype(pixels.dtype, jnp.integer):
         raise ValueError(f"pixels must be integers of shape {shape}; got {pixels.dtype} of {pixels.shape}.")
     return pixels.astype(jnp.int32)
-
-
-def _rays(name: str, rays: Arrayable) -> Float[Array, "*rays 3"]:
-    rays = jnp.asarray(rays, dtype=float)
-    if rays.ndim < 1 or rays.shape[-1] != 3:
-        raise ValueError(f"{name} must have shape (*rays, 3); got {rays.shape}.")
-    return require(rays, finite, f"{name} must be finite.")

@@ -9,13 +9,11 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from .checks import integer, is_traced
 from .locate import Ray
 from .march import Cell, Transform
-from .noise import blue_tile, hashed_uniforms
+from .noise import blue_tile, hashed_uniforms, seed_word
 from .triple import Scalar
 from .volume import Volume
 
@@ -36,10 +34,10 @@ class Noise(eqx.Module):
     stream: int = eqx.field(static=True)
 
     def __init__(self, seed: int | Any, pattern: Pattern | Any, stream: int):
-        seed = seed if is_traced(seed) else integer("seed", np.asarray(seed).item(), 0)
+        seed = seed_word(seed)
         if pattern not in ("white", "blue"):
             raise ValueError(f'pattern must be "white" or "blue"; got {pattern!r}.')
-        self.seed = jnp.asarray(seed).astype(jnp.uint32)
+        self.seed = seed
         self.tile = blue_tile() if pattern == "blue" else None
         self.stream = stream
 
@@ -64,10 +62,13 @@ class Jitter(Transform):
 
     **Arguments:**
 
-    - `seed`: integer ≥ 0. The random number of a pixel depends on seed and pixel alone.
+    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced, and mapped over. The random
+      number of a pixel depends on seed and pixel alone.
     - `pattern`: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
     - `front_residual`: give the piece that is left out a narrow cell of its own, from the entry to ξ d,
       sampled at the entry; the noise on cut faces then falls to that of the sample's value.
+
+    **Raises:** `ValueError` for a seed or a pattern that is none of these.
 
     Source: jittered sampling as in Kye 2013, section 2.2.
     """

@@ -1,11 +1,13 @@
 """Which colour and extinction has a value within this structure? One transfer function for each label."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from .checks import described, integer
 from .occupancy import Blocks
 from .transfer import (
     Classify,
@@ -27,29 +29,35 @@ class LabelTransferFunction(Transfer):
 
     **Arguments:**
 
-    - `functions`: that of label 0, 1, 2, …, or None for a label that is not seen. All have the same number
-      of control points. A label beyond the last is not seen either.
+    - `functions`: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
+      label that is not seen. A label that is not named, or lies beyond the last, is not seen either. Labels
+      are 0 to 255 here; number others anew, as by `np.unique(labels, return_inverse=True)`.
+
+    Where one function has fewer control points than another it is continued by points beyond its last, which
+    look like the last.
 
     The label is that of the nearest node, so it changes along a ray at once, half-way between nodes;
     `AlphaCorrection(labels=True)` cuts cells there.
 
-    **Raises:** `ValueError` for no function at all, and for different numbers of control points; and when
+    **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
     rendering a volume without labels.
     """
 
     stacked: TransferFunction
     """All functions as one, with a leading axis for the label; the last is that of labels not seen."""
 
-    def __init__(self, functions: Sequence[TransferFunction | None]):
-        seen = [function for function in functions if function is not None]
+    def __init__(
+        self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
+    ):
+        given = _by_label(functions)
+        seen = [function for function in given if function is not None]
         if not seen:
             raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
-        counts = sorted({function.values.shape[0] for function in seen})
-        if len(counts) > 1:
-            raise ValueError(f"functions must have the same number of control points; got {counts}.")
-        hidden = TransferFunction(seen[0].values, 0 * seen[0].colors, 0 * seen[0].extinction)
-        given = [hidden if function is None else function for function in [*functions, None]]
-        self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given)
+        points = max(function.values.shape[0] for function in seen)
+        first = _continued(seen[0], points)
+        hidden = TransferFunction(first.values, 0 * first.colors, 0 * first.extinction)
+        each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
+        self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
     def measured(self, volume: Volume, coordinate: Triple) -> Measured:
         """Value and label at a grid coordinate."""
@@ -65,9 +73,8 @@ class LabelTransferFunction(Transfer):
             value, label = measured
             label = jnp.where((label < 0) | (label > unseen), unseen, label)
             values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)
-            value = at_least(value, values[0])
             row = row_of(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
-            return interpolated(row, value - row[0])
+            return interpolated(row, at_least(value - row[0], jnp.zeros_like(row[0])))
 
         return classify
 
@@ -80,3 +87,39 @@ class LabelTransferFunction(Transfer):
             inside = seen_between(values, extinction, blocks.low, blocks.high)
             seen |= inside & blocks.may_hold(label)
         return seen
+
+
+def _by_label(functions: Any) -> list[TransferFunction | None]:
+    """Those of label 0, 1, 2, …"""
+    if isinstance(functions, Mapping):
+        labels = [integer("functions' label", label, 0, 255) for label in functions]
+        named = dict(zip(labels, functions.values(), strict=True))
+        functions = [named.get(label) for label in range(max(labels, default=-1) + 1)]
+    if not isinstance(functions, list | tuple):
+        raise ValueError(
+            "functions must be {label: TransferFunction}, or a sequence of them from label 0 on; "
+            f"got {described(functions)}."
+        )
+    for label, function in enumerate(functions):
+        if not isinstance(function, TransferFunction | None):
+            raise ValueError(
+                f"functions[{label}] must be a TransferFunction, or None; got {described(function)}."
+            )
+    if len(functions) > 256:
+        raise ValueError(f"functions must be those of labels 0 to 255; got {len(functions)} of them.")
+    return list(functions)
+
+
+def _continued(function: TransferFunction, points: int) -> TransferFunction:
+    """The same function by so many points."""
+    values, missing = function.values, points - function.values.shape[0]
+    if missing == 0:
+        return function
+    # far enough apart to differ in the float type
+    gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
+    beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
+    return TransferFunction(
+        jnp.concatenate([values, beyond]),
+        jnp.concatenate([function.colors, jnp.repeat(function.colors[-1:], missing, axis=0)]),
+        jnp.concatenate([function.extinction, jnp.repeat(function.extinction[-1:], missing)]),
+    )

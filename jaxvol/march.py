@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .beams import Box
-from .checks import number
+from .checks import described, integer, number
 from .locate import Affine, Ray, Space
 from .occupancy import Occupancy
 from .triple import Scalar, Triple
@@ -137,11 +137,11 @@ class March(eqx.Module):
     - `transforms`: applied in this order at every seam; none may be given twice.
     - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
       error falls with d. `"midpoint"`: in the middle; the error falls with d².
-    - `max_samples`: the most steps that a ray may take. Rays that need more are marked in
-      `Rendering.exhausted`. By default 131 072, against marches that never end.
+    - `max_samples`: the most steps that a ray may take, an integer from 1 to 2³⁰. Rays that need more are
+      marked in `Rendering.exhausted`. By default 131 072, against marches that never end.
 
     **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
-    transform, and for a transform given twice.
+    transform, for a transform given twice, and for a `max_samples` that is no such integer.
     """
 
     step: Float[Array, ""]
@@ -155,16 +155,18 @@ class March(eqx.Module):
         transforms: tuple[Transform, ...] | Any = (),
         quadrature: Literal["left", "midpoint"] | Any = "left",
         *,
-        max_samples: int | None = None,
+        max_samples: int | Any | None = None,
     ):
         self.step = number("step", step, above=0)
         if not isinstance(transforms, tuple | list):
-            raise ValueError(f"transforms must be a tuple, such as (AlphaCorrection(),); got {transforms!r}.")
+            raise ValueError(
+                f"transforms must be a tuple, such as (AlphaCorrection(),); got {described(transforms)}."
+            )
         self.transforms = tuple(transforms)
         kinds = [type(t) for t in self.transforms]
         for transform in self.transforms:
             if not isinstance(transform, Transform):
-                raise ValueError(f"transforms must hold jaxvol transforms; got {transform!r}.")
+                raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
             if kinds.count(type(transform)) > 1:
                 name = type(transform).__name__
                 raise ValueError(
@@ -173,9 +175,7 @@ class March(eqx.Module):
         if quadrature not in ("left", "midpoint"):
             raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
         self.quadrature = quadrature
-        if max_samples is not None and max_samples < 1:
-            raise ValueError(f"max_samples must be at least 1; got {max_samples}.")
-        self.max_samples = max_samples
+        self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**30)
 
     @property
     def most_samples(self) -> int:

@@ -8,7 +8,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
+from .checks import described, integer, is_traced
 from .triple import Triple
+
+
+def seed_word(seed: int | Any) -> UInt32[Array, ""]:
+    """The word that a seed stands for.
+
+    **Arguments:** `seed`: an integer in [0, 2³²), which is its own word; a traced one, of any integer type,
+    is taken modulo 2³². Or a key of `jax.random`, of which the word is drawn.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    if is_key(seed):
+        return jax.random.bits(seed, (), jnp.uint32)
+    if is_traced(seed):
+        seed = jnp.asarray(seed)
+        if seed.shape != () or not jnp.issubdtype(seed.dtype, jnp.integer):
+            raise ValueError(f"seed must be an integer, or a key of jax.random; got {described(seed)}.")
+        return seed.astype(jnp.uint32)
+    word = integer("seed", seed, 0, 2**32 - 1, otherwise=", or a key of jax.random")
+    return jnp.asarray(np.uint32(word))
+
+
+def is_key(seed: Any) -> bool:
+    """Whether a seed is a single key of `jax.random`, of either kind."""
+    if not isinstance(seed, jax.Array):
+        return False
+    if jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
+        return seed.shape == ()
+    return seed.dtype == jnp.uint32 and seed.shape == (2,)
 
 
 def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""], dtype: Any) -> Triple:

@@ -1,13 +1,14 @@
 """Which looks have names? Transfer functions for kinds of data, and any matplotlib colormap."""
 
-from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import Arrayable, finite_array, unit_interval
+from .checks import Arrayable, described, finite_array, integer, unit_interval
 from .display import from_srgb
 from .transfer import TransferFunction, extinction_of
 
@@ -125,7 +126,9 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
 }
 
 
-def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float = 1.0) -> TransferFunction:
+def preset(
+    name: str | Any, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0
+) -> TransferFunction:
     """A transfer function by name.
 
     **Arguments:**
@@ -138,7 +141,7 @@ def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float 
 
     **Raises:** `ValueError` for a name that is not there, and a `clim` that does not increase.
     """
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
     _, (own_low, own_high), points = PRESETS[name]
     low, high = _range((own_low, own_high) if clim is None else clim)
@@ -149,35 +152,59 @@ def preset(name: str, clim: Sequence[float] | None = None, unit_distance: float 
 
 def colormap(
     cmap: str | Any,
-    clim: Sequence[float],
+    clim: Arrayable,
     opacity: str | Arrayable = "linear",
-    unit_distance: float = 1.0,
-    n_colors: int = 256,
+    unit_distance: Arrayable = 1.0,
+    n_colors: int | Any = 256,
 ) -> TransferFunction:
     """A transfer function from a matplotlib colormap and an opacity ramp, as PyVista's `add_volume`.
 
     **Arguments:**
 
-    - `cmap`: name of a matplotlib colormap, or a colormap. Its colours are taken as sRGB and made linear.
+    - `cmap`: name of a matplotlib colormap, or a colormap; or a colour, such as `"tomato"`, `"#ff6347"` or
+      (1, 0.39, 0.28), which the whole range takes; or several colours, a list or an array (m, 3), at equal
+      distances over the range and linear between, in sRGB, as matplotlib mixes them. All colours are sRGB,
+      and made linear here. Their transparency does not count: `opacity` does.
     - `clim`: (low, high) in the volume's values: where the colormap begins and ends.
     - `opacity`: `"linear"`: from 0 to 1 over the range. `"sigmoid"`: `1/(1 + exp(-x))` for x from -10
       to 10 over the range. An array in [0, 1]: opacities at equal distances over the range.
     - `unit_distance`: world length of a layer that has these opacities.
-    - `n_colors`: number of control points.
+    - `n_colors`: number of control points, at least 2.
 
-    **Raises:** `ValueError` for an unknown colormap or opacity, opacities outside [0, 1], a `clim` that
-    does not increase.
+    **Raises:** `ValueError` for an unknown colormap, colour or opacity, opacities outside [0, 1], and a
+    `clim` that does not increase.
     """
-    import matplotlib
-
-    try:
-        colors = (matplotlib.colormaps[cmap] if isinstance(cmap, str) else cmap)(np.linspace(0, 1, n_colors))
-    except KeyError as fault:
-        raise ValueError(f"cmap must be a matplotlib colormap; got {cmap!r}.") from fault
+    n_colors = integer("n_colors", n_colors, 2)
+    colors = _display_colors(cmap, np.linspace(0, 1, n_colors))
     low, high = _range(clim)
-    linear = from_srgb(jnp.asarray(colors[:, :3], dtype=float))
+    linear = from_srgb(jnp.asarray(colors, dtype=float))
     extinction = extinction_of(_ramp(opacity, n_colors), unit_distance)
     return TransferFunction(np.linspace(low, high, n_colors), linear, extinction)
+
+
+def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """sRGB at fractions of the range."""
+    from matplotlib import colormaps, colors
+
+    if isinstance(cmap, str) and cmap in colormaps:
+        cmap = colormaps[cmap]
+    if isinstance(cmap, colors.Colormap):
+        return cmap(at)[:, :3]
+    cmap = jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, cmap)
+    try:
+        given = colors.to_rgba_array(cmap)[:, :3]
+        if len(given) == 0 or given.min() < 0 or given.max() > 1:
+            raise ValueError
+    except (ValueError, TypeError) as fault:
+        near = get_close_matches(cmap.lower(), list(colormaps), 3) if isinstance(cmap, str) else []
+        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        got = repr(cmap) if isinstance(cmap, list | tuple) else described(cmap)
+        raise ValueError(
+            "cmap must be a matplotlib colormap or its name, or one or several colours, by name or sRGB in "
+            f"[0, 1]; got {got}.{hint}"
+        ) from fault
+    place = np.linspace(0, 1, len(given))
+    return np.stack([np.interp(at, place, channel) for channel in given.T], axis=-1)
 
 
 def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:

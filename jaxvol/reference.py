@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .checks import all_finite, is_traced
+from .arguments import check_scene
+from .checks import Arrayable, all_finite, finite_array, is_traced
 from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.seam import Lighting, Sample, classification
 from .locate import Ray, enter, invalid
@@ -196,14 +197,14 @@ def end(ray: Ray, at: Progress) -> Picture:
 
 
 def render_ray_reference(
-    volume: Volume,
-    transfer: Transfer,
-    origin: Float[Array, "3"],
-    direction: Float[Array, "3"],
-    march: March,
+    volume: Volume | Any,
+    transfer: Transfer | Any,
+    origin: Arrayable,
+    direction: Arrayable,
+    march: March | Any,
     *,
     pixel: tuple[Any, Any] = (0, 0),
-    lighting: Lighting | None = None,
+    lighting: Lighting | Any | None = None,
 ) -> Rendering:
     """What one ray sees, by a plain scan over its cells.
 
@@ -221,6 +222,9 @@ def render_ray_reference(
     **Raises:** `ValueError` where the march or the spacing is traced and `march.max_samples` is not given:
     the length of the scan cannot be known.
     """
+    order = "render_ray_reference(volume, transfer, origin, direction, march)"
+    check_scene(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
+    origin, direction = _vector("origin", origin), _vector("direction", direction)
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
@@ -239,6 +243,14 @@ def render_ray_reference(
         rgba = lit_once(lit, space, line, rendering.rgba, rendering.depth)
         rendering = replace(rendering, rgba=rgba)
     return rendering
+
+
+def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
+    """An array of floats keeps its type; all else is made JAX's default one."""
+    floats = hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
+    if floats and value.shape == (3,):
+        return jnp.asarray(value)
+    return finite_array(name, value, (3,))
 
 
 def samples_across(volume: Volume, march: March) -> int:

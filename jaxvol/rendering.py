@@ -4,7 +4,10 @@ from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+from .checks import finite, is_traced
 
 
 Outputs: TypeAlias = Literal["all", "rgba"]
@@ -27,7 +30,7 @@ class Picture(eqx.Module):
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
         """Linear RGB over a background: one colour (3,), or an image of the same shape."""
-        background = jnp.asarray(background, self.rgba.dtype)
+        background = self._background(background)
         if background.shape not in ((3,), (*self.rgba.shape[:-1], 3)):
             raise ValueError(
                 f"background must be one colour (3,) or an image {(*self.rgba.shape[:-1], 3)}; "
@@ -35,6 +38,18 @@ class Picture(eqx.Module):
             )
         background = jnp.broadcast_to(background, (*self.rgba.shape[:-1], 3))
         return self.rgba[..., :3] + (1 - self.rgba[..., 3:]) * background
+
+    def _background(self, background: Any) -> Float[Array, "..."]:
+        """As numbers. A traced one may be NaN, and shows as it."""
+        if not is_traced(background):
+            given = background
+            try:
+                background = np.asarray(given, np.float32)
+            except (TypeError, ValueError) as fault:
+                raise ValueError(f"background must be linear RGB numbers; got {given!r}.") from fault
+            if not np.all(finite(background)):
+                raise ValueError("background must be finite; got NaN or infinity.")
+        return jnp.asarray(background, self.rgba.dtype)
 
 
 class DepthPicture(Picture):

@@ -97,7 +97,9 @@ class TransferFunction(Transfer):
 
     **Arguments:**
 
-    - `values`: (n,) increasing control points, in value units; n ≥ 2. They carry no gradient.
+    - `values`: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
+      step: what lies below takes the first one's colour and extinction, what lies there or above the
+      second's. They carry no gradient.
     - `colors`: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
     - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
       `1 - exp(-extinction w)`.
@@ -105,8 +107,10 @@ class TransferFunction(Transfer):
     Extinction is what is interpolated. VTK interpolates opacity; the two agree at the points, and
     differ between points where the opacity of a unit distance is high.
 
-    **Raises:** `ValueError` for fewer than two points, points that do not increase, negative
-    extinction, NaN or infinity, or lengths that differ.
+    Put a step between values of the data rather than at one: interpolation may round a value to either side.
+
+    **Raises:** `ValueError` for fewer than two points, points that do not increase or of which three are
+    equal, negative extinction, NaN or infinity, or lengths that differ.
     """
 
     values: Float[Array, " n"]
@@ -120,8 +124,9 @@ class TransferFunction(Transfer):
             raise ValueError(f"values must hold at least 2 control points; got {n}.")
         self.values = require(
             values,
-            lambda v: v[1:] > v[:-1],
-            "values must increase from point to point; got {got}. Sort them, and move equal ones apart.",
+            lambda v: (v[1:] >= v[:-1]).all() & (v[2:] > v[:-2]).all(),
+            "values must increase from point to point, but for two equal ones that make a step; got {got}. "
+            "Sort them, and let no three be equal.",
         )
         self.colors = finite_array("colors", colors, (n, 3))
         extinction = finite_array("extinction", extinction, (n,))
@@ -130,15 +135,16 @@ class TransferFunction(Transfer):
     @classmethod
     def from_points(
         cls,
-        points: Sequence[tuple[float, tuple[float, float, float], float]],
-        unit_distance: float = 1.0,
+        points: Sequence[tuple[float, Sequence[float], float]] | Any,
+        unit_distance: Arrayable = 1.0,
     ) -> "TransferFunction":
         """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
 
         **Arguments:**
 
-        - `points`: in increasing order of value. `opacity` in [0, 1] is that of a layer of thickness
-          `unit_distance`, and becomes the extinction `-ln(1 - opacity) / unit_distance` exactly.
+        - `points`: in increasing order of value; two of one value make a step. `opacity` in [0, 1] is that
+          of a layer of thickness `unit_distance`, and becomes the extinction
+          `-ln(1 - opacity) / unit_distance` exactly.
           An opacity of 1, whose extinction would be infinite, is taken as 1 - 2⁻²⁴.
         - `unit_distance`: world length. VTK's `ScalarOpacityUnitDistance`.
 
@@ -172,9 +178,8 @@ class TransferFunction(Transfer):
             return None
 
         def search(measured: Measured) -> Measured:
-            value = at_least(measured[0], values[0])
-            interval = jnp.clip(points_below(values, value) - 1, 0, last)
-            return interval, value - _at(values, interval)
+            interval = jnp.clip(points_below(values, measured[0]) - 1, 0, last)
+            return interval, at_least(measured[0] - _at(values, interval), jnp.zeros_like(values[0]))
 
         return search
 
@@ -188,11 +193,10 @@ class TransferFunction(Transfer):
 
         def chosen(measured: Measured) -> tuple[Triple, Scalar]:
             (value,) = measured
-            value = at_least(value, values[0])
             row = tuple(rows[0])
             for start, following in zip(values[1:], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
-            return interpolated(row, value - row[0])
+            return interpolated(row, at_least(value - row[0], jnp.zeros_like(row[0])))
 
         return chosen if values.shape[0] <= FEW else looked_up
 
@@ -200,9 +204,8 @@ class TransferFunction(Transfer):
         # By one scatter of whole rows, where JAX would sum up for every entry of a row apart.
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
         if self.values.shape[0] <= FEW:
-            limited = at_least(value, self.values[0])
-            interval = jnp.maximum(points_below(self.values, limited) - 1, 0)
-            past = limited - row_of(rows, interval)[0]
+            interval = jnp.maximum(points_below(self.values, value) - 1, 0)
+            past = at_least(value - row_of(rows, interval)[0], jnp.zeros_like(value))
         else:
             _, interval, past = measured
         *_, r, g, b, slope, inverse = row_of(rows, interval)
@@ -219,9 +222,11 @@ class TransferFunction(Transfer):
     def rows(self) -> Float[Array, "points 10"]:
         """A table with one row for each point: all that a sample needs which lies past it, but not past the
         next one, so that it finds them side by side. Value, colour, extinction; the slopes of colour and
-        extinction; and 1 over the way to the next point. Past the last one all slopes are 0."""
+        extinction; and 1 over the way to the next point. Past the last one all slopes are 0, and past the
+        first of two equal ones, where no value lies."""
         values = jax.lax.stop_gradient(self.values)
-        inverse = 1 / (values[1:] - values[:-1])[:, None]
+        gap = (values[1:] - values[:-1])[:, None]
+        inverse = jnp.where(gap > 0, 1 / jnp.where(gap > 0, gap, 1), 0)
         at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         slopes = jnp.concatenate([(at_points[1:] - at_points[:-1]) * inverse, inverse], axis=1)
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
@@ -293,14 +298,16 @@ def seen_between(
         before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
         # between two points there is something to see wherever one of the two has extinction
         from_point = jnp.maximum(points_below(values, low) - 1, 0)
-        to_point = jnp.minimum(points_below(values, high, strictly=True), n - 1)
+        # the first point at `high` or above, or the second, where two stand at `high`
+        to_point = jnp.maximum(points_below(values, high, strictly=True), points_below(values, high) - 1)
+        to_point = jnp.minimum(to_point, n - 1)
         return before[to_point + 1] > before[from_point]
     seen = jnp.zeros(low.shape, bool)
     for point in range(n):
         # a point's extinction is seen from the point before it to the one behind it
         reached = jnp.full(low.shape, positive[point])
         if point > 0:
-            reached &= high > values[point - 1]
+            reached &= (high > values[point - 1]) | (high >= values[point])
         if point < n - 1:
             reached &= low < values[point + 1]
         seen |= reached

@@ -11,6 +11,7 @@ import jaxvol as jv
 
 
 POSITION, FOCUS = (3.0, -4.0, 2.0), (0.5, 1.0, 0.0)
+BOX = jv.Volume(np.zeros((4, 5, 6), np.uint8), spacing=(10, 3, 1), origin=(7, -5, 2))
 
 
 def unit(v):
@@ -86,16 +87,49 @@ def test_one_field_can_be_replaced():
 
 
 def test_looking_at_sees_every_corner_of_the_volume():
-    volume = jv.Volume(np.zeros((4, 5, 6), np.uint8), spacing=(10, 3, 1), origin=(7, -5, 2))
-    low, high = (np.asarray(end) for end in volume.corners)
+    low, high = (np.asarray(end) for end in BOX.corners)
     for size in ((40, 20), (20, 40)):
-        camera = jv.Camera.looking_at(volume, (1, 2, 0.5), size=size)
+        camera = jv.Camera.looking_at(BOX, (1, 2, 0.5), size=size)
         right, up, forward = (np.asarray(axis) for axis in camera._axes())
         for corner in np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3):
             view = corner - np.asarray(camera.position)
             height = np.tan(np.radians(15)) * (view @ forward)
             assert abs(view @ up) <= height
             assert abs(view @ right) <= height * size[0] / size[1]
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_looking_at_from_above_and_below_picks_another_up(up, sign):
+    right, upward, forward = (
+        np.asarray(axis) for axis in jv.Camera.looking_at(BOX, sign * np.array(up), up)._axes()
+    )
+    np.testing.assert_allclose(forward, -sign * np.array(up), atol=1e-6)
+    np.testing.assert_allclose(upward, (0, 0, -1) if up == (0, 1, 0) else (0, 1, 0), atol=1e-6)
+    if sign > 0 and up != (1, 0, 0):
+        np.testing.assert_allclose(right, (1, 0, 0), atol=1e-6)
+
+
+def test_looking_at_under_jit_from_above_and_aside_is_the_same():
+    for direction in ((0.0, 0.0, 2.0), (0.5, -1.0, 0.4)):
+        traced = jax.jit(lambda d: jv.Camera.looking_at(BOX, d))(jnp.asarray(direction))
+        for one, other in zip(
+            jax.tree.leaves(traced), jax.tree.leaves(jv.Camera.looking_at(BOX, direction)), strict=True
+        ):
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(40, 20), (20, 40)])
+def test_an_orthographic_view_just_holds_the_sphere_around_the_volume(size):
+    camera = jv.Camera.looking_at(BOX, (1, 2, 0.5), parallel=True, size=size)
+    low, high = (np.asarray(corner) for corner in BOX.corners)
+    radius = np.linalg.norm(high - low) / 2
+    origins, directions = camera.rays()
+    assert np.ptp(directions, axis=(0, 1)).max() < 1e-6
+    width, height = (np.linalg.norm(np.asarray(origins[i] - origins[0, 0])) for i in ((0, -1), (-1, 0)))
+    shorter = min(width * size[0] / (size[0] - 1), height * size[1] / (size[1] - 1))
+    assert shorter == pytest.approx(2 * radius, rel=1e-4)
+    assert np.linalg.norm(np.asarray(camera.position - BOX.center)) > radius
 
 
 def test_rays_are_differentiable_in_the_camera():
@@ -117,6 +151,16 @@ BAD = {
     "up zero": (lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 0, 0)), "view_up must not be zero"),
     "size 0": (lambda: jv.Camera(POSITION, FOCUS, size=(0, 5)), r"size must be .* at least 1; got \(0, 5\)"),
     "half a pixel": (lambda: jv.Camera(POSITION, FOCUS, size=(4.5, 5)), "size must be"),
+    "size of text": (lambda: jv.Camera(POSITION, FOCUS, size="512x512"), "size must be .*got '512x512'"),
+    "crop by halves": (
+        lambda: jv.Camera(POSITION, FOCUS, size=(9, 9)).crop(1.5, 0, 5, 2),
+        "left must be an integer of at least 0; got 1.5",
+    ),
+    "an array": (
+        lambda: jv.Camera.looking_at(np.zeros((4, 4, 4))),
+        "volume must be a jaxvol Volume; got a NumPy",
+    ),
+    "no up": (lambda: jv.Camera.looking_at(BOX, view_up=(0, 0, 0)), "view_up must not be zero"),
     "one size": (lambda: jv.Camera(POSITION, FOCUS, size=5), "size must be"),
     "angle 180": (
         lambda: jv.Camera(POSITION, FOCUS, view_angle=180),

@@ -2,8 +2,11 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
+import time
+import warnings
 
 import numpy as np
 import pytest
@@ -71,7 +74,145 @@ def test_render_needs_nothing_but_a_file(volume_file, tmp_path):
     assert imread(output).std() > 5
 
 
+def render_file(volume_file, *words, size=("16", "16")):
+    return main(["render", str(volume_file), "--size", *size, *map(str, words)])
+
+
+def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path, monkeypatch, capsys):
+    calls = []
+    monkeypatch.setattr("jaxvol.cli.render", lambda *a: calls.append(a) or jv.render(*a))
+    output, depth = tmp_path / "a" / "x.png", tmp_path / "b" / "depth.tif"
+    assert (
+        render_file(volume_file, "--preset", "engine", "--transparent", "-o", output, "--depth", depth) == 0
+    )
+    (scene,) = calls
+    rendering = jv.render(*scene)
+    assert str(depth) in capsys.readouterr().out
+    found = imread(output)
+    assert found.shape == (16, 16, 4)
+    opacity = np.asarray(rendering.rgba[..., 3])
+    np.testing.assert_array_equal(found[..., 3], (opacity * 255).round())
+    np.testing.assert_array_equal(imread(depth), rendering.depth)
+    assert np.isinf(imread(depth)).any()
+
+
+def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_path):
+    transfer = jv.write_transfer(tmp_path / "t.json", jv.preset("engine"))
+    images = []
+    for number, look in enumerate((["--transfer", transfer], ["--preset", "engine"])):
+        output = tmp_path / f"{number}.npy"
+        assert render_file(volume_file, *look, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
+        images.append(np.load(output))
+    assert images[0].dtype == np.float32
+    assert images[0].std() > 0.02
+    np.testing.assert_array_equal(*images)
+
+
+def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
+    np.save(tmp_path / "v.npy", np.linspace(20, 90, 1000).reshape(10, 10, 10).astype(np.float32))
+    shown = (["--preset", "ct_bone", "--clim", "20", "90"], None)
+    for words, message in [
+        (
+            ["--preset", "ct_bone"],
+            r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values from 130 on\. A clim from",
+        ),
+        (
+            ["--preset", "ct_bone", "--camera", *["90"] * 3, *["200"] * 3],
+            "nothing is seen: no ray of the camera meets",
+        ),
+        (
+            ["--preset", "ct_bone", "--clim", "20", "90", "--unit-distance", "1e6"],
+            r"nothing is seen: the opacity is .* at most\. Give a shorter unit distance",
+        ),
+        shown,
+    ]:
+        assert render_file(tmp_path / "v.npy", *words, "-o", tmp_path / "x.png") == 0
+        told = capsys.readouterr().out
+        assert re.search(message, told) if message else "nothing" not in told, told
+
+
+STARTED = """
+import signal
+import sys
+import jaxvol.cli
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, whoever runs the tests
+render = jaxvol.cli.render
+def told(*scene):
+    print("under way", flush=True)
+    return render(*scene)
+jaxvol.cli.render = told
+sys.exit(jaxvol.cli.main(sys.argv[1:]))
+"""
+
+
+def test_ctrl_c_ends_a_command_at_once_with_one_line(volume_file, tmp_path):
+    words = [
+        "render",
+        str(volume_file),
+        "--size",
+        "6000",
+        "6000",
+        "--step",
+        "0.001",
+        "-o",
+        str(tmp_path / "x.png"),
+    ]
+    run = subprocess.Popen(
+        [sys.executable, "-c", STARTED, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert run.stdout.readline() == "under way\n"
+    time.sleep(0.3)
+    run.send_signal(signal.SIGINT)
+    begun = time.monotonic()
+    told = run.communicate(timeout=60)[1]
+    assert time.monotonic() - begun < 2
+    assert run.returncode == 130
+    assert told == "\njaxvol render: interrupted\n"
+    assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.slow
+def test_a_fit_that_is_interrupted_goes_on_from_its_checkpoint(volume_file, seen, tmp_path):
+    kept, cameras = tmp_path / "fit.npz", str(tmp_path / "cameras.json")
+    words = ["fit", str(volume_file), "--images", *seen, "--cameras", cameras, "--checkpoint", str(kept)]
+    command = [sys.executable, "-c", STARTED, *words, "-o", str(tmp_path / "t.json")]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not kept.exists() and run.poll() is None:
+        time.sleep(0.1)
+    run.send_signal(signal.SIGINT)
+    begun = time.monotonic()
+    told = run.communicate(timeout=60)[1]
+    assert time.monotonic() - begun < 2
+    assert run.returncode == 130
+    assert told.splitlines()[-1] == f"jaxvol fit: interrupted; the same command goes on from {kept}"
+    assert not (tmp_path / "t.json").exists()
+    with np.load(kept) as file:
+        steps = len(file["losses"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what the pictures do not determine
+        assert main([*words, "--max-steps", str(steps), "-o", str(tmp_path / "t.json")]) == 0
+    assert jv.read_transfer(tmp_path / "t.json").values.shape == (8,)
+
+
+def test_version_is_told(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert re.fullmatch(r"jaxvol \d+\.\d+\S* \(jax \d+\.\S+\)\n", capsys.readouterr().out)
+
+
 BAD = {
+    "EXR": (["FILE", "-o", "x.exr"], "--output: a file of colours must end in one of .png, .jpg"),
+    "transparent JPEG": (
+        ["FILE", "--transparent", "-o", "x.jpg"],
+        "colours and opacity must end in one of .png",
+    ),
+    "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of depth must end in one of .tif"),
+    "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
+    "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
+    "no transfer": (["FILE", "--transfer", "nowhere.json"], "nowhere.json"),
+    "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--parallel goes with --direction"),
     "no file": (["nowhere.raw"], "there is no file"),
     "preset": (["FILE", "--preset", "moon"], "preset must be one of"),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
@@ -85,11 +226,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys):
+def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
     arguments, message = BAD[case]
-    arguments = [str(volume_file) if a == "FILE" else a for a in arguments]
+    arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
     output = tmp_path / "x.png"
-    assert main(["render", *arguments, "-o", str(output)]) == 2
+    monkeypatch.setattr("jaxvol.cli.render", None)  # not reached
+    assert main(["render", "-o", str(output), *arguments]) == 2
     told = capsys.readouterr()
     assert told.err.count("\n") == 1
     assert told.err.startswith("jaxvol render: error: ")
@@ -135,6 +277,7 @@ BAD_FIT = {
     "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
     "start": ({"--start": ["CAMERAS"]}, "must be an object with values, colors, extinction"),
     "clim": ({"--clim": ["5", "4"]}, "clim must be (low, high)"),
+    "checkpoint": ({"--checkpoint": ["0.png/x"]}, "checkpoint: 0.png/x cannot be written"),
 }
 
 
@@ -145,6 +288,7 @@ def test_errors_of_fit_are_one_line_and_exit_code_2(case, volume_file, seen, tmp
     options = {"--images": ["0.png", "1.png"], "--cameras": ["cameras.json"], **changed}
     words = [w for name, values in options.items() for w in (name, *values)]
     words = ["cameras.json" if w == "CAMERAS" else w for w in words]
+    monkeypatch.setattr("jaxvol.fitting.driver._Run", None)  # no work is begun
     assert main(["fit", str(volume_file), *words, "-o", "x.json"]) == 2
     told = capsys.readouterr().err
     assert told.startswith("jaxvol fit: error: ")

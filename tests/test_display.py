@@ -27,11 +27,79 @@ def test_png_holds_srgb_and_clips(tmp_path):
     np.testing.assert_array_equal(found[0, 0], 0)
 
 
-@pytest.mark.parametrize("bad", [np.zeros((4, 4)), np.zeros((4, 4, 4)), np.full((4, 4, 3), np.nan)])
-def test_bad_images_are_named(bad, tmp_path):
-    with pytest.raises(ValueError, match="image must"):
-        jv.save_png(tmp_path / "x.png", bad)
-    assert not (tmp_path / "x.png").exists()
+RGBA = np.float32([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]])
+
+
+def test_transparent_png_has_straight_alpha(tmp_path):
+    found = imread(jv.save_image(tmp_path / "x.PNG", RGBA))
+    straight = np.asarray(jv.to_srgb(np.float32([[0.4, 0.2, 0.0], [0, 0, 0], [1, 1, 1]])))
+    np.testing.assert_array_equal(found[0, :, :3], (straight * 255).round())
+    np.testing.assert_array_equal(found[0, :, 3], [128, 0, 255])
+
+
+@pytest.mark.parametrize("ending", [".tif", ".tiff", ".npy"])
+@pytest.mark.parametrize("image", [RGBA, 7 * RGBA[..., :3], np.float32([[1.5, np.inf], [2.5, 3.0]])])
+def test_linear_formats_keep_every_float(ending, image, tmp_path):
+    path = jv.save_image(tmp_path / f"x{ending}", jnp.asarray(image))
+    found = np.load(path) if ending == ".npy" else imread(path)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, image)
+
+
+def test_a_tiff_says_that_its_colours_are_premultiplied(tmp_path):
+    from tifffile import EXTRASAMPLE, TiffFile
+
+    with TiffFile(jv.save_image(tmp_path / "x.tif", RGBA)) as file:
+        assert file.pages[0].extrasamples == (EXTRASAMPLE.ASSOCALPHA,)
+
+
+def test_jpeg_is_jpeg(tmp_path):
+    path = jv.save_image(tmp_path / "x.jpg", np.full((8, 8, 3), 0.2158605))
+    assert path.read_bytes()[:3] == b"\xff\xd8\xff"
+    assert abs(imread(path).astype(int) - 128).max() <= 2
+
+
+BAD = {
+    "no image": ("x.png", np.zeros(4), r"image must have shape .*got \(4,\)"),
+    "two channels": ("x.png", np.zeros((4, 4, 2)), r"image must have shape .*got \(4, 4, 2\)"),
+    "empty": ("x.npy", np.zeros((0, 4, 3)), "image must have shape"),
+    "NaN": (
+        "x.png",
+        np.full((4, 4, 3), np.nan),
+        "image must not be NaN or infinite; 48 of its 48 values are",
+    ),
+    "infinite": ("x.png", np.full((4, 4, 3), np.inf), "image must not be NaN or infinite"),
+    "EXR": ("x.exr", np.zeros((4, 4, 3)), r"path: .* must end in one of \.png, .*\.npy; got .*x\.exr"),
+    "none": ("x", np.zeros((4, 4, 3)), "must end in one of"),
+    "opacity in JPEG": (
+        "x.jpg",
+        RGBA,
+        r"colours and opacity must end in one of \.png, \.tif, \.tiff, \.npy;",
+    ),
+    "depth in PNG": ("x.png", np.zeros((4, 4)), r"depth must end in one of \.tif, \.tiff, \.npy;"),
+    "NaN depth": ("x.npy", np.full((4, 4), np.nan), "image must not be NaN"),
+    "a folder": (
+        "folder.png",
+        np.zeros((4, 4, 3)),
+        r"path: .*folder\.png cannot be written \(it is a folder",
+    ),
+    "in a file": ("file.txt/x.png", np.zeros((4, 4, 3)), r"x\.png cannot be written"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_images_and_files_are_named(case, tmp_path):
+    file, image, message = BAD[case]
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file.txt").touch()
+    with pytest.raises(ValueError, match=message):
+        jv.save_image(tmp_path / file, image)
+    assert not (tmp_path / file).is_file()
+
+
+def test_save_png_writes_nothing_else(tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in \.png; got .*x\.jpg"):
+        jv.save_png(tmp_path / "x.jpg", np.zeros((4, 4, 3)))
 
 
 def test_image_over_a_background():
@@ -43,3 +111,7 @@ def test_image_over_a_background():
     )
     with pytest.raises(ValueError, match="background must be one colour"):
         rendering.image(jnp.zeros((5, 3)))
+    with pytest.raises(ValueError, match="background must be linear RGB numbers; got 'white'"):
+        rendering.image("white")
+    with pytest.raises(ValueError, match="background must be finite"):
+        rendering.image((1, np.nan, 1))

@@ -270,6 +270,11 @@ def test_constraints_may_be_the_beginning_of_a_tree():
 
 # bad input
 
+
+def unreachable(parameters):
+    raise AssertionError("the residual was asked for before the arguments were checked")
+
+
 NAN = np.full((20, 24, 3), np.nan, np.float32)
 SMALL = np.zeros((4, 5, 3), np.float32)
 BAD = {
@@ -278,6 +283,18 @@ BAD = {
         r"views\[0\].*\(20, 24, 3\).*\(4, 5, 3\)",
     ),
     "NaN": (lambda: jv.ImageResidual(seen, [VIEWS[1], (CAMERAS[0], NAN)]), r"views\[1\].*finite; 1440"),
+    "8 bits": (
+        lambda: jv.ImageResidual(seen, [(CAMERAS[0], np.zeros((20, 24, 3), np.uint8))]),
+        r"views\[0\]: the image must be linear RGB, floats .*; got uint8.*from_srgb",
+    ),
+    "checkpoint": (
+        lambda: jv.fit(unreachable, BEGIN, checkpoint="/dev/null/a"),
+        r"checkpoint: /dev/null/a cannot be written \(/dev/null is no folder\)",
+    ),
+    "checkpoint a folder": (
+        lambda: jv.fit(unreachable, BEGIN, checkpoint=Path(__file__).parent),
+        r"checkpoint: .*tests cannot be written \(it is a folder\)",
+    ),
     "no views": (lambda: jv.ImageResidual(seen, []), "views must hold at least one pair"),
     "views": (lambda: jv.ImageResidual(seen, [VIEWS[0][1]]), "views must be pairs"),
     "no camera": (lambda: jv.ImageResidual(seen, [(1, SMALL)]), r"views\[0\] must be a pair .*got int first"),
@@ -292,6 +309,10 @@ BAD = {
     ),
     "solver": (lambda: jv.fit(curve, BEGIN, solver="newton"), "solver must be one of levenberg.*'newton'"),
     "residual": (lambda: jv.fit(VIEWS, GREY), "residual must be an ImageResidual, or a function"),
+    "residual and parameters swapped": (
+        lambda: jv.fit(GREY, RESIDUAL),
+        r"residual must be .*; got a TransferFunction\. The order is fit\(residual, parameters\)",
+    ),
     "start": (
         lambda: jv.fit(curve, {**BEGIN, "top": jnp.asarray(np.nan)}),
         r"parameters\['top'\] must be finite",
@@ -400,6 +421,25 @@ def test_a_fit_that_is_broken_off_goes_on_to_the_same_bits(tmp_path):
         assert same(again.parameters, whole.parameters)
         assert np.array_equal(again.losses, whole.losses)
         assert again.message == whole.message
+
+
+def test_a_fit_that_is_interrupted_keeps_its_steps(tmp_path):
+    whole = jv.fit(curve, BEGIN, max_steps=30)
+
+    def interrupt(step, parameters, loss):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    file = tmp_path / "folder" / "a"
+    with pytest.raises(KeyboardInterrupt) as stop:
+        jv.fit(curve, BEGIN, checkpoint=file, callback=interrupt)
+    assert stop.value.__notes__ == [
+        f"fit: stopped after 3 steps, which {file} holds; the same call goes on from there."
+    ]
+    steps = []
+    again = jv.fit(curve, BEGIN, max_steps=30, checkpoint=file, callback=lambda *a: steps.append(a[0]))
+    assert steps[0] == 4
+    assert same(again.parameters, whole.parameters)
 
 
 def test_a_finished_fit_is_not_fitted_again(tmp_path):

@@ -138,6 +138,20 @@ def test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample():
     np.testing.assert_array_equal(rendering.samples, [len(s) for s in samples])
 
 
+def test_seeds_may_be_keys_and_traced():
+    words = {int(jv.Jitter(seed).noise.seed) for seed in (0, 2**32 - 1, np.uint32(7), jnp.asarray(7))}
+    assert words == {0, 2**32 - 1, 7}
+    for key in (jax.random.key(3), jax.random.PRNGKey(3)):
+        drawn = jv.EmptySpaceJitter(key).noise.seed
+        assert drawn == jax.random.bits(key, (), jnp.uint32)
+    keys = jax.random.split(jax.random.key(0), 3)
+    for seeds in (jnp.arange(3), jnp.arange(3, dtype=jnp.uint32), keys, jax.random.key_data(keys)):
+        mapped = jax.vmap(lambda seed: jv.Jitter(seed).noise.seed)(seeds)
+        np.testing.assert_array_equal(mapped, [jv.Jitter(seed).noise.seed for seed in seeds])
+    with pytest.raises(ValueError, match=r"seed must be an integer.*got a traced array .* float32"):
+        jax.jit(lambda seed: jv.Jitter(seed).noise.seed)(0.5)
+
+
 def test_seeds_do_not_compile_again_and_images_differ_by_noise_alone():
     Counting = counting()
     volume = anisotropic_noise()
@@ -155,7 +169,10 @@ def test_seeds_do_not_compile_again_and_images_differ_by_noise_alone():
 
 
 BAD = {
-    "negative seed": (lambda: jv.Jitter(-1), "seed must be an integer of at least 0; got -1"),
+    "negative seed": (lambda: jv.Jitter(-1), "seed must be an integer from 0 to 4294967295.*; got -1"),
+    "33 bits": (lambda: jv.Jitter(2**32), "or a key of jax.random; got 4294967296"),
+    "two seeds": (lambda: jv.Jitter([1, 2]), "seed must be an integer .*; got a list"),
+    "two keys": (lambda: jv.Jitter(jax.random.split(jax.random.key(0))), r"seed must .* of shape \(2,\)"),
     "half a seed": (lambda: jv.EmptySpaceJitter(0.5), "seed must be an integer"),
     "pattern": (lambda: jv.Jitter(0, "pink"), 'pattern must be "white" or "blue"; got \'pink\''),
     "twice": (lambda: jv.March(0.1, (jv.Jitter(0), jv.Jitter(1))), "got Jitter 2 times"),

@@ -36,6 +36,20 @@ def test_each_label_has_its_own_function_and_others_are_not_seen():
     np.testing.assert_allclose(rgba, [red, 0, left * (1 - np.exp(-0.8)), 1 - left * np.exp(-0.8)], atol=1e-5)
 
 
+def test_functions_may_be_named_by_label_and_differ_in_points():
+    volume = layers(4, 4, 4, 4)
+    three = jv.TransferFunction([0.0, 50.0, 255.0], [BLUE] * 3, [0.0, 0.2, 0.2])
+    fine = jv.March(0.01, (jv.AlphaCorrection(labels=True),))
+    named = jv.LabelTransferFunction({np.uint8(2): three, 0: plain(RED, 0.1)})
+    listed = jv.LabelTransferFunction([plain(RED, 0.1), None, plain(BLUE, 0.2)])
+    # the look of 100 and of 300, beyond the points of each
+    for value in (100, 300):
+        data = jv.Volume(np.full(volume.shape, value, np.uint16), labels=volume.labels)
+        seen = along_x(data, named, fine).rgba
+        np.testing.assert_allclose(seen, along_x(data, listed, fine).rgba, atol=1e-6)
+        assert seen[0, 3] > 0.5
+
+
 @pytest.mark.parametrize("quadrature", ["left", "midpoint"])
 @pytest.mark.parametrize("step", [0.3, 0.77, 2.9])
 def test_cells_are_cut_at_labels_and_exact_at_any_step(step, quadrature):
@@ -107,14 +121,15 @@ def test_faces_of_a_frog_stay_smooth_under_jitter():
 
 
 UNLABELLED = jv.Volume(np.zeros((4, 3, 3), np.uint8))
-ONE, THREE_POINTS = plain(RED, 1.0), jv.TransferFunction([0, 1, 2], np.ones((3, 3)), [0, 0, 0])
+ONE = plain(RED, 1.0)
 CUTTING = jv.March(0.1, (jv.AlphaCorrection(labels=True),))
 BAD = {
     "no function": (lambda: jv.LabelTransferFunction([None]), "functions must hold a TransferFunction"),
-    "points differ": (
-        lambda: jv.LabelTransferFunction([ONE, THREE_POINTS]),
-        r"same number of control points; got \[2, 3\]",
-    ),
+    "one bare": (lambda: jv.LabelTransferFunction(ONE), "{label: TransferFunction}.*got a TransferFunction"),
+    "no label": (lambda: jv.LabelTransferFunction({"liver": ONE}), "functions' label must be .*got 'liver'"),
+    "negative": (lambda: jv.LabelTransferFunction({-1: ONE}), "functions' label must be .*got -1"),
+    "a colour": (lambda: jv.LabelTransferFunction([ONE, "red"]), r"functions\[1\] must be .*got 'red'"),
+    "many labels": (lambda: jv.LabelTransferFunction([ONE] * 257), "of labels 0 to 255; got 257"),
     "no labels to classify by": (
         lambda: along_x(UNLABELLED, jv.LabelTransferFunction([ONE]), jv.March(0.1)),
         "labels are needed here",

@@ -130,6 +130,13 @@ def test_a_march_that_runs_out_of_samples_says_so():
     assert not jv.render_rays(BOX, uniform_transfer(1.0), *RAY, jv.March(0.3)).exhausted[0]
 
 
+def test_whole_numbers_of_any_library_are_taken():
+    for given in (5, np.int64(5), np.array(5), jnp.asarray(5)):
+        assert type(jv.March(0.3, max_samples=given).max_samples) is int
+    for step in (np.float64(0.25), np.array(0.25), jnp.float16(0.25)):
+        assert float(jv.March(step).step) == 0.25
+
+
 BAD = {
     "step 0": (lambda: jv.March(0), "step must be greater than 0; got 0"),
     "negative step": (lambda: jv.March(-0.1), "step must be greater than 0; got -0.1"),
@@ -143,7 +150,23 @@ BAD = {
     "a class": (lambda: jv.March(0.1, (jv.AlphaCorrection,)), "transforms must hold jaxvol transforms"),
     "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
     "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),
-    "no samples": (lambda: jv.March(0.1, max_samples=0), "max_samples must be at least 1; got 0"),
+    **{
+        f"max_samples={bad!r}": (
+            lambda bad=bad: jv.March(0.1, max_samples=bad),
+            rf"max_samples must be an integer from 1 to 1073741824; got {told}\.",
+        )
+        for bad, told in [
+            (0, "0"),
+            (2**31, "2147483648"),
+            (2.5, "2.5"),
+            (5.0, "5.0"),
+            (True, "True"),
+            ("5", "'5'"),
+            (np.array([5]), r"a NumPy array of shape \(1,\) and type int64"),
+        ]
+    },
+    "beyond float32": (lambda: jv.March(1e300), r"step must be finite in float32; got 1e\+300"),
+    "complex": (lambda: jv.March(1j), "step must be numbers"),
     "opacity left 0": (
         lambda: jv.EarlyTermination(0),
         "opacity_left must be greater than 0 and less than 1; got 0",

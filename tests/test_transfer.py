@@ -1,11 +1,13 @@
 """Colour and extinction between control points; presets, colormaps, and what is refused."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.transfer import seen_between
 
 
 def evaluate(transfer, values):
@@ -33,6 +35,16 @@ def test_opacity_of_a_unit_distance_converts_exactly():
     np.testing.assert_allclose(transfer.opacity(2.5), opacities, atol=1e-7)
     # half the distance: 1 - sqrt(1 - a)
     np.testing.assert_allclose(transfer.opacity(1.25), 1 - np.sqrt(1 - np.array(opacities)), atol=1e-7)
+
+
+def test_numbers_of_any_library_are_taken():
+    plain = jv.TransferFunction.from_points([(0, (1, 0, 0), 0), (2, (0, 0, 1), 0.5)], 2)
+    mixed = jv.TransferFunction.from_points(
+        [(np.int16(0), [1, 0, 0], jnp.zeros(())), (jnp.float32(2), np.array([0, 0, 1]), np.float64(0.5))],
+        jnp.asarray(2.0),
+    )
+    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(mixed), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_opacity_one_is_the_largest_float_below():
@@ -80,6 +92,120 @@ def test_colormap_has_the_colours_of_matplotlib_in_linear_light():
     np.testing.assert_allclose(transfer.opacity()[:-1], np.linspace(0, 1, 256)[:-1], atol=1e-6)
 
 
+def test_colours_make_colormaps():
+    import matplotlib
+
+    def display(cmap):
+        return np.asarray(jv.to_srgb(jv.colormap(cmap, (0, 1), n_colors=5).colors))
+
+    tomato = np.array([255, 99, 71]) / 255
+    for one in ("tomato", "#ff6347", tuple(tomato), [tomato], np.array([tomato]), [jnp.asarray(tomato)]):
+        np.testing.assert_allclose(display(one), np.tile(tomato, (5, 1)), atol=1e-6)
+    expected = [(1, 0, 0), (0.5, 0, 0.5), (0, 0, 1), (0, 0.5, 0.5), (0, 1, 0)]
+    for three in (["red", "b", "#00ff00"], np.array([(1, 0, 0), (0, 0, 1), (0, 1, 0)])):
+        np.testing.assert_allclose(display(three), expected, atol=1e-6)
+    np.testing.assert_array_equal(display(matplotlib.colormaps["magma"]), display("magma"))
+
+
+STEPS = {
+    "a step up": ([60.0, 60.0], [0.0, 0.5]),
+    "between others": ([20.0, 60.0, 60.0, 200.0], [0.1, 0.2, 0.7, 0.3]),
+    "a step down at the end": ([20.0, 60.0, 60.0], [0.0, 0.4, 0.0]),
+    "many points": (np.sort([*np.arange(20.0), 7.0, 12.0]), np.linspace(0.1, 0.9, 22)),
+}
+
+
+@pytest.mark.parametrize("case", STEPS)
+def test_two_equal_points_are_a_step(case):
+    values, extinction = (np.asarray(part, np.float32) for part in STEPS[case])
+    colors = np.linspace(0, 1, 3 * len(values)).reshape(-1, 3)
+    transfer = jv.TransferFunction(values, colors, extinction)
+    for at in np.flatnonzero(values[1:] == values[:-1]):
+        step = values[at]
+        below, there, above = (np.nextafter(step, step + side) for side in (-1, 0, 1))
+        color, sigma = evaluate(transfer, [below, there, above])
+        np.testing.assert_allclose(sigma, extinction[[at, at + 1, at + 1]], rtol=1e-5)
+        np.testing.assert_allclose(color, colors[[at, at + 1, at + 1]], rtol=1e-5)
+    # all else as between other points; numpy takes the second one at a step, too
+    where = np.concatenate([np.linspace(-10, 260, 541), values]).astype(np.float32)
+    inside = where >= values[0]
+    expected = np.where(inside, np.interp(where, values, extinction), extinction[0])
+    if values[-1] == values[-2]:
+        expected = np.where(where >= values[-1], extinction[-1], expected)
+    np.testing.assert_allclose(evaluate(transfer, where)[1], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("case", STEPS)
+def test_the_derivative_at_a_step_is_finite_and_that_of_jax(case):
+    values, extinction = (np.asarray(part, np.float32) for part in STEPS[case])
+    transfer = jv.TransferFunction(values, np.linspace(0, 1, 3 * len(values)).reshape(-1, 3), extinction)
+    where = jnp.asarray(np.concatenate([np.linspace(-10, 260, 541), values]), jnp.float32)
+
+    def summed(transfer, where):
+        (r, g, b), sigma = jax.vmap(transfer)(where)
+        return jnp.sum(r + 2 * g + 3 * b + 4 * sigma)
+
+    expected, slope = jax.grad(summed, (0, 1))(transfer, where)
+    search, one = transfer.search(), jnp.ones_like(where)
+    measured = (where,) if search is None else (where, *jax.vmap(lambda v: search((v,)))(where))
+    found, (of_value, *_) = transfer.pull(measured, (one, 2 * one, 3 * one), 4 * one)
+    for name in ("colors", "extinction"):
+        assert np.isfinite(getattr(found, name)).all()
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(of_value, slope, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_what_a_step_shows_is_known_to_be_visible(many):
+    """Ranges that end exactly at a step, or begin there: the second point counts, the first one does not."""
+    filler = np.linspace(80, 255, 20) if many else [255.0]
+    up = jv.TransferFunction(
+        [0, 60, 60, *filler], np.ones((3 + len(filler), 3)), [0, 0, 1, *np.ones(len(filler))]
+    )
+    down = jv.TransferFunction(up.values, up.colors, [1, 1, 0, *np.zeros(len(filler))])
+    low, high = np.meshgrid(np.arange(50.0, 71), np.arange(50.0, 71), indexing="ij")
+    for transfer in (up, down):
+        seen = seen_between(transfer.values, transfer.extinction, jnp.asarray(low), jnp.asarray(high))
+        dense = evaluate(transfer, np.linspace(50, 70, 2001).astype(np.float32))[1] > 0
+        for i, j in zip(*np.nonzero(high >= low), strict=True):
+            within = slice(int(low[i, j] - 50) * 100, int(high[i, j] - 50) * 100 + 1)
+            assert seen[i, j] == dense[within].any(), (low[i, j], high[i, j])
+
+
+def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
+    data = np.zeros((24, 20, 20), np.uint8)
+    data[4:9, 5:15, 5:15] = 100
+    data[15:20, 8:12, 3:12] = 200
+    volume = jv.Volume(data)
+    step = jv.TransferFunction.from_points(
+        [(0, (0, 0, 0), 0), (60, (0.1, 0.2, 0.9), 0), (60, (0.9, 0.5, 0.1), 0.3), (255, (1, 1, 1), 0.6)]
+    )
+    camera = jv.Camera.looking_at(volume, (1, 0.3, 0.2), size=(24, 24)).zoom(1.6)
+    leaping, plain = jv.March(0.5, (jv.SpaceLeaping(),)), jv.March(0.5)
+
+    def image(transfer, march, adjoint="replay"):
+        return jv.render(volume, transfer, camera, march, outputs="rgba", adjoint=adjoint).rgba
+
+    rgba = image(step, leaping)
+    np.testing.assert_allclose(rgba, image(step, plain), atol=2e-6)
+    assert 0.1 < float((rgba[..., 3] > 0).mean()) < 0.9
+    # as the steepest ramp that a viewer without steps draws
+    ramp = jv.TransferFunction([0, np.nextafter(np.float32(60), 0), 60, 255], step.colors, step.extinction)
+    np.testing.assert_allclose(rgba, image(ramp, plain), atol=1e-5)
+
+    # in any direction but that of an extinction of 0, whose derivative leaps leave out
+    random = np.random.default_rng(0)
+    ways = jv.TransferFunction(
+        step.values, random.random((4, 3)), np.sign(np.asarray(step.extinction)) * random.random(4)
+    )
+    ways = eqx.tree_at(lambda t: t.values, ways, jnp.zeros(4))
+    _, slope = jax.jvp(lambda t: jnp.sum(image(t, plain, "forward") ** 2), (step,), (ways,))
+    gradient = jax.grad(lambda transfer: jnp.sum(image(transfer, leaping) ** 2))(step)
+    assert np.isfinite(gradient.extinction).all()
+    products = [jnp.vdot(a, b) for a, b in zip(*map(jax.tree.leaves, (gradient, ways)), strict=True)]
+    np.testing.assert_allclose(sum(products), slope, rtol=1e-4)
+
+
 def test_opacity_ramps():
     sigmoid = jv.colormap("gray", (0, 1), "sigmoid", n_colors=101).opacity()
     np.testing.assert_allclose(sigmoid[50], 0.5, atol=1e-6)
@@ -99,7 +225,29 @@ BAD = {
         lambda: jv.TransferFunction.from_points([(1, white, 0.5), (0, white, 0.5)]),
         "values must increase.*Sort",
     ),
-    "equal": (lambda: jv.TransferFunction([1, 1], np.ones((2, 3)), [0, 0]), "values must increase"),
+    "three equal": (
+        lambda: jv.TransferFunction([1, 1, 1], np.ones((3, 3)), [0, 0, 0]),
+        r"values must increase.*; got \[1\. 1\. 1\.\].*no three be equal",
+    ),
+    "points that are colours": (
+        lambda: jv.TransferFunction.from_points([(0, "red", 0), (1, "red", 1)]),
+        r"colors must be numbers of shape \(2, 3\)",
+    ),
+    "no colour": (lambda: jv.colormap("redd", (0, 1)), "cmap must be a .*; got 'redd'"),
+    "no colours": (lambda: jv.colormap([], (0, 1)), r"cmap must be .*; got \[\]"),
+    "colours of 8 bits": (
+        lambda: jv.colormap([(255, 0, 0)], (0, 1)),
+        r"cmap must be .* in \[0, 1\]; got \[\(",
+    ),
+    "a number": (lambda: jv.colormap(3, (0, 1)), "cmap must be .*; got 3"),
+    "n_colors": (
+        lambda: jv.colormap("gray", (0, 1), n_colors=1),
+        "n_colors must be an integer of at least 2",
+    ),
+    "beyond float32": (
+        lambda: jv.TransferFunction([0, 1e39], np.ones((2, 3)), [0, 1]),
+        r"values must be finite in float32; got \[0\.e\+00 1\.e\+39\]",
+    ),
     "opacity above 1": (
         lambda: jv.TransferFunction.from_points([(0, white, 0.5), (1, white, 1.5)]),
         r"opacity must be in \[0, 1\]",
@@ -126,9 +274,10 @@ BAD = {
         "unit_distance must be greater than 0; got 0",
     ),
     "unknown preset": (lambda: jv.preset("ct-bone"), "preset must be one of ct_bone.*got 'ct-bone'"),
+    "a list for a preset": (lambda: jv.preset(["engine"]), r"preset must be one of .*; got \['engine'\]"),
     "unknown colormap": (
         lambda: jv.colormap("viridi", (0, 1)),
-        "cmap must be a matplotlib colormap; got 'viridi'",
+        r"cmap must be a matplotlib colormap .*; got 'viridi'\. Did you mean viridis",
     ),
     "unknown ramp": (lambda: jv.colormap("gray", (0, 1), "cubic"), "opacity must be"),
     "ramp above 1": (lambda: jv.colormap("gray", (0, 1), [0, 2]), r"opacity must be in \[0, 1\]"),

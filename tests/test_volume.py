@@ -116,6 +116,38 @@ def test_float64_data_follow_jax():
         assert jv.Volume(np.zeros(SHAPE)).data.dtype == jnp.float64
 
 
+WIDE = {
+    "bool": (np.arange(210).reshape(SHAPE) % 2 == 0, "uint8"),
+    "int64 of 8 bits": (np.arange(210).reshape(SHAPE), "uint8"),
+    "int64 of 9 bits, signed": (np.arange(210).reshape(SHAPE) - 200, "int16"),
+    "int32 of 7 bits, signed": (np.arange(210).reshape(SHAPE).astype(np.int32) // 2 - 50, "int8"),
+    "uint32 of 16 bits": (np.arange(210).reshape(SHAPE).astype(np.uint32) * 300, "uint16"),
+    "int64 of 25 bits": (np.arange(210).reshape(SHAPE) * -(2**16), "float32"),
+    "big-endian int32": (np.arange(210).reshape(SHAPE).astype(">i4"), "uint8"),
+    "big-endian uint16": (np.arange(210).reshape(SHAPE).astype(">u2"), "uint16"),
+    "big-endian float32": (np.arange(210).reshape(SHAPE).astype(">f4"), "float32"),
+    "int32 of JAX": (jnp.arange(210).reshape(SHAPE), "uint8"),
+    "lists": (np.arange(210).reshape(SHAPE).tolist(), "uint8"),
+    "every other, turned": (np.arange(840, dtype=np.uint16).reshape(6, 7, 20)[:, :, ::-4].T, "uint16"),
+}
+
+
+@pytest.mark.parametrize("case", WIDE)
+def test_arrays_of_any_type_and_layout_become_one_that_holds_them_exactly(case):
+    data, becomes = WIDE[case]
+    labels = np.asarray(data).astype(np.int64) if np.asarray(data).dtype.kind == "f" else data
+    volume = jv.Volume(data, labels=labels)
+    assert str(volume.data.dtype) == becomes
+    np.testing.assert_array_equal(np.asarray(volume.data, np.float64), np.asarray(data, np.float64))
+    np.testing.assert_array_equal(volume.labels, np.asarray(data).astype(np.int64))
+
+
+def test_a_file_that_is_mapped_and_read_only_is_taken(tmp_path):
+    np.save(tmp_path / "a.npy", np.arange(210, dtype=np.int16).reshape(SHAPE))
+    mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
+    np.testing.assert_array_equal(jv.Volume(mapped).data, mapped)
+
+
 BAD = {
     "2-D": (lambda: jv.Volume(np.zeros((4, 4), np.uint8)), r"data\[x, y, z\].*shape \(4, 4\).*stack"),
     "an axis of one voxel": (
@@ -123,10 +155,24 @@ BAD = {
         r"at least 2 voxels.*\(4, 1, 4\)",
     ),
     "objects": (lambda: jv.Volume(np.full(SHAPE, None)), r"data must be of type.*got object"),
-    "int64": (lambda: jv.Volume(np.zeros(SHAPE, np.int64)), r"got int64\. Convert"),
-    "bool": (lambda: jv.Volume(np.zeros(SHAPE, bool)), r"got bool"),
+    "beyond 2**24": (
+        lambda: jv.Volume(np.arange(210).reshape(SHAPE) + 2**24),
+        r"data must be whole numbers from -2\*\*24 to 2\*\*24.*; got int64 from 16777216 to 16777425",
+    ),
+    "traced int32": (
+        lambda: jax.jit(lambda data: jv.Volume(data).data)(np.zeros(SHAPE, np.int32)),
+        r"data must be of type .* where they are traced; got int32.*astype\(jnp\.float32\)",
+    ),
+    "1e300": (
+        lambda: jv.Volume(np.where(np.arange(6) == 2, 1e300, np.zeros(SHAPE))),
+        r"data must be finite in float32, .*; got 35 of 210 voxels",
+    ),
+    "ragged": (lambda: jv.Volume([[[1, 2], [3]]]), "data must be an array; got a list"),
     "complex": (lambda: jv.Volume(np.zeros(SHAPE, complex)), r"got complex128"),
-    "text": (lambda: jv.Volume("engine.raw"), r"shape \(\)"),
+    "text": (
+        lambda: jv.Volume("engine.raw"),
+        r"data must be an array; got 'engine\.raw'\. jv\.load\(path\) reads files",
+    ),
     "zero spacing": (
         lambda: jv.Volume(np.zeros(SHAPE, np.uint8), spacing=(1, 0, 1)),
         r"spacing must be positive",
@@ -153,7 +199,15 @@ BAD = {
     ),
     "labels that are no integers": (
         lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.zeros(SHAPE)),
-        r"labels must be integers; got float64",
+        r"labels must be integers; got float64.*astype",
+    ),
+    "labels beyond int32": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.full(SHAPE, 2**40)),
+        r"labels must lie within int32; got int64 from 1099511627776 to 1099511627776",
+    ),
+    "labels of 32 bits beyond int32": (
+        lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.full(SHAPE, 2**31, np.uint32)),
+        r"labels must lie within int32; got uint32",
     ),
 }
 

@@ -17,11 +17,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from ..checks import integer
+from ..checks import integer, output_file
 from . import checkpoints
 from .constraints import Free, Where
 from .damping import LevenbergMarquardt
-from .residuals import OwnResidual, Problem, Residual, tile_entries
+from .residuals import OwnResidual, Problem, Residual, check_residual, tile_entries
 from .uncertainty import Uncertainty, uncertainty
 
 
@@ -120,21 +120,26 @@ def fit(
       result does not depend on it, but for rounding.
     - `callback`: `callback(step, parameters, loss)` after each step but the first, which looks at the start.
     - `progress`: shows a progress bar (`pip install "jaxvol[fit]"`).
-    - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, and at the end. If
-      it exists, the fit goes on from there, and ends with the same parameters, to the bit, as if it had never
-      stopped (on the same machine). A damaged file is told by a warning, and the one before it used.
+    - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, at the end, and when the
+      fit is interrupted (Ctrl-C; `KeyboardInterrupt` is raised again, and says so). Whether it can be written
+      is tried first. If it exists, the fit goes on from there, and ends with the same parameters, to the
+      bit, as if it had never stopped (on the same machine). A damaged file is told by a warning, and the one
+      before it used.
 
     **Returns:** a `Fit`. A solver that fails, stalls or runs out of steps is told by `Fit.success`,
     `Fit.message` and `Fit.solution.result`; the parameters are then the best ones that were seen. Directions
     that the residual does not determine are named in a warning.
 
     **Raises:** `ValueError` for arguments that do not fit together, parameters that are not finite or
-    out of bounds, a residual that is not finite at the start, and a checkpoint of another fit;
+    out of bounds, a residual that is not finite at the start, a checkpoint of another fit, and one that
+    cannot be written;
     `ImportError` where Optax or the progress bar is asked for and missing.
     """
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
         if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
+    check_residual(residual)
+    file = None if checkpoint is None else output_file("checkpoint", checkpoint)
     max_steps, max_jacobian = integer("max_steps", max_steps, 1), integer("max_jacobian", max_jacobian, 1)
     solver, patient = _solver(solver, rtol, atol)
     patience = patient if patience is None else integer("patience", patience, 1)
@@ -145,17 +150,26 @@ def fit(
     problem = Problem(residual, free, tile_entries(residual, y, max_jacobian, least_squares))
 
     run = _Run.begin(solver, problem, y)
-    keeper = None if checkpoint is None else _Keeper(Path(checkpoint), _about(solver, problem, run))
+    keeper = None if file is None else _Keeper(file, _about(solver, problem, run))
     if keeper is not None:
         run = keeper.resumed(run)
-    with _bar(progress, max_steps) as show:
-        while run.ended(max_steps, patience, rtol) is None:
-            run = run.step(solver, problem)
-            show(run)
-            if callback is not None:
-                callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
-            if keeper is not None:
-                keeper.save(run, checkpoint_seconds)
+    try:
+        with _bar(progress, max_steps) as show:
+            while run.ended(max_steps, patience, rtol) is None:
+                run = run.step(solver, problem)
+                show(run)
+                if callback is not None:
+                    callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
+                if keeper is not None:
+                    keeper.save(run, checkpoint_seconds)
+    except KeyboardInterrupt as stop:
+        if keeper is not None:
+            keeper.save(run)
+            stop.add_note(
+                f"fit: stopped after {len(run.losses)} steps, which {file} holds; the same call goes on from "
+                "there."
+            )
+        raise
     if keeper is not None:
         keeper.save(run)
     return _told(run, problem, run.ended(max_steps, patience, rtol), max_steps)

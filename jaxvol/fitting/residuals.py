@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..camera import Camera
-from ..checks import Arrayable, finite, finite_array
+from ..checks import Arrayable, described, finite, finite_array
 from ..engine import Adjoint, render
 from ..lighting.seam import Lighting
 from ..march import March
@@ -61,6 +61,15 @@ class Residual(eqx.Module):
         return 0.0
 
 
+def check_residual(residual: Any) -> None:
+    """Refuse what is no residual: a transfer function is a function, too."""
+    if isinstance(residual, Transfer) or not (callable(residual) or isinstance(residual, Residual)):
+        raise ValueError(
+            "residual must be an ImageResidual, or a function from parameters to arrays; "
+            f"got {described(residual)}. The order is fit(residual, parameters)."
+        )
+
+
 class OwnResidual(Residual):
     """A function from parameters to arrays, in one piece."""
 
@@ -69,11 +78,6 @@ class OwnResidual(Residual):
 
     @classmethod
     def of(cls, function: Any, parameters: PyTree) -> "OwnResidual":
-        if not callable(function):
-            raise ValueError(
-                "residual must be an ImageResidual, or a function from parameters to arrays; "
-                f"got {type(function).__name__}."
-            )
         shapes = jax.tree.leaves(eqx.filter_eval_shape(function, parameters))
         count = sum(math.prod(leaf.shape) for leaf in shapes)
         if count == 0:
@@ -124,8 +128,8 @@ class ImageResidual(Residual):
 
     A Jacobian that is too large is made in tiles of whole rows of an image.
 
-    **Raises:** `ValueError` for no views, an image of another size than its camera's, NaN or infinite
-    pixels, and a scene that returns something else.
+    **Raises:** `ValueError` for no views, an image of another size than its camera's or of integers, NaN or
+    infinite pixels, and a scene that returns something else.
     """
 
     scene: Scene
@@ -233,7 +237,13 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
             f"views[{number}] must be a pair (camera, image); got {type(camera).__name__} first."
         )
     width, height = camera.size
-    image = np.asarray(image, np.float32)
+    image = np.asarray(image)
+    if image.dtype.kind not in "fV":  # V: JAX's own short floats
+        raise ValueError(
+            f"views[{number}]: the image must be linear RGB, floats in [0, 1]; got {image.dtype}. Pixels of "
+            "a picture file become that by jv.read_views, or by jv.from_srgb(image / 255)."
+        )
+    image = image.astype(np.float32)
     if image.shape not in ((height, width, 3), (height, width, 4)):
         raise ValueError(
             f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, "

@@ -54,8 +54,8 @@ def load(
     guessed: an argument wins over the JSON, the JSON over the name.
 
     Medical images come out scaled (CT in HU), turned so that x, y, z grow towards the patient's left,
-    back and head (LPS). float64 becomes float32. Integers of 32 and 64 bits become int16 or uint16
-    where these hold every value, else float32.
+    back and head (LPS), and float64 becomes float32. Integers of 32 and 64 bits become smaller, from whatever
+    file they come, as `Volume` says.
 
     **Arguments:**
 
@@ -80,7 +80,11 @@ def load(
         fault = "is a directory" if path.is_dir() else "has an unknown ending"
         raise ValueError(f"path: {path} {fault}; expected a file ending in {', '.join(sorted(READERS))}.")
     placed = {name: said for name, said in (("spacing", spacing), ("origin", origin)) if said is not None}
-    return Volume(**(READERS[ending](path, Header(shape, dtype)) | placed))
+    arguments = READERS[ending](path, Header(shape, dtype)) | placed
+    try:
+        return Volume(**arguments)
+    except ValueError as fault:
+        raise ValueError(f"{path}: {fault}") from fault
 
 
 def register(ending: str, reader: Reader) -> None:

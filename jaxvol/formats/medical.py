@@ -45,7 +45,9 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
         )
     # a copy: the view dies with the image
     data = np.array(sitk.GetArrayViewFromImage(image).T, order="C")
-    return {"data": _narrow(path, data), "spacing": image.GetSpacing(), "origin": image.GetOrigin()}
+    if data.dtype == np.float64:
+        data = data.astype(np.float32)
+    return {"data": data, "spacing": image.GetSpacing(), "origin": image.GetOrigin()}
 
 
 def _check_nifti(path: Path, reader: Any, held: int) -> None:
@@ -89,21 +91,3 @@ def _inflated_metaimage(path: Path, reader: Any) -> Any | None:
     image.SetOrigin(reader.GetOrigin())
     image.SetDirection(reader.GetDirection())
     return image
-
-
-def _narrow(path: Path, data: np.ndarray) -> np.ndarray:
-    """The same values in a type that a volume may have."""
-    if data.dtype == np.float64:
-        return data.astype(np.float32)
-    if data.dtype.kind not in "iu" or data.dtype.itemsize < 4:
-        return data
-    low, high = int(data.min()), int(data.max())
-    for dtype in (np.int16, np.uint16):
-        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max:
-            return data.astype(dtype)
-    if max(-low, high) > 2**24:  # float32 holds every integer up to here
-        raise ValueError(
-            f"path: {path} holds {data.dtype} values from {low} to {high}; expected none beyond 2**24, so "
-            "that float32 keeps them apart. Rescale them first."
-        )
-    return data.astype(np.float32)

@@ -66,7 +66,7 @@ def _npy_array(path: Path, stream: Stream, held: int) -> np.ndarray:
         raise
     except Exception as fault:  # what numpy raises depends on how the header is broken
         raise ValueError(f"path: {path} has no valid .npy header ({fault!r}).") from fault
-    if dtype.kind not in "iuf":
+    if dtype.kind not in "biuf":
         raise ValueError(
             f"path: {path} holds an array of type {dtype}; expected integers or floats. "
             "Arrays of objects are pickles, which are never read."

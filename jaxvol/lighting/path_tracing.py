@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32
 
+from ..arguments import check_scene
 from ..camera import Camera
 from ..checks import Arrayable, integer, is_traced, number
 from ..compiled import compiled
@@ -46,10 +47,10 @@ BEFORE_ALL = np.uint32(2**32 - 1)
 
 
 def path_trace(
-    volume: Volume,
-    transfer: Transfer,
-    camera: Camera,
-    lights: Light | tuple[Light, ...],
+    volume: Volume | Any,
+    transfer: Transfer | Any,
+    camera: Camera | Any,
+    lights: Light | tuple[Light, ...] | Any,
     *,
     paths: int | Any = 16,
     key: Any = 0,
@@ -97,6 +98,8 @@ def path_trace(
 
     Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`.
     """
+    order = "path_trace(volume, transfer, camera, lights)"
+    check_scene(order, volume=volume, transfer=transfer, camera=camera)
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):

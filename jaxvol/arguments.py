@@ -1,0 +1,55 @@
+"""Are these a volume, a transfer function, a camera and a march? What renders asks before all else."""
+
+from types import NoneType
+from typing import Any
+
+from .camera import Camera
+from .checks import described
+from .lighting.seam import Lighting
+from .march import March
+from .transfer import Transfer
+from .volume import Volume
+
+
+WANTED: dict[str, tuple[tuple[type, ...], str, str]] = {
+    "volume": (
+        (Volume,),
+        "a jaxvol Volume",
+        "Pass jv.Volume(data, spacing=...) for an array, jv.load(path) for a file, or jv.phantom(name).",
+    ),
+    "transfer": (
+        (Transfer,),
+        "a transfer function",
+        "Pass jv.preset(name), jv.colormap(cmap, clim) or jv.TransferFunction.from_points(points).",
+    ),
+    "camera": (
+        (Camera,),
+        "a jaxvol Camera",
+        "Pass jv.Camera.looking_at(volume) or jv.Camera(position, focal_point).",
+    ),
+    "march": ((March,), "a jaxvol March", "Pass jv.March(step) or jv.March(step, transforms)."),
+    "lighting": (
+        (Lighting, NoneType),
+        "None or a Lighting, such as ScattererTemplates",
+        "Pass lights as jv.lighting.ScattererTemplates(materials, lights).",
+    ),
+}
+"""By the argument's name: what it may be, that in words, and how one is made."""
+
+
+def check_scene(call: str, **arguments: Any) -> None:
+    """Refuse arguments that are something else than their names say.
+
+    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`: told
+    where arguments have changed places.
+
+    **Raises:** `ValueError` naming the first such argument, what came, and what to pass.
+    """
+    for name, value in arguments.items():
+        kinds, wanted, remedy = WANTED[name]
+        if isinstance(value, kinds):
+            continue
+        elsewhere = [n for n, (other, *_) in WANTED.items() if value is not None and isinstance(value, other)]
+        if elsewhere:
+            remedy = f"That is the {elsewhere[0]}: the order is {call}."
+        raise ValueError(f"{name} must be {wanted}; got {described(value)}. {remedy}")

@@ -1,0 +1,95 @@
+"""Why is nothing seen in an image?"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .camera import Camera
+from .locate import Affine, Ray, enter
+from .rendering import Picture
+from .transfer import Transfer, TransferFunction
+from .triple import apart
+from .volume import Volume
+
+
+LEAST = 0.5 / 255
+"""Opacity below which a picture of 8 bits shows nothing."""
+
+RAYS, POINTS = 4096, 128
+"""At how many rays at most, and at how many points of each, a volume's values are looked up."""
+
+
+def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, picture: Picture) -> str | None:
+    """Why nothing shows in an image of this scene, and what to change; None where something shows.
+
+    Nothing shows where no pixel's opacity reaches 1/510, half a level of a picture of 8 bits. Values are
+    looked up at some 4096 rays, 128 points each, on the volume's own grid.
+    """
+    most = float(np.asarray(picture.rgba)[..., 3].max())
+    if most >= LEAST:
+        return None
+    hit, values = (np.asarray(part) for part in _values_along(volume, camera))
+    if not hit.any():
+        low, high = (", ".join(f"{c:g}" for c in np.asarray(corner)) for corner in volume.corners)
+        return (
+            f"no ray of the camera meets the volume, which lies from ({low}) to ({high}). Turn the camera to "
+            "its middle, as Camera.looking_at does."
+        )
+    if most > 0:
+        return (
+            f"the opacity is {most:.2g} at most. Give a shorter unit distance, so that more of it counts, or "
+            "higher opacities."
+        )
+    low, high = float(values[hit].min()), float(values[hit].max())
+    where = f"the volume's values along the rays run from {low:g} to {high:g}"
+    shown = _shown(transfer)
+    if shown is None:
+        return f"{where}, and the transfer function shows nothing, or another label's."
+    if not shown:
+        return f"{where}, and the transfer function's opacity is 0 everywhere."
+    told = " or ".join(_told(*ends) for ends in shown)
+    advice = f" A clim from {low:g} to {high:g} would show something." if low < high else ""
+    return f"{where}, and the transfer function shows values {told}.{advice}"
+
+
+def _told(low: float, high: float) -> str:
+    if high == np.inf:
+        return f"from {low:g} on" if low > -np.inf else "of any kind"
+    return f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}"
+
+
+def _shown(transfer: Transfer) -> list[tuple[float, float]] | None:
+    """The ranges of values that are not transparent. None where that is not for the value alone to say."""
+    if not isinstance(transfer, TransferFunction):
+        return None
+    values = np.asarray(transfer.values)
+    positive = np.concatenate([[False], np.asarray(transfer.extinction) > 0, [False]])
+    ends = np.flatnonzero(positive[1:] != positive[:-1])
+    # a point's opacity reaches to the one before it and the one behind it, the last ones' on for ever
+    reach = np.concatenate([[-np.inf], values, [np.inf]])
+    return [(float(reach[a]), float(reach[b + 1])) for a, b in ends.reshape(-1, 2)]
+
+
+def _values_along(volume: Volume, camera: Camera) -> tuple[Bool[Array, " rays"], Float[Array, "rays points"]]:
+    """For some rays, those that meet the volume first: whether they do, and which values they run through."""
+    space, zero = Affine(volume), jnp.zeros((), jnp.int32)
+
+    @jax.jit
+    def entered(origin: Float[Array, "n 3"], direction: Float[Array, "n 3"]) -> Ray:
+        return jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)))(origin, direction)
+
+    @jax.jit
+    def values(rays: Ray) -> Float[Array, "n points"]:
+        def one(ray: Ray) -> Float[Array, " points"]:
+            return jax.vmap(lambda part: volume.value(ray.path(part * ray.length)))(
+                jnp.linspace(0, 1, POINTS)
+            )
+
+        return jax.vmap(one)(rays)
+
+    rays = entered(*(part.reshape(-1, 3) for part in camera.rays()))
+    hit = rays.length > 0
+    count = max(int(hit.sum()), 1)
+    chosen = jnp.argsort(~hit, stable=True)[: count : -(-count // RAYS)]
+    return hit[chosen], values(jax.tree.map(lambda leaf: leaf[chosen], rays))

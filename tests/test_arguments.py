@@ -1,0 +1,98 @@
+"""What comes in place of a volume, a transfer function, a camera or a march is named, and a way out told."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.lighting import ConstantLight
+
+
+VOLUME = jv.phantom("sphere", 8)
+TRANSFER = jv.colormap("gray", (0, 255), unit_distance=0.01)
+CAMERA = jv.Camera.looking_at(VOLUME, size=(4, 4))
+MARCH = jv.March(0.1)
+LIGHT = ConstantLight()
+RAY = [0.0, 0.0, -5.0], [0.0, 0.0, 1.0]
+RAYS = [RAY[0]], [RAY[1]]
+
+BAD = {
+    "camera and march swapped": (
+        lambda: jv.render(VOLUME, TRANSFER, MARCH, CAMERA),
+        r"camera must be a jaxvol Camera; got a March\. That is the march: "
+        r"the order is render\(volume, transfer, camera, march\)",
+    ),
+    "volume and transfer swapped": (
+        lambda: jv.render(TRANSFER, VOLUME, CAMERA, MARCH),
+        "volume must be a jaxvol Volume; got a TransferFunction. That is the transfer",
+    ),
+    "an array": (
+        lambda: jv.render(np.zeros((4, 5, 6), np.uint8), TRANSFER, CAMERA, MARCH),
+        r"volume must be a jaxvol Volume; got a NumPy array of shape \(4, 5, 6\) and type uint8\. "
+        r"Pass jv\.Volume\(data, spacing=\.\.\.\)",
+    ),
+    "a traced array": (
+        lambda: jax.jit(lambda data: jv.render(data, TRANSFER, CAMERA, MARCH).rgba)(VOLUME.data),
+        "volume must be a jaxvol Volume; got a traced array of shape",
+    ),
+    "a path": (lambda: jv.render("a.nrrd", TRANSFER, CAMERA, MARCH), r"got 'a\.nrrd'\. .*jv\.load\(path\)"),
+    "no transfer function": (
+        lambda: jv.render(VOLUME, None, CAMERA, MARCH),
+        r"transfer must be a transfer function; got None\. Pass jv\.preset\(name\)",
+    ),
+    "a step": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, 0.1),
+        r"march must be a jaxvol March; got 0\.1\. Pass jv\.March\(step\)",
+    ),
+    "a class": (lambda: jv.render(VOLUME, TRANSFER, CAMERA, jv.March), "got the class March"),
+    "a light": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting=LIGHT),
+        "lighting must be None or a Lighting, .*; got a ConstantLight. Pass lights as",
+    ),
+    "rays' march": (lambda: jv.render_rays(VOLUME, TRANSFER, *RAYS, 0.1), r"march must be .*got 0\.1"),
+    "rays' order": (
+        lambda: jv.render_rays(TRANSFER, VOLUME, *RAYS, MARCH),
+        r"the order is render_rays\(volume, transfer, origins, directions, march\)",
+    ),
+    "rays of text": (
+        lambda: jv.render_rays(VOLUME, TRANSFER, "abc", RAYS[1], MARCH),
+        r"origins must be numbers of shape \(\*rays, 3\); got 'abc'",
+    ),
+    "complex rays": (
+        lambda: jv.render_rays(VOLUME, TRANSFER, RAYS[0], np.array(RAYS[1]) * 1j, MARCH),
+        "directions must be numbers",
+    ),
+    "reference": (
+        lambda: jv.render_ray_reference(VOLUME, TRANSFER, *RAY, CAMERA),
+        r"march must be a jaxvol March; got a Camera",
+    ),
+    "reference's ray": (
+        lambda: jv.render_ray_reference(VOLUME, TRANSFER, RAYS[0], RAYS[1], MARCH),
+        r"origin must have shape \(3,\); got shape \(1, 3\)",
+    ),
+    "paths": (
+        lambda: jv.path_trace(VOLUME, CAMERA, TRANSFER, LIGHT),
+        r"transfer must be .*got a Camera.*the order is path_trace\(volume, transfer, camera, lights\)",
+    ),
+    "paths in an array": (lambda: jv.path_trace(np.zeros(3), TRANSFER, CAMERA, LIGHT), "volume must be"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_something_else_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_rays_of_any_type_of_numbers_see_the_same():
+    expected = jv.render_rays(VOLUME, TRANSFER, *(jnp.asarray(part) for part in RAYS), MARCH).rgba
+    assert expected[0, 3] > 0.1
+    for convert in (np.int64, np.int8, np.float16, np.float64, lambda rays: rays):
+        seen = jv.render_rays(VOLUME, TRANSFER, *(convert(part) for part in RAYS), MARCH).rgba
+        np.testing.assert_array_equal(seen, expected)
+    for convert in (np.array, np.int64, lambda ray: ray):
+        one = jv.render_ray_reference(VOLUME, TRANSFER, *(convert(part) for part in RAY), MARCH)
+        assert one.rgba.dtype == jnp.float32
+        np.testing.assert_allclose(one.rgba, expected[0], atol=2e-6)
