@@ -17,12 +17,12 @@ from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 from .common import BLACK, Page, options
 
 
-AROUND = ConstantLight((0.1, 0.1, 0.1))
+AROUND = ConstantLight((1.3, 1.3, 1.3))
 COLUMNS: dict[str, tuple[float, dict[str, Any]] | None] = {
     "no light": None,
-    "as published": (3, {"occlusion": "hard"}),
+    "as published": (40, {"occlusion": "hard"}),
     "soft, 4 templates blended": (
-        7,
+        90,
         {"templates": 4, "blend": True, "packets": 16, "threshold": 0.004, "reach": (2, 4, 8)},
     ),
 }
