@@ -561,12 +561,12 @@ def test_values_and_gradients_are_finite_at_extremes(occlusion):
 # ---------------------------------------------------------------- one scale
 
 
-def half_space(opacity, light, extinction=1.0):
+def half_space(opacity, light):
     """Radiance, seen along the normal, of white matter that fills all below a face."""
     volume = jv.Volume(np.full((4, 4, 101), 0.5, np.float32), (20.0, 20.0, 0.2))
     x, y, _ = volume.center
     camera = jv.Camera((x, y, -1000), volume.center, (0, 1, 0), 0.01, size=(2, 2))
-    transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [extinction] * 2)
+    transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [1.0, 1.0])
     march = jv.March(0.1, (jv.AlphaCorrection(), jv.EarlyTermination(1e-3)), "midpoint")
     lighting = ScattererTemplates(
         Material(opacity, 1.0, 1.4), light, templates=2, blend=True, photons=40, levels=8
