@@ -169,14 +169,10 @@ class _How(eqx.Module):
     def require_room(self, camera: Camera) -> None:
         """**Raises** `ValueError` where a wave would not fit into memory."""
         walks = self.pixels(camera) * self.paths
-        asks = f"for {self.pixels(camera)} pixels at once"
         require_room(
-            walks * BYTES_OF_RESULT,
-            f"paths={self.paths} {asks}; trace fewer paths, and others onto them (onto=, of the same key)",
-        )
-        require_room(
-            min(self.lanes, walks) * BYTES_OF_WALK,
-            f"lanes={self.lanes} {asks}; take fewer, no result changes",
+            walks * BYTES_OF_RESULT + min(self.lanes, walks) * BYTES_OF_WALK,
+            f"lanes={self.lanes} and paths={self.paths}, {self.pixels(camera)} pixels at once; take fewer "
+            "lanes, which changes no result, or fewer paths, and add others to them by `onto`",
         )
 
 
