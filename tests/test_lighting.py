@@ -26,6 +26,7 @@ from jaxvol.lighting import (
     seam,
 )
 from jaxvol.lighting.baked import BakedLighting
+from jaxvol.lighting.deferred import Line, lit_picture
 from jaxvol.lighting.seam import Sample, Shading, Surroundings, lit
 from jaxvol.locate import Affine
 from jaxvol.triple import apart
@@ -643,13 +644,17 @@ def test_nan_in_what_is_baked_reaches_all_of_it():
     assert np.isnan(shade(lighting, volume, PLAIN, points)).all()
 
 
-def test_nan_reaches_deferred_light():
-    volume, transfer = scaled_phantom("sphere", 12), soft_transfer(0.1)
-    broken = eqx.tree_at(lambda t: t.extinction, transfer, jnp.full_like(transfer.extinction, jnp.nan))
-    march = jv.March(0.2, (jv.AlphaCorrection(),))
-    image = jv.render(volume, broken, around(volume, (4, 3)), march, lighting=Deferred(templates())).rgba
-    assert np.isnan(image).any()
-    assert np.all(np.isnan(image).all(axis=-1) == np.isnan(image).any(axis=-1))
+def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
+    volume, space = nodes({}), Affine(nodes({}))
+    lighting = ScattererTemplates(MATERIALS, lights(sky=True), given=given(PAIR, PAIR), reach=(2.0,))
+    seen = seam.classification(volume, TRANSFER, space, lighting)
+    zero = jnp.zeros((), jnp.int32)
+    line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
+    rgba = jnp.asarray([[jnp.nan] * 4, [0.5] * 4, [0.0] * 4])
+    found = jax.jit(lambda rgba, depth: lit_picture(seen, space, lambda _: line, rgba, depth))(
+        rgba, jnp.asarray([jnp.nan, 0.0, jnp.inf])
+    )
+    np.testing.assert_array_equal(np.isnan(found), [[True] * 4, [False] * 4, [False] * 4])
 
 
 # ---------------------------------------------------------------- baked
