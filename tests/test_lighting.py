@@ -1160,8 +1160,8 @@ BAD = {
     ),
     "no opacity": (lambda: ScattererTemplates([HALF, Material(0, 1.0)], SUN), "opacity must be above 0"),
     "many templates": (
-        lambda: ScattererTemplates(HALF, SUN, templates=10**6).grown(blend=False),
-        "1000000 templates.*asks for .* GiB of memory, and the device has",
+        lambda: ScattererTemplates(HALF, SUN, templates=10**9).grown(blend=False),
+        "1000000000 templates.*asks for .* GiB of memory, and the device has",
     ),
     "a fine grid": (
         lambda: ScattererTemplates(HALF, SUN, baked=10**5).prepared(nodes({}), TRANSFER, jv.March(0.1)),

@@ -405,7 +405,10 @@ BAD = {
         lambda: scatterer_template(HALF, 0, threshold=1e-9, levels=40),
         "templates.*levels=40.*threshold.*asks for .* GiB of memory, and the device has",
     ),
-    "too many templates": (lambda: scatterer_templates(HALF, 0, count=10**6), "1000000 templates.*asks for"),
+    "too many templates": (
+        lambda: scatterer_templates(HALF, 0, count=10**9),
+        "1000000000 templates.*asks for",
+    ),
     "traced": (traced_opacity, "levels must be given where opacity is traced"),
     "endless": (
         lambda: scatterer_template(Material(1.0, 1.0), 0, energy="printed"),

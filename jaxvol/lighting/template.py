@@ -28,8 +28,9 @@ from .memory import require_room
 
 Energy = Literal["conserving", "printed"]
 
-BYTES = 64
-"""Memory that a photon takes while a template grows."""
+BYTES, BYTES_OF_PAIR = 256, 16
+"""Memory that a photon takes while a template grows, with its draws, sorted and gathered; and what each pair
+of photons takes, by whose distance they are merged."""
 
 FADES = 0.8
 """From the threshold down to this part of it a photon fades."""
@@ -295,8 +296,7 @@ class _Growth(NamedTuple):
         """**Raises** `ValueError` where so many templates would not fit into memory."""
         tree = sum(min(self.packets * 2**level, self.most) for level in range(min(self.levels, 64)))
         tree += max(self.levels - 64, 0) * self.most
-        # a photon, sorted and gathered, and the draws of its level; to merge it, its distance from each other
-        each = tree * (BYTES + (4 * tree if self.merge > 0 else 0))
+        each = tree * (BYTES + (BYTES_OF_PAIR * tree if self.merge > 0 else 0))
         require_room(
             templates * each,
             f"{templates} templates, grown from {tree} photons each (packets={self.packets}, "
