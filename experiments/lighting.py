@@ -45,7 +45,8 @@ from .scenes import Scene, skin_head
 GOALS = {"templates": 2.2, "baked": 1.2}
 FEW = 8  # photons of each template, where several are blended and deferred
 FLESH = jv.Material(0.5, 0.05, 1.4)
-LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (4.0, 4.0, 4.0)), ConstantLight((0.1, 0.1, 0.1))
+LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (50.0, 50.0, 50.0)), ConstantLight((1.3, 1.3, 1.3))
+"""Bright, since flesh that absorbs half of each scattering reflects a sixth of white light from all sides."""
 UNLIT = "unlit"
 PHOTONS, BLENDED, BAKED, HARD = "photons", "templates blended", "baked", "hard occlusion"
 ONCE, BLENDED_ONCE, BAKED_ONCE = "photons, deferred", "templates blended, deferred", "baked, deferred"

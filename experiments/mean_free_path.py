@@ -4,10 +4,11 @@ Three balls of three materials, lit from the side, are rendered with scatterer t
 long, or too short, Levenberg–Marquardt looks for the three mean free paths.
 
 Then one ball at a time, of an optical thickness from far below 1 to far above, rendered with templates and
-by path tracing. A template says from where light reaches a sample, not how much of it leaves the object: so
-the brightness of the lights is fitted along with the mean free path, and what remains is the bias of the
-model. Twice: with the extinction that the camera's rays meet known, and with it following from the mean free
-path, as it does in the path tracer. Objects too small for their mean free path leave it undetermined.
+by path tracing. Templates are on the scale of path tracing, but only near it, and farther off where objects
+are thin and colours dark: so the brightness of the lights is fitted along with the mean free path, and what
+remains is the bias of the model. Twice: with the extinction that the camera's rays meet known, and with it
+following from the mean free path, as it does in the path tracer. Objects too small for their mean free path
+leave it undetermined.
 """
 
 from collections.abc import Sequence

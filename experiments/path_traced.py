@@ -1,9 +1,9 @@
 """How near do scatterer templates come to light as it is scattered, and in what time?
 
 The head phantom, of skin, muscle and bone, lit from the side: path traced, with standard errors; and rendered
-without light, and with templates, hard and soft, one for each pixel and blended. Templates have no scale of
-their own, so each image is first multiplied by the number that brings it nearest to the path-traced one.
-What that leaves is the error; what noise is in the reference is told beside it.
+without light, and with templates, hard and soft, one for each pixel and blended. Each image is compared as
+it is, and multiplied by the number that brings it nearest to the path-traced one: 1 for templates, were they
+on the same scale; the unlit image has none. What noise is in the reference is told beside it.
 """
 
 import time
@@ -79,8 +79,12 @@ def measure(
         image = np.asarray(frame(each))
         scale = float(np.sum(image * wanted) / np.sum(image**2))
         images[name] = image * scale
-        error = float(np.sqrt(np.mean((images[name] - wanted) ** 2)))
-        rows[name] = {**common.row(taken[name], taken[UNLIT], error), "scale": scale}
+        as_it_is, error = (float(np.sqrt(np.mean((i - wanted) ** 2))) for i in (image, images[name]))
+        rows[name] = {
+            **common.row(taken[name], taken[UNLIT], error),
+            "scale": scale,
+            "rmse as it is": as_it_is,
+        }
     return rows, images
 
 

@@ -21,7 +21,7 @@ from .common import BLACK, Page, options
 GAP, THICK, RADIUS = 0.15, 0.06, 0.75
 """Between ear and head, of the ear, of the head; the cube is 2 wide."""
 FLESH = jv.Material(0.5, 0.045, 1.4)
-LIGHTS = DirectionalLight((0.0, -1.0, 0.0), (4.0, 4.0, 4.0)), ConstantLight((0.03, 0.03, 0.03))
+LIGHTS = DirectionalLight((0.0, -1.0, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
 HOW: dict[str, Any] = {"occlusion": "hard", "templates": 8, "blend": True, "packets": 8, "cutoff": 0.001}
 REACHES: dict[str, tuple[float, ...]] = {"photons alone": (), "tested at 2, 4, 8 times": (2, 4, 8)}
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])

@@ -18,8 +18,8 @@ from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 from .common import BLACK, Page, options
 
 
-IRRADIANCE = (3.0, 3.0, 3.0)
-AROUND = ConstantLight((0.1, 0.1, 0.1))
+IRRADIANCE = (40.0, 40.0, 40.0)
+AROUND = ConstantLight((1.3, 1.3, 1.3))
 BLENDED = {"templates": 4, "blend": True, "packets": 16, "threshold": 0.004, "reach": (2, 4, 8)}
 COLUMNS: dict[str, dict[str, Any] | None] = {
     "no light": None,

@@ -22,10 +22,10 @@ FAR = 0.2
 """Of photons from their sample; the cube is 2 wide."""
 AIR, SKIN, DEEP, DEEPER, VEIL = 0.0, 1.0, 2.0, 3.0, 0.25
 PALE, RED, BLUE, GREY = (0.75, 0.6, 0.5), (0.9, 0.1, 0.05), (0.1, 0.2, 0.9), (0.1, 0.1, 0.1)
-LEFT = DirectionalLight((1.0, 0.3, -0.4), (1.8, 1.8, 1.8))
-BESIDE = DirectionalLight((1.0, -0.25, -0.15), (1.8, 1.8, 1.8))
-ABOVE = DirectionalLight((0.7, 0.1, -0.8), (1.2, 1.2, 1.2))
-SKY = ConstantLight((0.06, 0.06, 0.06))
+LEFT = DirectionalLight((1.0, 0.3, -0.4), (28.0, 28.0, 28.0))
+BESIDE = DirectionalLight((1.0, -0.25, -0.15), (28.0, 28.0, 28.0))
+ABOVE = DirectionalLight((0.7, 0.1, -0.8), (19.0, 19.0, 19.0))
+SKY = ConstantLight((1.0, 1.0, 1.0))
 Place = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -83,7 +83,7 @@ def veiled(place: Place, voxel: float) -> np.ndarray:
 
 STEPS: dict[str, tuple[Look, Look]] = {
     "1: photons nearer to the light": (
-        Look("a sky, nearer to all", ball, lights=(ConstantLight((0.25, 0.25, 0.25)),)),
+        Look("a sky, nearer to all", ball, lights=(ConstantLight((4.0, 4.0, 4.0)),)),
         Look("a sun from the left", ball, lights=(BESIDE,)),
     ),
     "2: that are not hidden": (

@@ -26,10 +26,12 @@ from jaxvol.lighting import (
     seam,
 )
 from jaxvol.lighting.baked import BakedLighting
+from jaxvol.lighting.deferred import Line, lit_picture
 from jaxvol.lighting.seam import Sample, Shading, Surroundings, lit
 from jaxvol.locate import Affine
 from jaxvol.triple import apart
 
+from .half_space import chandrasekhar, reflected, under_sky
 from .scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer
 
 
@@ -90,7 +92,16 @@ MATERIALS = (
     Material(0.5, 0.7, 1.2, values=(0.9, 1.3)),
     Material(0.8, 0.4, 0.8, values=(1.9, 2.3)),
 )
-POWER = np.array([1.0, 2.0, 3.0])
+IRRADIANCE = np.array([1.0, 2.0, 3.0])
+
+
+def radiance_of(opacity, irradiance=1.0):
+    """What a sample of a material makes of E b (c + s): 4 / (3π) times the reflectance of a half-space."""
+    gamma = np.sqrt(opacity)
+    return 4 / (3 * np.pi) * (1 - gamma) / (1 + gamma) * (1 - gamma / (3 * (1 + gamma))) * irradiance
+
+
+POWER = radiance_of(0.5, IRRADIANCE)
 PAIR = (((2, 0, 0), 0.3), ((-2, 0, 0), 0.6))
 
 
@@ -113,10 +124,10 @@ def lights(*, sun=None, lamp=None, sky=False):
     dark = np.zeros(3)
     return (
         DirectionalLight(
-            (0, 0, 1) if sun is None else -np.asarray(sun, float), dark if sun is None else POWER
+            (0, 0, 1) if sun is None else -np.asarray(sun, float), dark if sun is None else IRRADIANCE
         ),
-        PointLight((9, 9, 9) if lamp is None else lamp, dark if lamp is None else POWER),
-        ConstantLight(POWER if sky else dark),
+        PointLight((9, 9, 9) if lamp is None else lamp, dark if lamp is None else IRRADIANCE),
+        ConstantLight(IRRADIANCE if sky else dark),
     )
 
 
@@ -294,7 +305,7 @@ def test_materials_by_label_are_where_the_label_is():
     hard, soft = (
         shade(
             ScattererTemplates(
-                skin, ConstantLight(POWER), occlusion=occlusion, reach=(2.0,), given=given(photons)
+                skin, ConstantLight(IRRADIANCE), occlusion=occlusion, reach=(2.0,), given=given(photons)
             ),
             volume,
             TRANSFER,
@@ -496,7 +507,7 @@ EXTREMES = {
     "as it is": {},
     "nothing is seen": {"extinction": 0.0},
     "all is opaque": {"extinction": 1e6},
-    "nothing is absorbed": {"opacity": 0.0},
+    "hardly anything is absorbed": {"opacity": 0.02},
     "all is absorbed": {"opacity": 1.0},
     "a short path": {"path": 1e-6},
     "a long path": {"path": 1e6},
@@ -546,6 +557,104 @@ def test_values_and_gradients_are_finite_at_extremes(occlusion):
         assert np.isfinite(value), name
         for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
             assert np.all(np.isfinite(leaf)), (name, jax.tree_util.keystr(path))
+
+
+# ---------------------------------------------------------------- one scale
+
+
+def half_space(opacity, light):
+    """Radiance, seen along the normal, of white matter that fills all below a face."""
+    volume = jv.Volume(np.full((4, 4, 101), 0.5, np.float32), (20.0, 20.0, 0.2))
+    x, y, _ = volume.center
+    camera = jv.Camera((x, y, -1000), volume.center, (0, 1, 0), 0.01, size=(2, 2))
+    transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [1.0, 1.0])
+    march = jv.March(0.1, (jv.AlphaCorrection(), jv.EarlyTermination(1e-3)), "midpoint")
+    lighting = ScattererTemplates(
+        Material(opacity, 1.0, 1.4), light, templates=2, blend=True, photons=40, levels=8
+    )
+    return float(jv.render(volume, transfer, camera, march, lighting=lighting).rgba[..., :3].mean())
+
+
+def test_templates_are_as_bright_as_path_tracing():
+    """In closed form: what a half-space reflects of light from all sides, and of parallel light."""
+    for opacity in (0.1, 0.3, 0.6):
+        albedo = np.array([1 - opacity])
+        sky = half_space(opacity, (DirectionalLight((0, 0, 1), (0, 0, 0)), ConstantLight((2, 2, 2))))
+        sun = half_space(opacity, (DirectionalLight((0, 0, 1), (2, 2, 2)), ConstantLight((0, 0, 0))))
+        np.testing.assert_allclose(sky / 2, 0.95 * under_sky(albedo, 1.0), rtol=0.08)
+        np.testing.assert_allclose(sun / 2, 0.98 * reflected(albedo, 1.0, 1.0), rtol=0.12)
+
+
+def test_the_reflectance_of_a_material_is_that_of_multiple_scattering():
+    """All light of a half-space of H, integrated over the directions in which it leaves."""
+    nodes, weights = np.polynomial.legendre.leggauss(32)
+    for opacity in (0.001, 0.05, 0.3, 0.7, 0.99):
+        cosines = (nodes + 1) / 2
+        h = np.array([chandrasekhar(np.array([1 - opacity]), mu)[0] for mu in cosines])
+        exact = 1 - np.sqrt(opacity) * np.sum(weights * cosines * h)
+        np.testing.assert_allclose(Material(opacity, 1.0).optics.reflectance, exact, atol=0.0015)
+
+
+def test_the_threshold_does_not_show_in_the_brightness():
+    """What it cuts off is given back."""
+    coarse, fine = (
+        ScattererTemplates(Material(0.1, 1.0), SUN, threshold=threshold).grown(blend=False)
+        for threshold in (0.02, 0.005)
+    )
+    for found in (coarse, fine, coarse.brightest(4)):
+        np.testing.assert_allclose(found.intensity.sum(-1), 1, rtol=1e-5)
+
+
+# ---------------------------------------------------------------- NaN
+
+
+@pytest.mark.parametrize("occlusion", ["soft", "hard"])
+def test_nan_in_light_or_material_reaches_the_sample(occlusion):
+    """By `tree_at`, as an optimiser puts it there."""
+    lighting = ScattererTemplates(
+        MATERIALS, lights(sun=(1, 0, 0)), occlusion=occlusion, templates=1, photons=4, levels=2, cutoff=1e-6
+    )
+    volume, point = nodes({}), [(0, 0, 0)]
+    assert np.isfinite(shade(lighting, volume, TRANSFER, point)).all()
+    for where in (
+        lambda how: how.lights[0].direction,
+        lambda how: how.lights[0].irradiance,
+        lambda how: how.lights[1].position,
+        lambda how: how.lights[2].radiance,
+        lambda how: how.materials[0].opacity,
+        lambda how: how.materials[0].mean_free_path,
+        lambda how: how.materials[0].refractive_index,
+        lambda how: how.materials[0].values,
+    ):
+        broken = eqx.tree_at(where, lighting, jnp.full_like(where(lighting), jnp.nan))
+        assert np.isnan(shade(broken, volume, TRANSFER, point)).all()
+
+
+def test_a_traced_opacity_that_leaves_no_photon_makes_nan():
+    lighting = ScattererTemplates(MATERIALS, lights(sky=True), templates=1, levels=2, photons=4)
+    faint = eqx.tree_at(lambda how: how.materials[0].opacity, lighting, jnp.asarray(0.03))
+    assert np.isnan(shade(faint, nodes({}), TRANSFER, [(0, 0, 0)])).all()
+
+
+def test_nan_in_what_is_baked_reaches_all_of_it():
+    volume, points, how = baked_scene()
+    dark = DirectionalLight((0, 0, -1.0), (1.0, 1.0, 1.0))
+    broken = eqx.tree_at(lambda light: light.irradiance, dark, jnp.full(3, jnp.nan))
+    lighting = ScattererTemplates(FLESH, broken, baked=5, **how)
+    assert np.isnan(shade(lighting, volume, PLAIN, points)).all()
+
+
+def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
+    volume, space = nodes({}), Affine(nodes({}))
+    lighting = ScattererTemplates(MATERIALS, lights(sky=True), given=given(PAIR, PAIR), reach=(2.0,))
+    seen = seam.classification(volume, TRANSFER, space, lighting)
+    zero = jnp.zeros((), jnp.int32)
+    line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
+    rgba = jnp.asarray([[jnp.nan] * 4, [0.5] * 4, [0.0] * 4])
+    found = jax.jit(lambda rgba, depth: lit_picture(seen, space, lambda _: line, rgba, depth))(
+        rgba, jnp.asarray([jnp.nan, 0.0, jnp.inf])
+    )
+    np.testing.assert_array_equal(np.isnan(found), [[True] * 4, [False] * 4, [False] * 4])
 
 
 # ---------------------------------------------------------------- baked
@@ -614,6 +723,38 @@ def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(slope))
 
 
+@pytest.mark.parametrize("kind", ["float32", "uint8"])
+def test_an_image_by_baked_light_has_the_gradient_of_all_but_the_light(kind):
+    """Replay, the default, against JAX's own derivative of the reference."""
+    sphere = scaled_phantom("sphere", 12)
+    whole = kind == "uint8"
+    data = np.asarray(sphere.data * (255 if whole else 1)).astype(kind)
+    volume = jv.Volume(data, sphere.spacing, sphere.origin)
+    transfer = soft_transfer(0.1)
+    if whole:
+        transfer = eqx.tree_at(lambda t: t.values, transfer, 255 * transfer.values)
+    march, camera = jv.March(0.2, (jv.AlphaCorrection(),), max_samples=32), around(volume, (9, 7))
+    lighting = templates(materials=Material(0.5, 0.15, 1.4), baked=8)
+
+    def loss(scene, adjoint):
+        return jnp.sum(jv.render(*scene, march, lighting=lighting, adjoint=adjoint).rgba ** 2)
+
+    replay, direct = (
+        eqx.filter_jit(eqx.filter_grad(loss))((volume, transfer, camera), adjoint)
+        for adjoint in ("replay", "direct")
+    )
+    for where in (
+        *(() if whole else (lambda s: s[0].data,)),
+        lambda s: s[1].colors,
+        lambda s: s[1].extinction[2:],  # where it is 0 nothing is lit
+        lambda s: s[2].position,
+        lambda s: s[2].view_angle,
+    ):
+        size = float(np.abs(where(direct)).max())
+        assert size > 0
+        np.testing.assert_allclose(where(replay), where(direct), rtol=1e-3, atol=1e-4 * size)
+
+
 def shade_traced(lighting, volume, points):
     pixels = jnp.zeros((len(points), 2), jnp.int32)
     return lit_points(lighting, volume, PLAIN, jnp.asarray(points, float), pixels, jnp.ones(()))
@@ -623,9 +764,9 @@ def shade_traced(lighting, volume, points):
 
 SIZE = (16, 12)
 MANY = (
-    DirectionalLight((0.6, 0.8, -1.0), (0.9, 0.8, 0.7)),
-    PointLight((0.9, -1.2, 1.4), (1.0, 1.0, 2.0)),
-    ConstantLight((0.1, 0.15, 0.2)),
+    DirectionalLight((0.6, 0.8, -1.0), (14.0, 13.0, 11.0)),
+    PointLight((0.9, -1.2, 1.4), (16.0, 16.0, 32.0)),
+    ConstantLight((1.6, 2.4, 3.2)),
 )
 PARTS = (Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.8, 0.1, 1.5, values=(0.5, 2.0)))
 SETS = {
@@ -894,12 +1035,7 @@ def image_scene():
     camera = jv.Camera((1.9, -1.3, 1.7), tuple(map(float, volume.center)), (0.1, 0, 1), 40.0, size=(6, 5))
     march = jv.March(0.21, (jv.AlphaCorrection(),), "midpoint", max_samples=32)
     materials = Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.7, 0.1, 1.2, values=(0.5, 2.0))
-    lights = (
-        DirectionalLight((0.6, 0.8, -1.0), (0.9, 0.8, 0.7)),
-        PointLight((0.9, -1.2, 1.4), (1.0, 1.0, 2.0)),
-        ConstantLight((0.1, 0.15, 0.2)),
-    )
-    return volume, transfer, camera, march, templates(materials=materials, light=lights)
+    return volume, transfer, camera, march, templates(materials=materials)
 
 
 def deferred(scene):
@@ -1018,6 +1154,19 @@ BAD = {
     "cutoff": (lambda: ScattererTemplates(HALF, SUN, cutoff=1.0), "cutoff must be"),
     "seed": (lambda: ScattererTemplates(HALF, SUN, seed=-1), "seed must be an integer"),
     "baked": (lambda: ScattererTemplates(HALF, SUN, baked=1), "baked must be an integer of at least 2"),
+    "an opacity too low": (
+        lambda: ScattererTemplates(Material(0.03, 1.0), SUN),
+        "opacity 0.03 leaves no photon .*threshold=0.01.*packets=4.*a threshold of at most 0.0075",
+    ),
+    "no opacity": (lambda: ScattererTemplates([HALF, Material(0, 1.0)], SUN), "opacity must be above 0"),
+    "many templates": (
+        lambda: ScattererTemplates(HALF, SUN, templates=10**9).grown(blend=False),
+        "1000000000 templates.*asks for .* GiB of memory, and the device has",
+    ),
+    "a fine grid": (
+        lambda: ScattererTemplates(HALF, SUN, baked=10**5).prepared(nodes({}), TRANSFER, jv.March(0.1)),
+        "nodes for baked=100000.*asks for .* GiB",
+    ),
     "threshold": (lambda: ScattererTemplates(HALF, SUN, threshold=0.0), "threshold must be"),
     "packets": (lambda: ScattererTemplates(HALF, SUN, packets=0), "packets must be an integer"),
     "energy": (lambda: ScattererTemplates(HALF, SUN, energy="lost"), "energy must be one of"),

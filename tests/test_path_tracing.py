@@ -6,6 +6,7 @@ NumPy, by z-scores of pixels and of means over regions. Seeds are fixed, so that
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.ndimage import map_coordinates
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, Material, PointLight
 
+from .half_space import reflected, under_sky
 from .scenes import anisotropic_noise, around, in_float64, inside, soft_transfer, uniform_transfer
 
 
@@ -190,34 +192,114 @@ def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_tol
     assert abs(z_of_regions(more.radiance - expected, more.standard_error**2)).max() < 4
 
 
-def chandrasekhar(albedo: np.ndarray, cosine: float) -> np.ndarray:
-    """His function H for isotropic scattering, by iterating its integral equation."""
-    nodes, weights = np.polynomial.legendre.leggauss(64)
-    nodes, weights = (nodes + 1) / 2, weights / 2
-    h = np.ones((len(albedo), 64))
-    root = np.sqrt(1 - albedo)[:, None]
-
-    def next_of(mu):
-        kernel = nodes / (mu[:, None] + nodes)
-        return 1 / (root + (albedo[:, None] / 2) * ((h * weights) @ kernel.T))
-
-    for _ in range(200):
-        h = next_of(nodes)
-    return next_of(np.asarray([cosine]))[:, 0]
-
-
 @pytest.mark.parametrize("albedo", [(0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
 def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(albedo):
     # a half-space is a cube of 60 mean free paths, seen in the middle of a side
     albedo, cosine, volume = np.array(albedo), 0.6, cube()
     sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
     traced = often(8, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lit(sun))
-    h = chandrasekhar(albedo, 1.0) * chandrasekhar(albedo, cosine)
-    expected = albedo / 4 * cosine / (1 + cosine) * h
+    expected = np.pi * reflected(albedo, 1.0, cosine)
     mean = np.asarray(traced.radiance, float).mean(axis=(0, 1))
     error = np.sqrt((np.asarray(traced.standard_error, float) ** 2).sum(axis=(0, 1))) / 320
     assert np.all(error < 0.005 * expected)
     assert np.all(abs(mean - expected) < 3 * error)
+
+
+def test_of_light_from_all_sides_a_half_space_reflects_its_closed_form():
+    albedo, volume = np.array([0.5, 0.8, 0.95]), cube()
+    sky = lit(ConstantLight((2.0, 2.0, 2.0)))
+    traced = often(2, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), sky)
+    expected = 2 * under_sky(albedo, 1.0)
+    error = np.sqrt((np.asarray(traced.standard_error, float) ** 2).sum(axis=(0, 1))) / 320
+    assert np.all(error < 0.01 * expected)
+    assert np.all(abs(np.asarray(traced.radiance, float).mean(axis=(0, 1)) - expected) < 3 * error)
+
+
+def scene_of(volume, **changed):
+    """All that an image is made of, as one tree."""
+    whole = {
+        "volume": volume,
+        "transfer": spiky(),
+        "camera": around(volume),
+        "lights": lit(SUN, LAMP, SKY),
+        "anisotropy": jnp.float32(0.0),
+    }
+    return whole | changed
+
+
+def image_of(scene, **how):
+    given = [scene[name] for name in ("volume", "transfer", "camera", "lights")]
+    return trace(*given, anisotropy=scene["anisotropy"], **how).radiance
+
+
+@pytest.mark.parametrize("name", ["volume", "transfer", "camera", "lights", "anisotropy"])
+def test_it_refuses_to_be_differentiated(name):
+    scene = scene_of(anisotropic_noise())
+
+    def loss(part):
+        return image_of(scene | {name: part}).sum()
+
+    def of_materials(path):
+        return image_of(scene, materials=Material(0.5, path)).sum()
+
+    part = scene[name]
+    still = jax.tree.map(jnp.zeros_like, part)
+    for derivative in (
+        lambda: jax.grad(loss)(part),
+        lambda: jax.jit(jax.grad(loss))(part),
+        lambda: jax.grad(jax.jit(loss))(part),
+        lambda: jax.jvp(loss, (part,), (still,)),
+        lambda: jax.linearize(loss, part),
+        lambda: jax.vmap(jax.grad(loss))(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), part)),
+        lambda: jax.grad(of_materials)(0.5),
+    ):
+        with pytest.raises(RuntimeError, match=r"path_trace has no derivative.*ScattererTemplates"):
+            derivative()
+
+
+def test_it_may_stand_in_what_is_differentiated_with_respect_to_something_else():
+    scene = scene_of(anisotropic_noise())
+    expected = float(image_of(scene).mean())
+
+    def loss(gain):
+        tinted = ConstantLight(jax.lax.stop_gradient(gain) * scene["lights"][2].radiance)
+        return gain * image_of(scene | {"lights": (*scene["lights"][:2], tinted)}).mean()
+
+    np.testing.assert_allclose(jax.grad(loss)(1.0), expected, rtol=1e-5)
+    assert jax.eval_shape(jax.jit(jax.grad(loss)), 1.0).shape == ()
+
+
+@pytest.mark.slow
+def test_many_images_at_once_are_those_one_by_one():
+    scene = scene_of(anisotropic_noise())
+    skies = jnp.asarray([[0.5, 1.0, 0.7], [2.0, 0.1, 0.0]])
+
+    def image(radiance):
+        return image_of(scene | {"lights": (*scene["lights"][:2], ConstantLight(radiance))})
+
+    np.testing.assert_allclose(jax.vmap(image)(skies), [image(sky) for sky in skies], rtol=1e-4, atol=1e-6)
+
+
+BROKEN = {
+    "transfer": lambda scene: scene["transfer"].extinction,
+    "color": lambda scene: scene["transfer"].colors,
+    "light": lambda scene: scene["lights"][0].irradiance,
+    "direction": lambda scene: scene["lights"][0].direction,
+    "sky": lambda scene: scene["lights"][2].radiance,
+    "camera": lambda scene: scene["camera"].position,
+    "spacing": lambda scene: scene["volume"].spacing,
+    "voxels": lambda scene: scene["volume"].data,
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_nan_makes_the_image_nan(name):
+    scene, where = scene_of(anisotropic_noise()), BROKEN[name]
+    for number in (jnp.nan, jnp.inf):
+        broken = eqx.tree_at(where, scene, where(scene).at[..., -1].set(number))
+        traced = trace(*(broken[n] for n in ("volume", "transfer", "camera", "lights")))
+        assert np.isnan(traced.radiance).all()
+        assert np.isnan(traced.image()).all()
 
 
 def test_lights_add_up():
@@ -341,6 +423,9 @@ def test_bad_arguments_are_named():
     fails("anisotropy", anisotropy=1.0)
     fails("max_scatterings", max_scatterings=0)
     fails("lanes", lanes=0)
+    fails("lanes=.* and paths=100000000000, .*asks for .* GiB of memory, and the device has", paths=10**11)
+    wide, deep = jv.Camera.looking_at(volume, size=(2**15, 2**15)), 2**31
+    fails(f"lanes={deep} and paths=16, ", volume, transfer, wide, FURNACE, lanes=deep)
     fails("materials", materials=())
     fails("materials", materials=Material(0.5, 1.0, label=1))
     fails("labels", volume, jv.LabelTransferFunction([transfer]), camera, FURNACE)

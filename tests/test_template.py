@@ -22,7 +22,7 @@ from jaxvol.lighting import (
 )
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import PRESETS, materials_of
-from jaxvol.lighting.template import FADES, _merged, photons_above
+from jaxvol.lighting.template import FADES, _merged, photons_above, template_levels
 
 from .scenes import in_float64
 
@@ -299,6 +299,18 @@ def test_the_brightest_photons_keep_the_energy_of_all(grown):
     np.testing.assert_allclose(grown.brightest(10**6).intensity, grown.intensity, rtol=1e-5)
 
 
+def test_the_threshold_that_is_advised_keeps_something():
+    faint, threshold = Material(0.031, 1.0), 0.00775
+    assert template_levels(faint, threshold=threshold) > 1
+    assert totals(grow(faint, KEY, threshold=threshold, levels=1)) > 0.02
+
+
+def test_where_an_opacity_is_traced_a_template_that_keeps_nothing_is_nan():
+    found = jax.vmap(lambda a: grow(Material(a, 1.0), KEY, levels=2))(jnp.asarray([0.0, 0.031, 0.05]))
+    np.testing.assert_array_equal(np.isnan(found.intensity).all(axis=-1), [True, True, False])
+    np.testing.assert_array_equal(np.isnan(found.intensity).any(axis=-1), [True, True, False])
+
+
 def test_no_energy_is_made_where_there_is_none():
     dark = photons(((0.0, 0.0, 1.0), 0.0), ((0.0, 1.0, 0.0), 0.0)).brightest(1)
     np.testing.assert_array_equal(dark.intensity, [0.0])
@@ -376,6 +388,27 @@ BAD = {
     "flights": (lambda: scatterer_template(HALF, 0, flights=False), 'flights=False belongs to energy="print'),
     "no angle": (lambda: scatterer_template(HALF, 0, critical_angle=0.0), "critical_angle must be"),
     "wide angle": (lambda: scatterer_template(HALF, 0, critical_angle=91.0), "critical_angle must be"),
+    "opacity too low": (
+        lambda: scatterer_template(Material(0.031, 1.0), 0),
+        "opacity 0.031 leaves no photon above threshold=0.01.*packets=4.*a threshold of at most 0.00775",
+    ),
+    "opacity too low, levels given": (
+        lambda: scatterer_template(Material(0.031, 1.0), 0, levels=3),
+        "opacity 0.031 leaves no photon",
+    ),
+    "one opacity too low": (
+        lambda: scatterer_templates([HALF, Material(0.2, 1.0)], 0, threshold=0.1, levels=2),
+        "opacity 0.2 leaves no photon above threshold=0.1",
+    ),
+    "opacity 0": (lambda: scatterer_template(Material(0.0, 1.0), 0), "opacity must be above 0"),
+    "a tree too large": (
+        lambda: scatterer_template(HALF, 0, threshold=1e-9, levels=40),
+        "templates.*levels=40.*threshold.*asks for .* GiB of memory, and the device has",
+    ),
+    "too many templates": (
+        lambda: scatterer_templates(HALF, 0, count=10**9),
+        "1000000000 templates.*asks for",
+    ),
     "traced": (traced_opacity, "levels must be given where opacity is traced"),
     "endless": (
         lambda: scatterer_template(Material(1.0, 1.0), 0, energy="printed"),

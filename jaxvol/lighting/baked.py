@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from ..chunks import Chosen
 from ..triple import Triple
 from ..volume import split
+from .memory import require_room
 from .seam import Lighting, Sample, Shading, Surroundings, lit
 
 
@@ -25,6 +26,11 @@ DARKEST = 1 / 64
 
 GROWN = 2
 """Nodes, around those where anything is seen, to which light is spread: samples lie between nodes."""
+
+
+BYTES = 96
+"""Memory that a node takes while its light is computed: its ratios, whether they are known, and the sums over
+the nodes around."""
 
 
 class BakedLighting(Lighting):
@@ -87,10 +93,16 @@ class BakedShading(Shading):
 
 def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighting:
     """The light on a grid with so many nodes along the volume's longest side, and as many in proportion along
-    the others."""
+    the others.
+
+    NaN in what it is made of makes all of it NaN. **Raises** `ValueError` where it does not fit into memory.
+    """
     shading, around = jax.lax.stop_gradient((shading, around))
     longest = max(around.volume.shape)
     nx, ny, nz = (max(2, round(resolution * n / longest)) for n in around.volume.shape)
+    require_room(
+        nx * ny * nz * BYTES, f"a grid of {nx} x {ny} x {nz} nodes for baked={resolution}; take a coarser one"
+    )
     classification = around.transfer.over(around.volume)
 
     def node(number: Int[Array, ""]) -> Sample:
@@ -115,7 +127,7 @@ def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighti
         return r, g, b
 
     count = nx * ny * nz
-    seen = jax.lax.map(lambda i: node(i).extinction > 0, jnp.arange(count), batch_size=min(count, 2**14))
+    seen = jax.lax.map(lambda i: node(i).extinction != 0, jnp.arange(count), batch_size=min(count, 2**14))
     chosen = Chosen.of([seen.reshape(1, -1)])
     none = jnp.zeros(count, around.volume.spacing.dtype)
 

@@ -72,7 +72,7 @@ def lit_once(
     """What one ray has seen, as lit by `seen.light`."""
     assert seen.light is not None
     opacity = rgba[3]
-    visible = opacity > 0
+    visible = opacity != 0  # NaN stays NaN
     red, green, blue = (rgba[i] / jnp.where(visible, opacity, 1) for i in range(3))
     point = along(line.origin, line.direction, jnp.where(visible, depth, 0))
     measured = seen.searched(seen.measure(space.coordinate(point)))
@@ -92,7 +92,7 @@ def lit_picture(
     """What many rays have seen, as lit. `line`: the ray at a place of the flattened picture. Those that have
     seen anything are put together, and lit so many at a time."""
     flat, depth = rgba.reshape(-1, 4), depth.reshape(-1)
-    visible = flat[:, 3] > 0
+    visible = flat[:, 3] != 0
     place, last = in_front(visible), jnp.maximum(jnp.sum(visible, dtype=jnp.int32) - 1, 0)
 
     # computed again on the way back, where it would take memory for all rays

@@ -1,4 +1,8 @@
-"""Where does light come from, and how much of it arrives? With Mitsuba's names and units."""
+"""Where does light come from, and how much of it arrives? With Mitsuba's names and units.
+
+Irradiance is power per area, radiance power per area and solid angle, each in linear RGB. Images by
+`path_trace`, and by `ScattererTemplates` wherever there is a material, are in radiance of the same unit.
+"""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple

@@ -25,14 +25,28 @@ class Optics(NamedTuple):
         """Itself, so that it may stand where a `Material` does."""
         return self
 
+    @property
+    def reflectance(self) -> Float[Array, "..."]:
+        """R, the share of light from all sides that a half-space of the material sends back, were it white:
+        of the single-scattering albedo ω = 1 - opacity, alike in all directions.
+
+        `R = r (1 - γ / (3 (1 + γ)))`, `r = (1 - γ) / (1 + γ)`, `γ = √(1 - ω)`; off by at most 0.0014 from the
+        integral over Chandrasekhar's function H. Source: Hapke, Theory of Reflectance and Emittance
+        Spectroscopy, 1993.
+        """
+        # never 0, where its derivative is infinite
+        gamma = jnp.sqrt(jnp.maximum(self.opacity, jnp.finfo(self.opacity.dtype).tiny ** 0.5))
+        return (1 - gamma) / (1 + gamma) * (1 - gamma / (3 * (1 + gamma)))
+
 
 class Material(eqx.Module):
     """Something that scatters light: skin, muscle, bone.
 
     **Arguments:**
 
-    - `opacity`: the share of light that is absorbed where it is scattered, in [0, 1]: 1 minus the
-      transparency of Lee, Kwon and Shin (2016), and 1 minus what path tracing calls the albedo.
+    - `opacity`: α, the share of light that is absorbed where it is scattered, in [0, 1]: 1 minus the
+      transparency of Lee, Kwon and Shin (2016), and, in white matter, 1 minus the single-scattering albedo of
+      path tracing. Templates ask for one above 0, see their `threshold`.
     - `mean_free_path`: λ, the mean distance from one scattering to the next, world length, > 0.
       `from_scatterers` computes it.
     - `refractive_index`: > 0; 1 in air.
@@ -158,13 +172,18 @@ def shares(
         else:
             low, high = jax.lax.stop_gradient(one.values)
             if edge == 0:
-                there = ((value >= low) & (value <= high)).astype(value.dtype)
+                there = step(value - low) * step(high - value)
             else:
                 width = edge * (high - low)
                 there = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
         each.append(left * there)
         left = left * (1 - there)
     return tuple(each)
+
+
+def step(x: Scalar, at_0: float = 1.0) -> Scalar:
+    """0 below 0, and 1 above. Of NaN NaN, which a comparison would make a 0."""
+    return jnp.where(x == 0, at_0, (jnp.sign(x) + 1) / 2)
 
 
 def smoothstep(x: Scalar) -> Scalar:

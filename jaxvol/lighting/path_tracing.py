@@ -1,16 +1,17 @@
 """What does light that is scattered many times make of a volume? A reference, by path tracing.
 
 Unbiased: an image is its answer plus noise, whose size it tells, and which falls with the square root of
-the number of paths. Not differentiable. It is what cheaper lighting is held against.
+the number of paths. It is what cheaper lighting is held against, and refuses to be differentiated.
 """
 
 from typing import Any
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Int, PyTree, UInt32
 
 from ..arguments import check_scene
 from ..camera import Camera
@@ -20,6 +21,7 @@ from ..locate import Affine, enter
 from ..noise import hashed_uniforms_4
 from ..occupancy import Blocks
 from ..packed import with_words, words_of
+from ..taps import floats, without_voxels
 from ..transfer import Transfer
 from ..triple import Scalar
 from ..volume import Volume
@@ -28,6 +30,7 @@ from .lights import Light, lights_of
 from .majorants import Majorants
 from .materials import Material, materials_of
 from .medium import Medium
+from .memory import require_room
 from .path_traced import PathTraced
 from .walks import Scene, Walk, Words, step
 
@@ -41,6 +44,18 @@ TURNS = 128
 UNTIL_CHANCE_ENDS_IT = 2**20
 """Scatterings that a walk may have by default. A path of albedo 1 leaves a medium of optical thickness τ
 after some τ² scatterings, so this bounds none but those in media a thousand mean free paths thick."""
+
+BYTES_OF_WALK, BYTES_OF_RESULT = 2**10, 2**6
+"""Memory that a walk takes in its lane, and what it has brought until its wave is over."""
+
+NOT_DIFFERENTIABLE = (
+    "path_trace has no derivative, and volume, transfer, camera, lights, materials or anisotropy carries a "
+    "tangent here (jax.grad, jax.jvp, jax.linearize). Differentiate scatterer templates instead, as "
+    "render(..., lighting=lighting.ScattererTemplates(...)); or, where the path-traced image is to count as "
+    "constant, pass jax.lax.stop_gradient of what it is made of."
+)
+"""What its error says. The walks' own derivative would not be that of the image in any case: how often, and
+where, a path collides jumps with the extinction."""
 
 BEFORE_ALL = np.uint32(2**32 - 1)
 """In place of the number of a walk's step, for what is drawn before the first."""
@@ -68,6 +83,11 @@ def path_trace(
     medium. (`render` takes the colour for light that the medium emits. With albedo 0 the two agree on
     opacity.)
 
+    The image is in radiance, in the unit that `lights` gives it: in a white furnace (albedo 1 under a
+    `ConstantLight` of radiance L) it is L times the opacity. A half-space of albedo ω reflects, of light from
+    all sides, (1 - γ H(μ)) L, with γ = √(1 - ω), Chandrasekhar's function H, and the cosine μ at which it is
+    seen. `ScattererTemplates` are on the same scale.
+
     **Arguments:**
 
     - `volume`: on its own grid; curved ones (`ToroidalMap`) are not supported.
@@ -91,7 +111,11 @@ def path_trace(
     - `lanes`: paths that are traced side by side. Memory grows with it, and no result changes.
 
     **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function of another
-    kind, labels where the volume has none, and `onto` of another size or key.
+    kind, labels where the volume has none, `onto` of another size or key, and lanes or paths that do not fit
+    into memory; `RuntimeError` where it is differentiated, by grad or jvp, with respect to anything that it
+    is made of. In a function that is differentiated with respect to something else it may stand.
+
+    NaN or infinity in any number that the image is made of makes the whole image NaN: each path may come by.
 
     Random numbers have 24 bits, so free paths longer than 16.6 mean ones within a block of voxels, one in
     6e-8, are not drawn.
@@ -100,6 +124,9 @@ def path_trace(
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_scene(order, volume=volume, transfer=transfer, camera=camera)
+    volume, transfer, camera, lights, materials, anisotropy = eqxi.nondifferentiable(
+        (volume, transfer, camera, lights, materials, anisotropy), msg=NOT_DIFFERENTIABLE
+    )
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):
@@ -112,6 +139,7 @@ def path_trace(
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
     how = _How(paths, integer("lanes", lanes, 1), bool(antialias))
+    how.require_room(camera)
     seed = _seed(key)
     first = 0
     if onto is not None:
@@ -136,6 +164,19 @@ class _How(eqx.Module):
     paths: int = eqx.field(static=True)
     lanes: int = eqx.field(static=True)
     antialias: bool = eqx.field(static=True)
+
+    def pixels(self, camera: Camera) -> int:
+        """How many go on in one wave."""
+        return min(max(TURNS * self.lanes // self.paths, 1), camera.size[0] * camera.size[1])
+
+    def require_room(self, camera: Camera) -> None:
+        """**Raises** `ValueError` where a wave would not fit into memory."""
+        walks = self.pixels(camera) * self.paths
+        require_room(
+            walks * BYTES_OF_RESULT + min(self.lanes, walks) * BYTES_OF_WALK,
+            f"lanes={self.lanes} and paths={self.paths}, {self.pixels(camera)} pixels at once; take fewer "
+            "lanes, which changes no result, or fewer paths, and add others to them by `onto`",
+        )
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -194,16 +235,18 @@ def _trace(
     given: _Given, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], how: _How
 ) -> PathTraced:
     """The pixels row by row, in waves that bound the memory."""
-    given, camera = jax.tree.map(_single, jax.lax.stop_gradient((given, camera)))
+    given, camera = jax.tree.map(_single, (given, camera))
     scene, (width, height) = given.scene(), camera.size
-    pixels = min(max(TURNS * how.lanes // how.paths, 1), width * height)
+    sound = _finite((without_voxels(given.volume), given.blocks, scene.majorants, given.transfer))
+    sound &= _finite((given.materials, given.lights, given.anisotropy, camera))
+    pixels = how.pixels(camera)
     waves = -(-width * height // pixels)
     count = pixels * how.paths
 
     def wave(number: Int[Array, ""]) -> tuple[Array, ...]:
         def begin(place: Int[Array, " lanes"]) -> Walk:
             pixel, path = number * pixels + place // how.paths, place % how.paths
-            wanted = (place < count) & (pixel < width * height)
+            wanted = sound & (place < count) & (pixel < width * height)
             words = (
                 pixel.astype(jnp.uint32),
                 first + path.astype(jnp.uint32),
@@ -218,7 +261,15 @@ def _trace(
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
     sums = jax.tree.map(image, jax.lax.map(wave, jnp.arange(waves, dtype=jnp.int32)))
+    sums = jax.tree.map(
+        lambda leaf: jnp.where(sound, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, sums
+    )
     return PathTraced(*sums, seed=seed, paths=how.paths)
+
+
+def _finite(tree: PyTree) -> Bool[Array, ""]:
+    """Whether all its numbers are. Walks compare them, and a comparison with NaN has an answer."""
+    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(floats(tree))]))
 
 
 def _single(leaf: Array) -> Array:

@@ -7,6 +7,8 @@ Lee, Kwon and Shin: Scattered light representation in accordance with the materi
 volume rendering (2016), sections 3.3 and 3.4.
 """
 
+import functools
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -26,12 +28,13 @@ from ..triple import Scalar, Triple, along
 from ..volume import Volume
 from .baked import BakedLighting, bake
 from .lights import ConstantLight, Light, LocatedLight, lights_of
-from .materials import Material, Optics, materials_of, shares, smoothstep
+from .materials import Material, Optics, materials_of, shares, smoothstep, step
 from .seam import Lighting, Sample, Shading, Surroundings
 from .template import (
     Energy,
     ScattererTemplate,
     photons_above,
+    require_photons,
     scatterer_templates,
     settings,
     template_levels,
@@ -47,16 +50,23 @@ TWILIGHT = 0.25
 """Under soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
 
 
+WHITE = 4 / (3 * math.pi)
+"""What makes radiance of irradiance, so that opaque white matter that absorbs nothing is as bright as the
+light around it. Of the photons around a sample in a flat face, half are outside, from where light comes,
+and half are inside, and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c, in light of
+radiance L."""
+
+
 class ScattererTemplates(Lighting):
     """Light scattered inside materials, by templates.
 
     A sample x of a material has around it the photons of one of the material's templates, photon j at x + p_j
-    with intensity a_j. Under lights of irradiance E, a sample of colour c becomes
+    with intensity a_j. Under lights of irradiance E, a sample of colour c gets the radiance
 
-        Σ_lights E b (c + s)    b = Σ_lit side a_j v_j    s = Σ_in matter a_j c(x + p_j)
+        k R Σ_lights E b (c + s)    b = Σ_lit side a_j v_j    s = Σ_in matter a_j c(x + p_j)
 
-    1. On the lit side are photons nearer to the light than x. Constant light is π times its radiance, and
-       comes from all sides.
+    1. On the lit side are photons nearer to the light than x. Constant light has an irradiance of π times its
+       radiance, and comes from all sides.
     2. v_j is 0 for a photon that is hidden, 1 for others, tested at x + p_j and at its multiples `reach`.
     3. b, the brightness, grows with the intensities of photons that are not hidden.
     4. s, the colour that shines through from inside, comes from photons in the same material,
@@ -66,14 +76,28 @@ class ScattererTemplates(Lighting):
 
     What belongs to no material keeps its colour.
 
+    **Scale.** The paper's sum is E b (c + s), in no unit. Here the intensities of a template sum to 1 (but
+    for `given` ones, and printed energy, which are taken as they are), and k R makes it radiance, on the
+    scale of `path_trace`: k = 4 / (3π) is a constant, and R = `Optics.reflectance` that of the sample's
+    material, which falls from 1 to 0 with its opacity. So ratios between pixels of one material are the
+    paper's; to have its numbers, divide by k R. A flat face of white matter, of which nothing is seen but
+    its surface, has a radiance of R L under a `ConstantLight` of radiance L.
+
+    Measured on white half-spaces of opacities from 0.05 to 0.9, seen along the normal, against the exact
+    radiance of multiple scattering: 0.91 to 1.13 times as bright in constant light, 0.88 to 1.27 in
+    parallel light along the normal, and 1.05 to 1.55 at an incidence of 60°, where light from beside the
+    face is not yet hidden; of each the lower half where extinction is 1/λ, the upper where it is 10/λ.
+    Where colours are darker than white, templates are too bright: in path tracing a colour darkens each of
+    many scatterings, and in templates the whole once.
+
     **Arguments:**
 
     - `materials`: one or several. Where a place belongs to two, the first counts.
     - `lights`: one or several.
     - `templates`: for each material. `blend`: use all of them for every sample, rather than one, chosen at
-      random for each pixel: less noise, at as many times the cost.
-    - `photons`: of each template keep so many of the brightest, corrected for the energy left out. By default
-      all.
+      random for each pixel (our choice: the paper does not say which sample takes which): less noise, at as
+      many times the cost.
+    - `photons`: of each template keep so many of the brightest, which hold the energy of all. By default all.
     - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, were each
       stretch of it like its far end; materials meet in ramps, the lit side ends in one, and the image is
       differentiable. `"hard"`: as published: a photon is hidden where anything is seen at one of these
@@ -90,12 +114,17 @@ class ScattererTemplates(Lighting):
       gradient. Where lighting, volume or transfer function are traced, it is computed in each image.
     - `levels`: of their trees; needed where an opacity is traced.
     - `given`: templates to be used instead of grown ones, with leading axes (materials, templates); lengths
-      stay as they are, so that nothing depends on the materials' mean free paths.
+      stay as they are, so that nothing depends on the materials' mean free paths, and so do intensities.
 
     Templates are grown anew in each image, from the materials' numbers as they are, so that these have
     gradients.
 
-    **Raises:** `ValueError` for arguments of other kinds, and where `levels` are needed.
+    The gradient of extinction lacks, at places where the extinction is 0, what light they would show: nothing
+    is lit that is not seen.
+
+    **Raises:** `ValueError` for arguments of other kinds, where `levels` are needed, for a material of
+    which the threshold leaves no photon (where its opacity is traced, the image is NaN), and for templates
+    or a grid that do not fit into memory.
     """
 
     materials: tuple[Material, ...]
@@ -161,6 +190,7 @@ class ScattererTemplates(Lighting):
                 )
             self.templates, levels = given.intensity.shape[1], 0
         else:
+            require_photons(self.materials, packets, threshold)
             how: Any = {"packets": packets, "threshold": threshold, "energy": energy}
             opacities = [each.opacity for each in self.materials]
             if levels is None:
@@ -175,16 +205,21 @@ class ScattererTemplates(Lighting):
     def grown(self, *, blend: bool) -> ScattererTemplate:
         """The templates as they are used: (materials, templates or 1, photons)."""
         packets, threshold, energy, levels = self.growth
-        templates = self.given or scatterer_templates(
-            self.materials,
-            self.seed,
-            count=self.templates,
-            packets=packets,
-            threshold=threshold,
-            energy=energy,
-            critical_angle=self.critical_angle,
-            levels=levels,
-        )
+        if self.given is not None:
+            templates = self.given
+        else:
+            templates = scatterer_templates(
+                self.materials,
+                self.seed,
+                count=self.templates,
+                packets=packets,
+                threshold=threshold,
+                energy=energy,
+                critical_angle=self.critical_angle,
+                levels=levels,
+            )
+            if energy == "conserving":  # with what the threshold has cut off
+                templates = templates.normalized()
         if blend:
             templates = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
         return templates.brightest(self.photons * (self.templates if blend else 1))
@@ -299,11 +334,11 @@ class TemplateShading(Shading):
             offset = x * speed, y * speed, z * speed
             place = around.at(_beside(sample, offset))
             own = notes.optics.opacity
-            scale = intensity * jnp.where(own > 0, optics.opacity / jnp.where(own > 0, own, 1), 0)
+            scale = intensity * jnp.where(own == 0, 0, optics.opacity / jnp.where(own == 0, 1, own))
         if self._soft:  # as much as is there over the distance from one scattering to the next
             matter = -jnp.expm1(-place.extinction * optics.mean_free_path)
         else:
-            matter = (place.extinction > 0).astype(scale.dtype)
+            matter = step(place.extinction, 0.0)
         r, g, b = (scale * sum(there) * matter * c for c in place.color)
 
         seen = intensity * self._visible(around, sample, offset, place.extinction)
@@ -313,9 +348,10 @@ class TemplateShading(Shading):
     def color(self, sample: Sample, notes: _Notes, sums: Any) -> Triple:
         brightness, inner = sums
         matter = sum(notes.shares)
+        scale = matter * WHITE * notes.optics.reflectance
         red, green, blue = (
             c * (1 - matter)
-            + matter
+            + scale
             * (c + s)
             * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, notes.lights, strict=True))
             for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
@@ -336,10 +372,8 @@ class TemplateShading(Shading):
         further = [around.extinction(_beside(sample, offset, k)) for k in self.how.reach]
         places = [first, *further]
         if not self._soft:
-            hidden = jnp.zeros_like(first, bool)
-            for extinction in places:
-                hidden |= extinction > 0
-            return (~hidden).astype(first.dtype)
+            clear = (1 - step(extinction, 0.0) for extinction in places)
+            return functools.reduce(jnp.multiply, clear)
         pieces = np.diff([0.0, 1.0, *self.how.reach])
         depth = sum(piece * extinction for piece, extinction in zip(pieces, places, strict=True))
         return jnp.exp(-depth * _norm(offset))
@@ -353,7 +387,7 @@ class TemplateShading(Shading):
         # of a light at a finite distance r, r - |r d - p|, in a form that loses no digits
         near = closer - length**2 / (2 * distance)
         if not self._soft:
-            return (near > 0).astype(length.dtype)
+            return step(near, 0.0)
         return smoothstep(0.5 + near / length / (2 * TWILIGHT))
 
 

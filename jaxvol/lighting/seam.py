@@ -146,7 +146,8 @@ def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None
     """The colour of a sample as lit.
 
     `taps`: for a gradient of the voxels, what `replay` adds to each voxel that a term asks for: arrays with a
-    leading axis for the terms. Returned are also the voxels that were asked for, in the same way.
+    leading axis for the terms. Returned are also the voxels that were asked for, in the same way: none where
+    there are no terms. None: nobody wants to know.
     """
     notes = shading.about(around, sample)
 
@@ -162,7 +163,7 @@ def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None
         return jax.tree.map(jnp.add, sums, added), None if taps is None else volume.asked
 
     if shading.terms == 0:
-        return shading.color(sample, notes, None), None
+        return shading.color(sample, notes, None), None if taps is None else []
     term = jax.eval_shape(lambda: shading.term(around, sample, notes, jnp.zeros((), jnp.int32)))
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
     sums, asked = jax.lax.scan(one, none, (jnp.arange(shading.terms), taps))

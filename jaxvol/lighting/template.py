@@ -23,12 +23,21 @@ from ..checks import integer, is_traced, number
 from ..formats.npy import read_arrays
 from ..triple import Scalar
 from .materials import Material, Optics, materials_of, smoothstep
+from .memory import require_room
 
 
 Energy = Literal["conserving", "printed"]
 
+BYTES, BYTES_OF_PAIR = 256, 16
+"""Memory that a photon takes while a template grows, with its draws, sorted and gathered; and what each pair
+of photons takes, by whose distance they are merged."""
+
 FADES = 0.8
 """From the threshold down to this part of it a photon fades."""
+
+
+MERGE = 0.01
+"""Photons closer than this part of the mean free path become one."""
 
 
 class ScattererTemplate(eqx.Module):
@@ -48,6 +57,10 @@ class ScattererTemplate(eqx.Module):
         some = jnp.sum(kept, axis=-1, keepdims=True)
         scale = whole / jnp.where(some > 0, some, 1)
         return ScattererTemplate(self.offset[..., :count, :], kept * scale)
+
+    def normalized(self) -> "ScattererTemplate":
+        """The same photons, scaled so that each template holds an energy of 1. NaN where it holds none."""
+        return ScattererTemplate(self.offset, self.intensity / self.intensity.sum(axis=-1, keepdims=True))
 
     def blended(self) -> "ScattererTemplate":
         """One template of all photons of those along the last leading axis, with the mean energy of these."""
@@ -87,7 +100,7 @@ def scatterer_template(
     energy: Energy | Any = "conserving",
     flights: bool = True,
     critical_angle: float | Any | None = None,
-    merge: float = 0.01,
+    merge: float = MERGE,
     levels: int | None = None,
 ) -> ScattererTemplate:
     """Simulate the light around a place in a material.
@@ -105,14 +118,19 @@ def scatterer_template(
     - `packets`: into how many the light, of energy 1, is divided at the origin. Their directions are spread
       evenly, turned at random. One packet makes a lopsided template.
     - `threshold`: of a photon's intensity, in (0, 1). It fades between this and 0.8 of it, rather than to
-      vanish at once.
+      vanish at once. (The paper's seems to end whole levels: it counts 56 to 63 photons, a full tree of
+      six levels, at an opacity of a half, and lists fainter ones.) The first photons are the brightest,
+      of α / `packets` each: a template whose threshold is above 1.25 times that keeps nothing.
     - `energy`: `"conserving"`: I' = (1 - α) I, so that all parts add up to I, and the template's energy falls
-      short of 1 by what the threshold cuts off alone. `"printed"`: as the paper has it, I' = α I, after I was
+      short of 1 by what the threshold cuts off alone. It is the form that made the paper's tables, whose
+      photons of the first and second level it gives (that of the second is α (1 - α) cos θ' / `packets`).
+      `"printed"`: as the paper's equations (1) to (3) have it, misprints as these are: I' = α I, after I was
       multiplied by exp(-Δx / λ) cos θ, θ the angle of incidence, whose cosine is drawn uniformly. Its energy
       is not 1; without these factors (`flights=False`) it is α / (1 - α), above 1 for α > ½.
     - `critical_angle`: degrees, in (0, 90]. By default that of total reflection between the material and
       air, arcsin of 1/n, or of n where it is below 1.
-    - `merge`: photons closer than this part of λ become one.
+    - `merge`: photons closer than this part of λ become one, which holds the light of both: those of the
+      paper's tables that are brighter than a packet could leave are such.
     - `levels`: of the tree. By default as many as leave photons above the threshold, which asks for an
       opacity that is known when the program is compiled; to be given where it is traced.
 
@@ -120,21 +138,36 @@ def scatterer_template(
     free path, opacity and refractive index (at an index of 1, where the critical angle has no derivative,
     that one is 0).
 
-    **Raises:** `ValueError` for numbers out of range, and where `levels` are needed.
+    **Raises:** `ValueError` for numbers out of range, where `levels` are needed, for a tree that does not fit
+    into memory, and where the threshold is above all photons. Where the opacity is traced, the intensities
+    are then NaN.
     """
     packets, threshold, energy = settings(packets, threshold, energy)
+    require_photons(material, packets, threshold)
     if not flights and energy != "printed":
         raise ValueError(
             'flights=False belongs to energy="printed"; a conserving template has no such factors.'
         )
     if levels is None:
         levels = template_levels(material, packets=packets, threshold=threshold, energy=energy)
-    grow = _Growth(packets, threshold, energy == "conserving", flights, float(merge), levels)
+    grow = _Growth(
+        packets, threshold, energy == "conserving", flights, float(merge), integer("levels", levels, 1)
+    )
+    grow.require_room(1)
     return grow(material.optics, _cosine_of_critical_angle(material.optics, critical_angle), _key(key))
 
 
 def scatterer_templates(
-    materials: Material | Sequence[Material], key: PRNGKeyArray | int, *, count: int = 8, **how: Any
+    materials: Material | Sequence[Material],
+    key: PRNGKeyArray | int,
+    *,
+    count: int = 8,
+    packets: int = 4,
+    threshold: float = 0.01,
+    energy: Energy | Any = "conserving",
+    merge: float = MERGE,
+    levels: int | None = None,
+    **how: Any,
 ) -> ScattererTemplate:
     """Several templates for each of some materials, grown at once.
 
@@ -142,16 +175,23 @@ def scatterer_templates(
 
     **Returns:** a `ScattererTemplate` with leading axes (materials, count). The draws are keyed by the number
     of the material, and that of its template.
+
+    **Raises:** as `scatterer_template` does; memory is that of all templates.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
-    if how.get("levels") is None:
-        given = {name: how[name] for name in ("packets", "threshold", "energy") if name in how}
-        how["levels"] = max(template_levels(each, **given) for each in materials)
+    packets, threshold, energy = settings(packets, threshold, energy)
+    require_photons(materials, packets, threshold)
+    if levels is None:
+        levels = max(
+            template_levels(each, packets=packets, threshold=threshold, energy=energy) for each in materials
+        )
+    same: Any = {"packets": packets, "threshold": threshold, "merge": merge, "levels": levels}
+    _Growth(conserving=energy == "conserving", flights=True, **same).require_room(count * len(materials))
     optics = jax.tree.map(lambda *each: jnp.stack(each), *(each.optics for each in materials))
 
     def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
-        return scatterer_template(optics, draws, **how)
+        return scatterer_template(optics, draws, energy=energy, **same, **how)
 
     several = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)), in_axes=(0, 0, None))
     return several(optics, jnp.arange(len(materials)), jnp.arange(count))
@@ -168,19 +208,42 @@ def settings(packets: Any, threshold: Any, energy: Any) -> tuple[int, float, Ene
     )
 
 
+def require_photons(
+    materials: Material | Optics | Sequence[Material], packets: int, threshold: float
+) -> None:
+    """**Raises** `ValueError` for a material whose templates would hold no light: its brightest photons, the
+    first, are below the threshold. Says nothing of opacities that are traced."""
+    for each in (materials,) if isinstance(materials, Material | Optics) else materials:
+        if (
+            is_traced(each.opacity)
+            or (alpha := float(np.asarray(each.opacity))) > FADES * threshold * packets
+        ):
+            continue
+        if alpha == 0:
+            raise ValueError(
+                "opacity must be above 0 for scatterer templates: what absorbs nothing leaves no photons."
+            )
+        raise ValueError(
+            f"opacity {alpha:g} leaves no photon above threshold={threshold:g}: the brightest, the first of "
+            f"packets={packets}, hold {alpha / packets:.3g} each, and nothing is kept below {FADES:g} times "
+            f"the threshold. Give a threshold of at most {alpha / packets:.3g}, or fewer packets."
+        )
+
+
 def template_levels(
     material: Material | Optics, *, packets: int = 4, threshold: float = 0.01, energy: Energy = "conserving"
 ) -> int:
     """How many levels of the tree may hold a photon above the threshold: the brightest one of level k has
     `α (1 - α)^k / packets`, or under the printed form `α^(k + 1) / packets`.
 
-    **Raises:** `ValueError` where the material's opacity is traced.
+    **Raises:** `ValueError` where the material's opacity is traced, and where it leaves no photon.
     """
     if is_traced(material.opacity):
         raise ValueError("levels must be given where opacity is traced: the number of photons depends on it.")
     alpha = float(np.asarray(material.opacity))
+    require_photons(material, packets, threshold)
     passed, least = (1 - alpha if energy == "conserving" else alpha), FADES * threshold * packets
-    if alpha <= least or passed == 0:
+    if passed == 0:
         return 1
     if passed == 1:
         raise ValueError('opacity must be below 1 under energy="printed", whose tree would never end; got 1.')
@@ -229,6 +292,18 @@ class _Growth(NamedTuple):
         whole += max(self.levels - 64, 0) * self.most
         return min(whole, self.most) if self.conserving else whole
 
+    def require_room(self, templates: int) -> None:
+        """**Raises** `ValueError` where so many templates would not fit into memory."""
+        tree = sum(min(self.packets * 2**level, self.most) for level in range(min(self.levels, 64)))
+        tree += max(self.levels - 64, 0) * self.most
+        each = tree * (BYTES + (BYTES_OF_PAIR * tree if self.merge > 0 else 0))
+        require_room(
+            templates * each,
+            f"{templates} templates, grown from {tree} photons each (packets={self.packets}, "
+            f"threshold={self.threshold:g}, levels={self.levels}); ask for fewer templates or levels, or a "
+            "higher threshold",
+        )
+
     def __call__(self, optics: Optics, cone: Scalar, key: PRNGKeyArray) -> ScattererTemplate:
         origin, draws = jax.random.split(key)
         start, even = jnp.zeros((self.packets, 3)), jnp.full(self.packets, 1 / self.packets)
@@ -249,7 +324,9 @@ class _Growth(NamedTuple):
         if self.merge > 0:
             photons = _sorted(_merged(photons, self.merge))
         offset = photons.offset[: self.capacity] * optics.mean_free_path
-        return ScattererTemplate(offset, photons.intensity[: self.capacity])
+        # where none is above the threshold, which `require_photons` cannot say of what is traced
+        any_ = optics.opacity > FADES * self.threshold * self.packets
+        return ScattererTemplate(offset, jnp.where(any_, photons.intensity[: self.capacity], jnp.nan))
 
     def _level(
         self, optics: Optics, cone: Scalar, key: PRNGKeyArray, packets: "_Packets"
@@ -292,8 +369,13 @@ def _cosine_of_critical_angle(optics: Optics, degrees: Any) -> Scalar:
     if degrees is not None:
         return jnp.cos(jnp.deg2rad(number("critical_angle", degrees, above=0, below=90.001)))
     sine = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
-    squared = 1 - sine**2
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+    return _root(1 - sine**2)
+
+
+def _root(squared: Scalar) -> Scalar:
+    """The square root, 0 below 0, with a derivative of 0 there. NaN stays NaN."""
+    none = squared <= 0
+    return jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, squared)))
 
 
 def _fade(x: Scalar) -> Scalar:
@@ -320,8 +402,7 @@ def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[
     b = x * y * a
     first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=-1)
     second = jnp.stack([b, sign + y * y * a, -y], axis=-1)
-    squared = 1 - cosine**2
-    sine = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+    sine = _root(1 - cosine**2)
     around = 2 * jnp.pi * u
     turned = (sine * jnp.cos(around))[:, None] * first + (sine * jnp.sin(around))[:, None] * second
     return turned + cosine[:, None] * direction
