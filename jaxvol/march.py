@@ -137,8 +137,9 @@ class March(eqx.Module):
     - `transforms`: applied in this order at every seam; none may be given twice.
     - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
       error falls with d. `"midpoint"`: in the middle; the error falls with d².
-    - `max_samples`: the most steps that a ray may take, an integer from 1 to 2³⁰. Rays that need more are
-      marked in `Rendering.exhausted`. By default 131 072, against marches that never end.
+    - `max_samples`: the most steps that a ray may take, an integer from 1 to 2²⁴, to where float32
+      counts. Rays that need more are marked in `Rendering.exhausted`. By default 131 072, against marches
+      that never end.
 
     **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
     transform, for a transform given twice, and for a `max_samples` that is no such integer.
@@ -175,7 +176,7 @@ class March(eqx.Module):
         if quadrature not in ("left", "midpoint"):
             raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
         self.quadrature = quadrature
-        self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**30)
+        self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**24)
 
     @property
     def most_samples(self) -> int:

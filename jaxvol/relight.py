@@ -65,7 +65,7 @@ def relit(
     chosen, around = visible(known), light.around
     size = sum(weight.size for weight in known.weight)
     moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
-    volume = around.volume if total.voxels is None else Tapped(around.volume, around.volume, None)
+    volume = around.volume if total.voxels is None else Tapped.of(around.volume, None)
 
     def one(places: Int[Array, " chunk"], carry: tuple[Relit, LightTotal]) -> tuple[Relit, LightTotal]:
         found, total = carry

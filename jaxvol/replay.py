@@ -191,7 +191,7 @@ class Replay(Follower):
         ):
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
-            here = Tapped(placed, placed, taps) if voxels else with_words(placed, self.words)
+            here = Tapped.of(placed, taps) if voxels else with_words(placed, self.words)
             found = []
             for piece in pieces(march, ray, here, front(march, at, k)):
                 depth = march.sample(piece)

@@ -3,6 +3,9 @@
 And what else it takes to add up gradients: of trees, of whose leaves some have none.
 """
 
+import dataclasses
+from functools import cache
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,24 +15,40 @@ from .volume import Volume
 
 
 class Tapped(Volume):
-    """A volume that writes down which voxels it is asked for, and adds something to each."""
+    """A volume, of whatever kind, that writes down which voxels it is asked for, and adds something to each.
+
+    `Tapped.of` makes one: of a class of its own for each kind of volume, so that a kind that measures in its
+    own way still does."""
 
     taps: list | None
     asked: list = eqx.field(static=True)
 
-    def __init__(self, volume: Volume, whole: Volume, taps: list | None):
-        self.data, self.labels = whole.data, whole.labels
-        self.spacing, self.origin = volume.spacing, volume.origin
-        self.taps, self.asked = taps, []
+    @classmethod
+    def of(cls, volume: Volume, taps: list | None) -> "Tapped":
+        """The volume, tapped."""
+        if isinstance(volume, cls):
+            kind = type(volume)
+        else:
+            kind = cls if type(volume) is Volume else _kind(type(volume))
+        tapped = object.__new__(kind)
+        values = {field.name: getattr(volume, field.name, None) for field in dataclasses.fields(kind)}
+        for name, value in (values | {"taps": taps, "asked": []}).items():
+            object.__setattr__(tapped, name, value)
+        return tapped
 
     def tapped(self, taps: list) -> "Tapped":
         """The same volume, with a list of its own."""
-        return Tapped(self, self, taps)
+        return Tapped.of(self, taps)
 
     def _voxel(self, flat: Int[Array, ""]) -> Shaped[Array, ""]:
         self.asked.append(flat)
         value = jax.lax.stop_gradient(super()._voxel(flat))
         return value if not self.taps else value + self.taps[len(self.asked) - 1]
+
+
+@cache
+def _kind(kind: type[Volume]) -> type[Tapped]:
+    return type(f"Tapped{kind.__name__}", (Tapped, kind), {})
 
 
 def floats(tree: PyTree) -> PyTree:

@@ -153,7 +153,7 @@ BAD = {
     **{
         f"max_samples={bad!r}": (
             lambda bad=bad: jv.March(0.1, max_samples=bad),
-            rf"max_samples must be an integer from 1 to 1073741824; got {told}\.",
+            rf"max_samples must be an integer from 1 to 16777216; got {told}\.",
         )
         for bad, told in [
             (0, "0"),
