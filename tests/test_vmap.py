@@ -92,7 +92,7 @@ PARTS = {
 }
 
 
-def over(part, adjoint="replay", dtype="uint8"):
+def over(part, dtype="uint8"):
     """A scene as a function of one of its parts, and several of that."""
     where, scenes = PARTS[part], [scene(i, dtype) for i in range(COUNT)]
     parts = [where(s) for s in scenes]
@@ -110,7 +110,7 @@ def over(part, adjoint="replay", dtype="uint8"):
 )
 def test_over_one_part(part, dtype):
     """The others are closed over, as they mostly are: voxels are concrete then, and so packed."""
-    made, parts = over(part, dtype=dtype)
+    made, parts = over(part, dtype)
     scenes = [made(p) for p in parts]
     images = [image(s) for s in scenes]
     assert np.abs(images[0] - images[1]).max() > 1e-3
