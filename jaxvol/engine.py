@@ -303,7 +303,10 @@ def _pull(
         is_leaf=lambda leaf: leaf is None,
     )
     found = eqx.filter(pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
-    fault = has_fault(scene)
+    # a loss that looks at what is NaN has no gradient: that of a ray that is not marched would be 0
+    floats = (jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)) for tree in (rendering, whole))
+    lost = [jnp.any(jnp.isnan(leaf) & (part != 0)) for leaf, part in zip(*floats, strict=True)]
+    fault = jnp.any(jnp.stack(lost))
     return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
 
 

@@ -100,9 +100,11 @@ class Total(eqx.Module):
         lit = None if light is None else light.leaves
         parts = transfer, march, without_voxels(volume), lit
         transfer, march, volume_, lit = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
-        # many small parts are added up, which 16 bits would lose
-        sums = jnp.zeros(volume.data.size, jnp.promote_types(volume.data.dtype, jnp.float32))
-        return cls(transfer, march, volume_, sums if voxels else None, lit)
+        sums = None
+        if voxels:
+            # many small parts are added up, which 16 bits would lose
+            sums = jnp.zeros(volume.data.size, jnp.promote_types(volume.data.dtype, jnp.float32))
+        return cls(transfer, march, volume_, sums, lit)
 
 
 class Replay(Follower):

@@ -1,27 +1,105 @@
-"""The code in the documents runs."""
+"""The code in the documents, and in the library's docstrings, runs, and what it computes is finite."""
 
+import ast
+import inspect
 import re
+import textwrap
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 
 ROOT = Path(__file__).parent.parent
 
+BLOCK = re.compile(r"^( *)```python\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
-@pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md"])
-def test_python_in_the_documents_runs(document, tmp_path, monkeypatch):
+
+def examples(text):
+    """The Python in a text: of its blocks, and of its lines at a prompt."""
+    blocks = [textwrap.dedent(block) for _, block in BLOCK.findall(text)]
+    prompts = re.findall(r"^ *(?:>>>|\.\.\.) ?(.*)$", text, re.MULTILINE)
+    return [*blocks, *(["\n".join(prompts)] if prompts else [])]
+
+
+def docstrings(module):
+    """Of a file of the library: of the module, its classes, and their functions."""
+    kinds = ast.Module, ast.ClassDef, ast.FunctionDef
+    nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+    return [ast.get_docstring(node) or "" for node in nodes if isinstance(node, kinds)]
+
+
+def documents():
+    """Every document with examples: name, and the examples, which share their names as its readers do."""
+    for name in ("README.md", "CONTRIBUTING.md"):
+        yield name, examples((ROOT / name).read_text(encoding="utf-8"))
+    for module in sorted((ROOT / "jaxvol").rglob("*.py")):
+        for text in docstrings(module):
+            if found := examples(text):
+                yield f"{module.relative_to(ROOT)}: {text.splitlines()[0]}", found
+
+
+DOCUMENTS = dict(documents())
+FITS = "jv.fit("
+
+# A fit takes minutes. What stands before it in its document runs in the fast tests.
+CASES = [
+    *(pytest.param(name, False, id=name) for name in DOCUMENTS),
+    *(
+        pytest.param(name, True, id=f"{name}, fits", marks=pytest.mark.slow)
+        for name, found in DOCUMENTS.items()
+        if any(FITS in block for block in found)
+    ),
+]
+
+
+def assert_tells_something(value, what):
+    """Every float is finite, and not all are 0."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(value) if hasattr(leaf, "dtype")]
+    floats = [leaf for leaf in leaves if np.issubdtype(leaf.dtype, np.inexact)]
+    assert floats, what
+    assert all(np.isfinite(leaf).all() for leaf in floats), what
+    assert any(leaf.any() for leaf in floats), what
+
+
+@pytest.mark.parametrize(("document", "fits"), CASES)
+def test_python_in_the_documents_runs(document, fits, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(
-        r"^```python\n(.*?)^```", (ROOT / document).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-    )
+    blocks = [block for block in DOCUMENTS[document] if fits or FITS not in block]
     assert blocks
+    names: dict = {}
     for block in blocks:
-        names: dict = {}
         exec(block, names)
-        assert float(names["rendering"].rgba.max()) > 0.1
-        if "gradient" in names:
-            assert float(abs(names["gradient"].extinction).max()) > 0
+    assert float(names["rendering"].rgba.max()) > 0.1
+    assert_tells_something(names["rendering"].rgba, "rendering")
+    # what a document differentiates
+    if "jax.grad" in "".join(blocks):
+        gradient = names["gradient"]
+        assert_tells_something(gradient.colors, "gradient.colors")
+        assert_tells_something(gradient.extinction, "gradient.extinction")
+    if fits:
+        assert names["found"].losses[-1] < 0.1 * names["found"].losses[0]
+        assert_tells_something(names["found"].parameters, "found.parameters")
+
+
+def test_examples_are_found_wherever_they_stand():
+    text = inspect.cleandoc(
+        """
+        - a list, with
+
+          ```python
+          one = 1
+          ```
+
+        >>> two = 2
+        >>> for three in range(3):
+        ...     pass
+        """
+    )
+    assert examples(text) == ["one = 1\n", "two = 2\nfor three in range(3):\n    pass"]
+    assert sum(FITS in block for block in DOCUMENTS["README.md"]) == 1
+    assert len(DOCUMENTS["README.md"]) == 2
 
 
 def test_every_link_to_a_file_leads_somewhere():

@@ -1,0 +1,419 @@
+"""Would the tests see it? Known faults, each put into a copy of the tree, where the fast tests must fail.
+
+`python -m tests.mutations` runs the named tests of every fault below, first as the library is, when all must
+pass, and then with each fault in turn, when at least one must fail. Nothing is changed in place. `--only
+NAME` runs some of them, `-j N` so many at once, `--list` tells which there are.
+
+A fault is one that happened, or that is easily made: an index that overflows, a sign, a place off by one.
+Where none of the fast tests sees one, a test is missing; where its old text is not found any more, the code
+has changed, and the fault wants to be stated anew.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+ROOT = Path(__file__).parent.parent
+
+TIMEOUT = 3600
+"""Seconds after which a test that does not end is taken for one that sees nothing."""
+
+COPIED = ("jaxvol", "tests", "experiments", "pyproject.toml")
+
+
+class Mutation(NamedTuple):
+    """A fault.
+
+    - `name`: what goes wrong.
+    - `file`: of `jaxvol/`; `old`: a text that it holds once; `new`: what stands there instead.
+    - `tests`: fast tests, relative to `tests/`, of which at least one must fail.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+    def applied(self, root: Path) -> str:
+        """The file's text with the fault in it."""
+        path = root / "jaxvol" / self.file
+        text = path.read_text(encoding="utf-8")
+        count = text.count(self.old)
+        if count != 1:
+            raise ValueError(
+                f"{self.name}: jaxvol/{self.file} must hold this text once, and holds it {count} times:\n\n"
+                f"{self.old}\n\nThe code has changed: state the fault anew in tests/mutations.py."
+            )
+        return text.replace(self.old, self.new)
+
+
+LEAPT_GRADIENT = "test_gradient_matrix.py::test_replay_does_not_see_the_leaps[jittered-hierarchy-uint8]"
+FORWARD_GRADIENT = "test_gradient_matrix.py::test_forward_is_replay[jittered-hierarchy-uint8]"
+DIFFERENCES = "test_gradient_matrix.py::test_gradients_are_central_differences[moving-hierarchy-float64]"
+FAULTS = "test_faults.py::test_what_is_no_number_reaches_image_and_gradient[leaping]"
+WHOLE_SCENES = "test_vmap.py::test_over_whole_scenes[float32]"
+PACKED = "test_leaping.py::test_packed_voxels_are_the_same_values"
+RENDERED = "test_agreement.py::test_the_renderer_is_the_independent_marcher"
+
+MUTATIONS = [
+    # where rays are, and where they begin
+    Mutation(
+        "toroidal map: the sign of an angle",
+        "toroidal.py",
+        "return half + _atan2(y, z), half + _atan2(x, off)",
+        "return half - _atan2(y, z), half + _atan2(x, off)",
+        ("test_toroidal.py::test_map_and_inverse_agree_with_each_other_and_with_the_printed_formula",),
+    ),
+    Mutation(
+        "locate: distances of a far camera counted from its base, not from its origin",
+        "locate.py",
+        "ray = Ray(entry, direction, base + start, length,",
+        "ray = Ray(entry, direction, start, length,",
+        ("test_rays.py::test_depth_is_the_mean_distance_of_what_is_seen",),
+    ),
+    Mutation(
+        "start: no transform is asked where the first cell begins",
+        "reference.py",
+        "offset=march.start(ray),",
+        "offset=zero,",
+        ("test_jitter.py::test_jitter_starts_each_ray_a_part_of_a_step_in",),
+    ),
+    Mutation(
+        "jitter: keyed by the place in a beam, not by the pixel",
+        "waves.py",
+        "(column + left, row + top))",
+        "((column + left) % BEAM, (row + top) % BEAM))",
+        (f"{RENDERED}[jittered-left]",),
+    ),
+    Mutation(
+        "jitter: a crop has numbers of its own",
+        "waves.py",
+        "left, top = jnp.round(source.corner).astype(column.dtype)",
+        "left, top = 0, 0",
+        ("test_jitter.py::test_a_crop_is_jittered_as_its_part_of_the_image",),
+    ),
+    # how they move on
+    Mutation(
+        "advance: empty-space jitter shortens every transparent step",
+        "jitter.py",
+        "jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)",
+        "jnp.where(transparent, steps - 1 + memory, steps), memory",
+        ("test_jitter.py::test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample",),
+    ),
+    Mutation(
+        "leap: one cell too far",
+        "wavefront.py",
+        "/ march.step - 1e-3)",
+        "/ march.step + 1)",
+        (LEAPT_GRADIENT,),
+    ),
+    Mutation(
+        "leap: finished rays move by an index that is none, and overflow",
+        "wavefront.py",
+        "jnp.where((cells > 0) & ~at.finished, a, b), gone, at)",
+        "jnp.where(cells > 0, a, b), gone, at)",
+        (LEAPT_GRADIENT,),
+    ),
+    Mutation(
+        "leap: a ray's visible cells end one too early",
+        "replay.py",
+        "until = jnp.max(jnp.where(seen, cells + 1, kept.until[None]), axis=0)",
+        "until = jnp.max(jnp.where(seen, cells, kept.until[None]), axis=0)",
+        (LEAPT_GRADIENT,),
+    ),
+    Mutation(
+        "leap: a ray's visible cells begin one too late",
+        "replay.py",
+        "return Span(jnp.minimum(kept.first, first), until), None, None",
+        "return Span(jnp.minimum(kept.first, first) + 1, until), None, None",
+        (LEAPT_GRADIENT,),
+    ),
+    Mutation(
+        "survey: boxes of beams do without the bulge between their corners",
+        "beams.py",
+        "least(d, 1) - bulge / size,",
+        "least(d, 1),",
+        ("test_leaping.py::test_no_beam_misses_what_is_seen",),
+    ),
+    Mutation(
+        "survey: boxes of stretches end before the stretch does",
+        "beams.py",
+        "first + 1.01 * length)",
+        "first + 0.5 * length)",
+        ("test_leaping.py::test_no_ray_misses_what_is_seen",),
+    ),
+    Mutation(
+        "survey: blocks without the nodes of their upper faces",
+        "occupancy.py",
+        "BLOCK, axis) for i in range(BLOCK + 1)",
+        "BLOCK, axis) for i in range(BLOCK)",
+        ("test_occupancy.py::test_blocks_hold_every_value_between_their_nodes",),
+    ),
+    Mutation(
+        "survey: chessboard distances one too large",
+        "occupancy.py",
+        "return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)",
+        "return jnp.where(anything, distance + (distance > 0), jnp.uint8(FARTHEST)).reshape(-1)",
+        ("test_occupancy.py::test_distances_are_those_of_a_chessboard",),
+    ),
+    Mutation(
+        "survey: the bit of another label",
+        "occupancy.py",
+        "return (self.labels >> (label % 32)) & 1 == 1",
+        "return (self.labels >> (label % 31)) & 1 == 1",
+        ("test_occupancy.py::test_blocks_know_their_labels",),
+    ),
+    Mutation(
+        "survey: blocks with NaN taken for empty",
+        "scene.py",
+        "transfer.visible(known.blocks) | known.blocks.unordered",
+        "transfer.visible(known.blocks)",
+        (FAULTS,),
+    ),
+    Mutation(
+        "kept: what was computed from an array stays when the array has gone",
+        "kept.py",
+        "weakref.finalize(array, _MEMORY.pop, key, None)",
+        "pass",
+        ("test_occupancy.py::test_what_was_computed_goes_with_its_array",),
+    ),
+    # what a sample stands for
+    Mutation(
+        "cut: the last cell reaches past the exit",
+        "alignment.py",
+        "cell = Cell(cell.front, jnp.where(reaches_past, left, cell.width),",
+        "cell = Cell(cell.front, cell.width,",
+        ("test_alignment.py::test_a_constant_volume_is_exact_under_jitter",),
+    ),
+    Mutation(
+        "cut: the part behind a label's face dropped",
+        "alignment.py",
+        "Cell(last, end - last, cell.cut),",
+        "Cell(last, 0 * last, cell.cut),",
+        ("test_labels.py::test_cells_are_cut_at_labels_and_exact_at_any_step",),
+    ),
+    Mutation(
+        "quadrature: midpoints sampled at the front",
+        "march.py",
+        'return cell.front if self.quadrature == "left" else cell.front + cell.width / 2',
+        "return cell.front",
+        ("test_march.py::test_midpoint_samples_only_inside",),
+    ),
+    Mutation(
+        "stop: rays end while much is left",
+        "termination.py",
+        "(transmittance <= self.opacity_left)",
+        "(transmittance >= self.opacity_left)",
+        ("test_march.py::test_early_termination_stops_where_little_is_left",),
+    ),
+    Mutation(
+        "stop: one sample more than the march allows",
+        "march.py",
+        "return 2**17 if self.max_samples is None else self.max_samples",
+        "return 2**17 if self.max_samples is None else self.max_samples + 1",
+        ("test_march.py::test_a_march_that_runs_out_of_samples_says_so",),
+    ),
+    Mutation(
+        "compositing: samples weighted as if nothing lay before them",
+        "reference.py",
+        "weight = jnp.where(at.finished, 0, (1 - total) * alpha)",
+        "weight = jnp.where(at.finished, 0, alpha)",
+        (f"{RENDERED}[plain-left]",),
+    ),
+    # what is read, and what it looks like
+    Mutation(
+        "packing: the sign of int16 and int8 lost",
+        "packed.py",
+        "if signed:  #",
+        "if not signed:  #",
+        (PACKED,),
+    ),
+    Mutation(
+        "packing: the row beside taken from the wrong axis",
+        "packed.py",
+        "words = words | beside(words, 1) << 16",
+        "words = words | beside(words, 0) << 16",
+        (PACKED,),
+    ),
+    Mutation(
+        "labels: the node below, not the nearest",
+        "volume.py",
+        "jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)",
+        "jnp.clip(jnp.floor(c).astype(jnp.int32), 0, n - 1)",
+        ("test_volume.py::test_label_is_that_of_the_nearest_node",),
+    ),
+    Mutation(
+        "transfer function: NaN has extinction 0",
+        "transfer.py",
+        "jnp.where(extinction < 0, 0, extinction)",
+        "jnp.where(extinction > 0, extinction, 0)",
+        (FAULTS,),
+    ),
+    Mutation(
+        "transfer function: the gradient of the upper point forgotten",
+        "transfer.py",
+        "at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))",
+        "at_points = sums[:, :4]",
+        ("test_gradients.py::test_tables_pull_as_jax_does",),
+    ),
+    Mutation(
+        "faults: a leaf that is NaN leaves the image black",
+        "engine.py",
+        "rays, spans = invalid(waves.rays(source, space, number), fault), None",
+        "rays, spans = waves.rays(source, space, number), None",
+        (FAULTS,),
+    ),
+    Mutation(
+        "faults: and its gradient finite",
+        "engine.py",
+        "return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)",
+        "return found",
+        (FAULTS,),
+    ),
+    # what a loss sees of it
+    Mutation(
+        "replay: the sign of what lies behind a sample",
+        "replay.py",
+        "slope = left * value[k] - (whole - front)",
+        "slope = left * value[k] + (whole - front)",
+        (FORWARD_GRADIENT,),
+    ),
+    Mutation(
+        "replay: samples behind early termination have a gradient",
+        "replay.py",
+        "jnp.where(known.finished[i][k] | (left <= nothing), 0, slope)",
+        "jnp.where(left <= nothing, 0, slope)",
+        (FORWARD_GRADIENT,),
+    ),
+    Mutation(
+        "replay: depths count from the entry",
+        "backward.py",
+        "of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)",
+        "pass",
+        (FORWARD_GRADIENT,),
+    ),
+    Mutation(
+        "replay: one of eight voxels gets no gradient",
+        "taps.py",
+        "for place, part in zip(asked, parts, strict=True):",
+        "for place, part in list(zip(asked, parts, strict=True))[1:]:",
+        (DIFFERENCES,),
+    ),
+    Mutation(
+        "replay: the gradient of a camera is that of its last wave",
+        "backward.py",
+        "return (total, added(of_source, of_rays_source)), None",
+        "return (total, jax.tree.map(jnp.zeros_like, of_source)), None",
+        (FORWARD_GRADIENT,),
+    ),
+    # programs
+    Mutation(
+        "programs: the branch that is never taken is",
+        "compiled.py",
+        "return jax.lax.cond(live, f, never, *arguments)",
+        "return jax.lax.cond(~live, f, never, *arguments)",
+        (f"{RENDERED}[plain-left]",),
+    ),
+    Mutation(
+        "vmap: elements of a batch in another order",
+        "compiled.py",
+        "return jax.lax.map(one, [leaf for leaf, moves in",
+        "return jax.lax.map(one, [leaf[::-1] for leaf, moves in",
+        (WHOLE_SCENES,),
+    ),
+]
+
+
+def copy_to(folder: Path) -> None:
+    """The tree, without what is not needed to test it."""
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            ignored = shutil.ignore_patterns("__pycache__", "results")
+            shutil.copytree(source, folder / name, ignore=ignored)
+        elif source.exists():
+            shutil.copy2(source, folder / name)
+
+
+def run(folder: Path, tests: tuple[str, ...], programs: Path) -> subprocess.CompletedProcess[str]:
+    """pytest on these tests, of the tree in a folder, with programs kept from run to run."""
+    environment = os.environ | {
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "JAX_COMPILATION_CACHE_DIR": str(programs),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    named = [f"tests/{test}" for test in tests]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *named]
+    how: Any = {"cwd": folder, "env": environment, "capture_output": True, "text": True, "check": False}
+    try:
+        return subprocess.run(command, timeout=TIMEOUT, **how)
+    except subprocess.TimeoutExpired:
+        return subprocess.CompletedProcess(command, -1, f"does not end within {TIMEOUT} s", "")
+
+
+def first_failure(output: str) -> str:
+    """The test that failed, from what pytest printed."""
+    lines = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return lines[0].split(" - ")[0] if lines else output.strip()[-2000:]
+
+
+def check(tests: tuple[str, ...], mutation: Mutation | None, folder: Path, programs: Path) -> bool:
+    """Whether these tests pass in a copy of the tree, made in `folder`; with a fault, whether one fails."""
+    begin = time.monotonic()
+    folder.mkdir()
+    copy_to(folder)
+    if mutation is not None:
+        (folder / "jaxvol" / mutation.file).write_text(mutation.applied(folder), encoding="utf-8")
+    found = run(folder, tests, programs)
+    shutil.rmtree(folder)
+    # 0: all passed; 1: some failed; all else: pytest could not run them
+    good = found.returncode == (0 if mutation is None else 1)
+    told = {0: "all pass", 1: first_failure(found.stdout)}
+    name = f"as it is, {len(tests)} tests" if mutation is None else mutation.name
+    verdict = told.get(found.returncode, found.stdout + found.stderr)
+    print(f"{'ok' if good else 'MISSED'}: {name}: {verdict} ({time.monotonic() - begin:.0f} s)", flush=True)
+    return good
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.mutations", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", action="append", metavar="NAME", help="faults whose names hold this")
+    parser.add_argument("-j", type=int, default=1, metavar="N", help="as many at once")
+    parser.add_argument("--list", action="store_true", help="name the faults, and run nothing")
+    given = parser.parse_args()
+    chosen = [m for m in MUTATIONS if not given.only or any(part in m.name for part in given.only)]
+    if not chosen:
+        parser.error(f"--only {given.only}: no fault has such a name; --list names them.")
+    if given.list:
+        print("\n".join(m.name for m in chosen))
+        return 0
+    for mutation in chosen:
+        mutation.applied(ROOT)
+    tests = tuple(sorted({test for mutation in chosen for test in mutation.tests}))
+    parts = [tests[i :: given.j] for i in range(min(given.j, len(tests)))]
+
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(given.j) as pool:
+
+        def run_all(jobs: list[tuple[tuple[str, ...], Mutation | None]], name: str) -> list[bool]:
+            folders = [Path(temporary) / f"{name}{i}" for i in range(len(jobs))]
+            programs = [Path(temporary) / "programs"] * len(jobs)
+            return list(pool.map(check, *zip(*jobs, strict=True), folders, programs))
+
+        if not all(run_all([(part, None) for part in parts], "whole")):
+            return 1
+        caught = run_all([(m.tests, m) for m in chosen], "fault")
+    print(f"{sum(caught)} of {len(caught)} faults are caught.")
+    return 0 if all(caught) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,102 @@
+"""Does a number that is none reach the image? A fit that has diverged must not look like one that agrees.
+
+What a constructor gets is checked there. Here leaves are replaced afterwards, as optimisers do, and traced.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+from .scenes import around
+
+
+SIZE = (9, 7)
+
+WHOLE = {
+    "spacing": lambda s: s[0].spacing,
+    "origin": lambda s: s[0].origin,
+    "values": lambda s: s[1].values,
+    "colors": lambda s: s[1].colors,
+    "extinction": lambda s: s[1].extinction,
+    "position": lambda s: s[2].position,
+    "focal_point": lambda s: s[2].focal_point,
+    "view_up": lambda s: s[2].view_up,
+    "view_angle": lambda s: s[2].view_angle,
+    "window": lambda s: s[2].window,
+    "step": lambda s: s[3].step,
+    "opacity_left": lambda s: s[3].transforms[1].opacity_left,
+}
+"""Leaves on which every pixel depends."""
+
+
+def scene(transforms=()):
+    """A volume with something to see in one half, and nothing in the other."""
+    data = np.zeros((12, 10, 11), np.float32)
+    data[2:5, 3:7, 3:8] = 0.8
+    volume = jv.Volume(data, (0.1, 0.1, 0.1))
+    transfer = jv.TransferFunction([0.0, 0.2, 1.0], np.full((3, 3), 0.5), [0.0, 0.0, 9.0])
+    march = jv.March(0.05, (jv.AlphaCorrection(), jv.EarlyTermination(0.01), *transforms))
+    return volume, transfer, around(volume, SIZE), march
+
+
+def seen(transforms):
+    """The scene's floats, and under `jax.jit` (loss, image), and gradient, of them."""
+    floats, rest = eqx.partition(scene(transforms), eqx.is_inexact_array)
+
+    @jax.jit
+    def both(floats):
+        def loss(floats):
+            rgba = jv.render(*eqx.combine(floats, rest)).rgba
+            return jnp.sum(rgba**2), rgba
+
+        return jax.value_and_grad(loss, has_aux=True)(floats)
+
+    return floats, both
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [(jv.SpaceLeaping(),), pytest.param((), marks=pytest.mark.slow)],
+    ids=["leaping", "not leaping"],
+)
+def test_what_is_no_number_reaches_image_and_gradient(transforms):
+    floats, both = seen(transforms)
+    (_, whole), gradient = both(floats)
+    assert 0.2 < float(whole[..., 3].max()) <= 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert float(jnp.abs(gradient[1].colors).max()) > 0
+
+    for name, where in WHOLE.items():
+        for fault in (np.nan, np.inf):
+            leaf = where(floats)
+            bad = eqx.tree_at(where, floats, leaf.at[(0,) * leaf.ndim].set(fault))
+            (value, image), gradient = both(bad)
+            assert np.isnan(value), (name, fault)
+            assert np.isnan(image).all(), (name, fault)
+            assert np.isnan(gradient[1].colors).any(), (name, fault)
+            assert np.isnan(where(gradient)).any(), (name, fault)
+
+    for place in ((3, 5, 5), (9, 5, 5)):  # a voxel that is seen, and one in empty space
+        bad = eqx.tree_at(lambda f: f[0].data, floats, floats[0].data.at[place].set(np.nan))
+        (value, image), gradient = both(bad)
+        assert np.isnan(value), place
+        assert np.isnan(image).any(), place
+        assert not np.isnan(image).all(), "rays that do not meet it see what they saw"
+        assert np.isnan(gradient[1].colors).any(), place
+        assert np.isnan(gradient[0].data).any(), place
+
+
+def test_rays_that_are_none_are_refused_when_the_program_runs():
+    volume, transfer, camera, march = scene()
+    origins, directions = camera.rays()
+    image = jax.jit(lambda *rays: jv.render_rays(volume, transfer, *rays, march, outputs="rgba").rgba)
+    assert np.isfinite(image(origins, directions)).all()
+    for fault in (np.nan, np.inf):
+        with pytest.raises(Exception, match="origins must be finite"):
+            image(origins.at[0, 0, 0].set(fault), directions).block_until_ready()
+        with pytest.raises(Exception, match="directions must be finite"):
+            image(origins, directions.at[2, 1, 0].set(fault)).block_until_ready()

@@ -1,0 +1,404 @@
+"""Is a gradient the same however it is computed? Every leaf of a scene, by each adjoint, under each method of
+space leaping, for each type of voxel.
+
+The scene has what users' scenes have: empty space between what is seen, rays that miss the volume and rays
+that see nothing in it, several beams of rays, the last of them incomplete; and everything is at its default.
+Most gradients are taken as users take them, by `jax.grad` of `render` without a `jax.jit` around, since there
+small voxels are fetched from their packed copy. Nearly all the time goes to compiling: 10 to 15 CPU seconds
+for the two programs of a gradient, which all cameras, transfer functions and voxels of a type share.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import jaxvol as jv
+from experiments import scenes as real_scenes
+
+from .scenes import doubled, in_float64
+
+
+SHAPE = (26, 21, 31)
+SIZE = (37, 21)
+"""More than one beam of 16 x 16 pixels each way."""
+
+SETS = {
+    "plain": ("left", ()),
+    "aligned": ("midpoint", (jv.AlphaCorrection(),)),
+    "jittered": ("left", (jv.Jitter(3), jv.AlphaCorrection(), jv.EarlyTermination(0.05))),
+    "moving": ("left", (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05))),
+    "residual": ("midpoint", (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())),
+}
+
+EXACT = ["hierarchy", "distance", "beam"]
+"""Methods that leap over nothing that is seen."""
+
+METHODS = [None, *EXACT, "min_distance"]
+
+TOPS = {"uint8": 255, "uint16": 60_000, "int16": 4000, "float32": 1, "float64": 1}
+"""The largest value of a volume of each type."""
+
+CAMERAS = {
+    "outside": ((3.1, -3.9, 2.4), (1.1, 0.5, 1.0), 30.0),
+    "inside": ((1.15, 0.45, 1.0), (0.7, 0.6, 0.6), 70.0),
+    "past it": ((3.1, -3.9, 2.4), (1.9, 0.9, 1.6), 30.0),
+}
+"""Position, focal point and view angle. `"parallel"` is the first without perspective."""
+
+LEAVES = {
+    "voxels": lambda s: s[0].data,
+    "spacing": lambda s: s[0].spacing,
+    "origin": lambda s: s[0].origin,
+    "colors": lambda s: s[1].colors,
+    "extinction": lambda s: s[1].extinction,
+    "position": lambda s: s[2].position,
+    "focal_point": lambda s: s[2].focal_point,
+    "view_up": lambda s: s[2].view_up,
+    "view_angle": lambda s: s[2].view_angle,
+    "window": lambda s: s[2].window,
+    "step": lambda s: s[3].step,
+}
+
+slow = pytest.mark.slow
+
+
+def blobs(dtype, seed=0):
+    """Two blobs far from each other, and a piece of a third one, which a corner of the volume cuts."""
+    random = np.random.default_rng(seed)
+    x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in SHAPE), indexing="ij")
+    value = np.zeros(SHAPE)
+    for center, radius in (((-0.5, 0.1, -0.4), 0.45), ((0.4, -0.3, 0.5), 0.4), ((0.9, 0.9, -0.9), 0.5)):
+        a, b, c = center + random.uniform(-0.05, 0.05, 3)
+        value = np.maximum(value, 1 - np.sqrt((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / radius)
+    value = np.where(value > 0, value + 0.1 * random.random(SHAPE), 0)
+    return (np.clip(value, 0, 1) * TOPS[dtype]).astype(dtype)
+
+
+def scene_of(name="jittered", method=None, dtype="uint8", camera="outside", max_samples=None):
+    """A scene of blobs under a set of transforms and a method of leaping, in the float type of the day."""
+    quadrature, transforms = SETS[name]
+    transforms = transforms if method is None else (*transforms, jv.SpaceLeaping(method, 4))
+    volume = jv.Volume(blobs(dtype), (0.07, 0.09, 0.06), (0.2, -0.4, 0.1))
+    values, extinction = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 1.0]), np.array([0.0, 0.0, 1.0, 3.0, 0.0, 9.0])
+    if name == "moving":  # as many points as are looked up by searching
+        few, values = values, np.linspace(0, 1, 31)
+        extinction = np.interp(values, few, extinction)
+    colors = np.random.default_rng(2).random((len(values), 3))
+    transfer = jv.TransferFunction(values * TOPS[dtype], colors, extinction)
+    parallel = 0.8 if camera == "parallel" else None
+    position, target, angle = CAMERAS["outside" if parallel else camera]
+    camera = jv.Camera(position, target, (0.1, 0.2, 1), angle, size=SIZE, parallel_scale=parallel)
+    if jax.config.read("jax_enable_x64"):
+        transforms = doubled(transforms)
+    return volume, transfer, camera, jv.March(0.043, transforms, quadrature, max_samples=max_samples)
+
+
+def loss(scene, adjoint="replay"):
+    """A scalar of image and depths, in which nothing cancels."""
+    return loss_and_opacity(scene, adjoint)[0]
+
+
+def loss_and_opacity(scene, adjoint):
+    rendering = jv.render(*scene, adjoint=adjoint)
+    opacity = rendering.rgba[..., 3]
+    weights = np.random.default_rng(5).normal(size=(*opacity.shape, 5))
+    depth = jnp.where(opacity > 0, rendering.depth, 0) * opacity
+    seen = jnp.concatenate([rendering.rgba, depth[..., None]], axis=-1)
+    return jnp.sum(seen * jnp.asarray(weights, seen.dtype)), opacity
+
+
+def gradient(scene, adjoint="replay", *, empty=False):
+    """That of every leaf by name; of extinctions, where there is any. `empty`: some rays must see nothing."""
+    take = eqx.filter_grad(functools.partial(loss_and_opacity, adjoint=adjoint), has_aux=True)
+    found, opacity = take(scene)
+    assert not empty or 0.05 < np.mean(opacity > 0) < 0.95
+    leaves = {name: where(found) for name, where in LEAVES.items()}
+    leaves["extinction"] = jnp.where(scene[1].extinction > 0, leaves["extinction"], 0)
+    return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
+
+
+def directions(scene, seed=0):
+    """For every leaf a direction along which to change it alone: (name, tangent of the scene). Extinctions of
+    0 stay."""
+    random = np.random.default_rng(seed)
+    still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, scene)
+    for name, where in LEAVES.items():
+        leaf = where(scene)
+        if not eqx.is_inexact_array(leaf):
+            continue
+        along = jnp.asarray(random.choice([-1.0, 1.0], leaf.shape), leaf.dtype)
+        along = jnp.where(leaf > 0, along, 0) if name == "extinction" else along
+        yield name, eqx.tree_at(where, still, along)
+
+
+def slopes(scene, adjoint="forward"):
+    """How the loss changes along each direction, by forward mode."""
+
+    def slope(tangent):
+        return eqx.filter_jvp(functools.partial(loss, adjoint=adjoint), (scene,), (tangent,))[1]
+
+    return {name: float(slope(tangent)) for name, tangent in directions(scene)}
+
+
+def central(scene, h=1e-6):
+    """The same by central differences of what `jax.value_and_grad` calls the value."""
+    value = eqx.filter_value_and_grad(loss)
+
+    def moved(tangent, by):
+        return jax.tree.map(
+            lambda leaf, along: leaf if along is None else leaf + by * along,
+            scene,
+            tangent,
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    return {
+        name: float(value(moved(tangent, h))[0] - value(moved(tangent, -h))[0]) / (2 * h)
+        for name, tangent in directions(scene)
+    }
+
+
+def assert_same(found, expected, tolerance, context=""):
+    """Each leaf's gradient to this part of its norm, which is not 0."""
+    assert found.keys() == expected.keys()
+    for name, want in expected.items():
+        norm = np.linalg.norm(want)
+        assert norm > 0, (context, name)
+        error = np.linalg.norm(found[name] - want) / norm
+        assert error <= tolerance, f"{context} {name}: off by {error:.1e} of its norm {norm:.3g}"
+
+
+def assert_slopes(found, gradients, scene, tolerance, context=""):
+    """Slopes along `directions`, whose components are all 1 or -1, to this part of the gradient's norm."""
+    for name, tangent in directions(scene):
+        along, norm = np.asarray(LEAVES[name](tangent)), np.linalg.norm(gradients[name])
+        assert norm > 0, (context, name)
+        error = abs(found[name] - np.vdot(gradients[name], along)) / norm
+        assert error <= tolerance, f"{context} {name}: off by {error:.1e} of its norm {norm:.3g}"
+
+
+QUICK = ["hierarchy", "beam"]
+"""`"distance"` is `"beam"` without a start."""
+
+FAST = {("jittered", method, "uint8") for method in QUICK}
+TYPES = ["uint8", "uint16", "int16", "float32"]
+LEAPT = [
+    *((name, method, "uint8") for name in SETS for method in EXACT),
+    *(("moving", "hierarchy", dtype) for dtype in TYPES[1:]),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "dtype"), [case if case in FAST else pytest.param(*case, marks=slow) for case in LEAPT]
+)
+def test_replay_does_not_see_the_leaps(name, method, dtype):
+    for camera in CAMERAS:
+        found, expected = (
+            gradient(scene_of(name, leaps, dtype, camera), empty=True) for leaps in (method, None)
+        )
+        assert_same(found, expected, 1e-4, camera)
+
+
+@pytest.mark.parametrize("method", [*QUICK, pytest.param("distance", marks=slow)])
+def test_no_leap_shows_in_a_gradient_whatever_is_rendered(method):
+    """Invariant 2, for gradients: other cameras, transfer functions, voxels, seeds and steps."""
+
+    @settings(max_examples=6, deadline=None, derandomize=True)
+    @given(
+        seed=st.integers(0, 1000),
+        away=st.floats(0.2, 6),
+        step=st.floats(0.02, 0.2),
+        dense=st.floats(0.05, 20),
+        shown=st.lists(st.booleans(), min_size=6, max_size=6),
+    )
+    def check(seed, away, step, dense, shown):
+        random = np.random.default_rng(seed)
+        volume, transfer, camera, march = scene_of("jittered", method)
+        volume = jv.Volume(blobs("uint8", seed), volume.spacing, volume.origin)
+        side = random.normal(size=3)
+        position = np.asarray(volume.center) + away * side / np.linalg.norm(side)
+        target = np.asarray(volume.center) + random.uniform(-0.3, 0.3, 3)
+        camera = jv.Camera(position, target, random.normal(size=3), random.uniform(15, 90), size=SIZE)
+        extinction = np.where(shown, dense * random.random(6), 0)
+        transfer = jv.TransferFunction(transfer.values, random.random((6, 3)), extinction)
+        transforms = (jv.Jitter(seed), *march.transforms[1:])
+        scenes = [(volume, transfer, camera, jv.March(step, used)) for used in (transforms, transforms[:-1])]
+        found, expected = map(gradient, scenes)
+        for name, want in expected.items():
+            assert np.isfinite(found[name]).all(), name
+            # float32 leaves this much of sums in which most cancels
+            rounding = 1e-6 * np.linalg.norm(expected["focal_point"])
+            assert np.linalg.norm(found[name] - want) <= 1e-4 * np.linalg.norm(want) + rounding, name
+
+    check()
+
+
+FORWARD = [
+    *(("jittered", method, "uint8") for method in METHODS),
+    *(("moving", method, "uint8") for method in METHODS),
+    *((name, "hierarchy", "uint8") for name in ("plain", "aligned", "residual")),
+    *(("moving", "hierarchy", dtype) for dtype in TYPES[1:]),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "dtype"),
+    [c if c == ("jittered", "hierarchy", "uint8") else pytest.param(*c, marks=slow) for c in FORWARD],
+)
+def test_forward_is_replay(name, method, dtype):
+    """`"min_distance"`, whose image is another, too."""
+    for camera in CAMERAS:
+        scene = scene_of(name, method, dtype, camera)
+        assert_slopes(slopes(scene), gradient(scene), scene, 1e-4, camera)
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "dtype"),
+    [
+        ("moving", "hierarchy", "float64"),
+        *(pytest.param(name, None, "float64", marks=slow) for name in SETS if name != "plain"),
+        *(pytest.param("moving", method, "uint8", marks=slow) for method in EXACT),
+    ],
+)
+def test_gradients_are_central_differences(name, method, dtype):
+    """But for the plain march, whose image jumps where a sample crosses the exit."""
+    with in_float64():
+        scene = scene_of(name, method, dtype)
+        assert_slopes(central(scene), gradient(scene), scene, 1e-5)
+
+
+@slow
+@pytest.mark.parametrize("name", SETS)
+def test_adjoints_agree_to_rounding(name):
+    with in_float64():
+        for camera in (*CAMERAS, "parallel"):
+            scene = scene_of(name, None, "float64", camera, max_samples=128)
+            expected = gradient(scene, "direct")
+            assert_same(gradient(scene), expected, 1e-9, camera)
+            assert_slopes(slopes(scene), expected, scene, 1e-9, camera)
+            for method in EXACT:
+                leapt = scene_of(name, method, "float64", camera)
+                assert_same(gradient(leapt), expected, 1e-9, (camera, method))
+
+
+@slow
+@pytest.mark.parametrize("method", EXACT)
+def test_gradients_under_jit_are_those_without(method):
+    """There the voxels are traced, and so not packed."""
+    scene = scene_of("moving", method)
+    inside = eqx.filter_jit(eqx.filter_grad(loss))(scene)
+    leaves = {name: np.asarray(where(inside)) for name, where in LEAVES.items() if where(inside) is not None}
+    leaves["extinction"] = np.where(scene[1].extinction > 0, leaves["extinction"], 0)
+    assert_same(leaves, gradient(scene), 1e-4)
+
+
+@slow
+def test_waves_and_batches_of_rays_do_not_show():
+    """1.07 million pixels: five waves, and tens of batches."""
+    gradients = {}
+    for method in (None, "hierarchy"):
+        volume, transfer, camera, march = scene_of("jittered", method)
+        large = jv.Camera(camera.position, camera.focal_point, camera.view_up, 30.0, size=(1040, 1030))
+        gradients[method] = gradient((volume, transfer, large, march))
+    assert_same(gradients["hierarchy"], gradients[None], 1e-4)
+
+
+@slow
+def test_float32_gradients_are_those_of_float64():
+    single = gradient(scene_of("moving", "hierarchy"))
+    with in_float64():
+        double = gradient(scene_of("moving", "hierarchy"))
+    assert_same(single, double, 1e-3)
+
+
+def assert_slopes_of(of, given, leaps, context=""):
+    """`of(parameters, method, adjoint)`: replay with leaps and without, forward and differences agree."""
+    random = np.random.default_rng(0)
+    signs = jax.tree.map(lambda leaf: jnp.asarray(random.choice([-1.0, 1.0], leaf.shape)), given)
+    signs = jax.tree.map(lambda sign, leaf: jnp.where(leaf == 0, 0, sign), signs, given)
+    floats = {}
+    for method in (None, leaps):
+        found = jax.grad(lambda g, m=method: of(g, m, "replay"))(given)
+        floats[method] = [np.asarray(leaf) for leaf in jax.tree.leaves(found)]
+    norm = np.linalg.norm([np.linalg.norm(leaf) for leaf in floats[None]])
+    for found, expected, leaf in zip(floats[leaps], floats[None], jax.tree.leaves(given), strict=True):
+        found, expected = (np.where(leaf == 0, 0, part) for part in (found, expected))
+        assert np.linalg.norm(found - expected) <= 1e-9 * norm, context
+    slope = sum(np.vdot(part, sign) for part, sign in zip(floats[leaps], jax.tree.leaves(signs), strict=True))
+    forward = jax.jvp(lambda g: of(g, leaps, "forward"), (given,), (signs,))[1]
+    ends = [
+        of(jax.tree.map(lambda leaf, sign, h=h: leaf + h * sign, given, signs), leaps, "replay")
+        for h in (1e-6, -1e-6)
+    ]
+    assert abs(forward - slope) <= 1e-9 * norm, context
+    assert abs((ends[0] - ends[1]) / 2e-6 - slope) <= 1e-5 * norm, context
+
+
+@slow
+@pytest.mark.parametrize("method", EXACT)
+def test_functions_by_label(method):
+    labels = (np.indices(SHAPE).sum(axis=0) // 9 % 3).astype(np.uint8)
+    with in_float64():
+
+        def of(given, leaps, adjoint):
+            volume, transfer, camera, march = scene_of("jittered", leaps)
+            volume = jv.Volume(volume.data, volume.spacing, volume.origin, labels)
+            functions = [jv.TransferFunction(transfer.values, *leaves) for leaves in given]
+            transfer = jv.LabelTransferFunction([functions[0], None, functions[1]])
+            transforms = [t for t in march.transforms if not isinstance(t, jv.AlphaCorrection)]
+            march = jv.March(march.step, (*transforms, jv.AlphaCorrection(labels=True)))
+            return loss((volume, transfer, camera, march), adjoint)
+
+        transfer = scene_of()[1]
+        given = [
+            (transfer.colors, transfer.extinction),
+            (1 - transfer.colors, 2 * transfer.extinction),
+        ]
+        assert_slopes_of(of, given, method)
+
+
+@slow
+@pytest.mark.parametrize("method", EXACT[:2])
+def test_rays_of_ones_own(method):
+    with in_float64():
+
+        def of(given, leaps, adjoint):
+            volume, transfer, _, march = scene_of("jittered", leaps)
+            rendering = jv.render_rays(volume, transfer, *given, march, adjoint=adjoint)
+            weights = np.random.default_rng(5).normal(size=rendering.rgba.shape)
+            return jnp.sum(rendering.rgba * jnp.asarray(weights))
+
+        origins, directions = scene_of()[2].rays()
+        # of other lengths than 1, and not rectangular
+        assert_slopes_of(of, (origins.reshape(-1, 3)[:500], 3 * directions.reshape(-1, 3)[:500]), method)
+
+
+FILES = {
+    "engine": "engine_256x256x128_uint8.raw.gz",
+    "bonsai": "bonsai_256x256x256_uint8.raw.gz",
+    "lidc0314_airway": "lidc0314_airway_256x192x200_int16le.raw.gz",
+    "aneurism": "aneurism_256x256x256_uint8.raw.gz",
+}
+
+
+@slow
+@pytest.mark.parametrize("name", real_scenes.SCENES)
+def test_adjoints_agree_on_the_scenes_of_the_experiments(name, real_volume):
+    folder = None if name == real_scenes.PHANTOM else real_volume(FILES[name]).parent
+    scene = real_scenes.SCENES[name](folder, 128)
+
+    def leapt(method):
+        leaps = () if method is None else (jv.SpaceLeaping(method),)
+        transforms = (jv.AlphaCorrection(), *leaps, jv.EarlyTermination(1 / 255))
+        return *scene[:3], jv.March(scene.step, transforms)
+
+    expected = gradient(leapt(None))
+    for method in EXACT:
+        found = gradient(leapt(method))
+        assert_same(found, expected, 1e-4, method)
+        assert_slopes(slopes(leapt(method)), found, leapt(method), 1e-4, method)

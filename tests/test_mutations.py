@@ -1,0 +1,39 @@
+"""The list of known faults fits the code: `python -m tests.mutations` can be run."""
+
+import ast
+import subprocess
+import sys
+
+import pytest
+
+from .mutations import MUTATIONS, ROOT
+
+
+def test_every_fault_is_a_change_of_the_code_as_it_is():
+    names = [mutation.name for mutation in MUTATIONS]
+    assert len(set(names)) == len(names) >= 20
+    for mutation in MUTATIONS:
+        changed = mutation.applied(ROOT)
+        before = (ROOT / "jaxvol" / mutation.file).read_text(encoding="utf-8")
+        assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(before)), mutation.name
+
+
+def test_a_text_that_is_not_there_any_more_is_told():
+    with pytest.raises(ValueError, match=r"march\.py must hold this text once, and holds it 0 times"):
+        MUTATIONS[0]._replace(file="march.py", old="no such line").applied(ROOT)
+
+
+def test_every_test_that_is_named_exists_and_is_fast():
+    named = {test for mutation in MUTATIONS for test in mutation.tests}
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-n", "0"]
+    found = subprocess.run(
+        [*command, *(f"tests/{test}" for test in sorted(named))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stdout[-3000:] + found.stderr[-3000:]
+    collected = found.stdout
+    for test in named:
+        assert f"tests/{test}" in collected, f"{test} is slow, or has another name"
