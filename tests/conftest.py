@@ -1,6 +1,8 @@
 """Every test runs with shapes and types checked, and with JAX's silent conversions forbidden."""
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -16,13 +18,39 @@ with install_import_hook("jaxvol", "tests.typechecker.check"):
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+PROGRAMS = pytest.StashKey[str]()
+"""The folder in which all processes of this session keep what they compile."""
+
+
+def pytest_configure(config):
+    """Compile each program once a session, whichever worker, kernel or subprocess asks for it first.
+
+    The folder is new every time and removed at the end, so that nothing old is tested."""
+    if hasattr(config, "workerinput"):
+        return  # a worker of pytest-xdist: the environment tells it
+    folder = config.stash[PROGRAMS] = tempfile.mkdtemp(prefix="jaxvol-programs-")
+    settings = {
+        "jax_compilation_cache_dir": folder,
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    for name, value in settings.items():
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
+
+
+def pytest_unconfigure(config):
+    if PROGRAMS in config.stash:
+        shutil.rmtree(config.stash[PROGRAMS], ignore_errors=True)
+
 
 @pytest.fixture(scope="module", autouse=True)
 def room_for_programs():
-    """Compiled programs take memory maps, of which Linux gives a process 65 530; past that XLA crashes."""
+    """Forget programs before a worker holds 3 GB of them, and long before their memory maps are as many as
+    Linux gives a process (65 530), past which XLA crashes. What is asked for again lies in the folder."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and len(maps.read_bytes().splitlines()) > 30_000:
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 15_000:
         jax.clear_caches()
 
 

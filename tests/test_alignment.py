@@ -46,8 +46,15 @@ def test_without_it_the_exit_is_bumpy():
     assert jumps[1] < jumps[0] / 20
 
 
-@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
-@pytest.mark.parametrize("pattern", ["white", "blue"])
+@pytest.mark.parametrize(
+    ("pattern", "quadrature"),
+    [
+        ("white", "left"),
+        ("blue", "midpoint"),
+        pytest.param("white", "midpoint", marks=pytest.mark.slow),
+        pytest.param("blue", "left", marks=pytest.mark.slow),
+    ],
+)
 def test_a_constant_volume_is_exact_under_jitter(pattern, quadrature):
     volume = scaled_phantom("constant")
     camera = jv.Camera((0.3, 0.2, -4.0), (0.3, 0.2, 0.0), (0, 1, 0), size=(40, 32), parallel_scale=0.5)

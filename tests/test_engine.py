@@ -22,7 +22,7 @@ def assert_same(a, b, tolerance=1e-6):
         np.testing.assert_allclose(left, right, atol=tolerance, rtol=0, err_msg=name)
 
 
-@pytest.mark.parametrize("size", [(70, 3), (65, 65), (1, 1)])
+@pytest.mark.parametrize("size", [(65, 65), (1, 1), pytest.param((70, 3), marks=pytest.mark.slow)])
 def test_waves_do_not_show(size, monkeypatch):
     volume = anisotropic_noise()
     camera = around(volume, size)
@@ -30,9 +30,9 @@ def test_waves_do_not_show(size, monkeypatch):
     assert whole.rgba.shape == (size[1], size[0], 4)
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
     monkeypatch.setattr(waves, "WAVE", 4)
-    jax.clear_caches()
-    assert_same(whole, jv.render(volume, soft_transfer(), camera, MARCH))
-    jax.clear_caches()
+    Anew = counting()  # another type, so another program
+    assert_same(whole, jv.render(volume, Anew(*jax.tree.leaves(soft_transfer())), camera, MARCH))
+    assert Anew.traces == 1
 
 
 def test_rays_of_ones_own_see_what_the_camera_sees():
@@ -56,7 +56,7 @@ def test_adjoints_share_one_image(adjoint):
     assert_same(plain, jv.render(volume, soft_transfer(), camera, MARCH, adjoint=adjoint))
 
 
-@pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
+@pytest.mark.parametrize("adjoint", ["replay", "forward", pytest.param("direct", marks=pytest.mark.slow)])
 def test_an_image_alone_is_the_same_with_its_gradient(adjoint):
     volume, transfer = anisotropic_noise(), soft_transfer()
     march = jv.March(0.07, (jv.AlphaCorrection(), jv.EmptySpaceJitter(), jv.EarlyTermination(0.1)))
@@ -134,17 +134,17 @@ def test_memory_beside_the_image_does_not_grow_with_it():
     assert large - small <= 1.1 * bytes_per_pixel * pixels
 
 
-@pytest.mark.parametrize("transforms", [(), (jv.AlphaCorrection(),), (jv.EarlyTermination(0.1),)])
-def test_a_transform_that_is_not_asked_for_leaves_no_trace(transforms):
+def test_a_transform_that_is_not_asked_for_leaves_no_trace():
     """The program of a plain march is smaller, in operations, than that of any other."""
     volume = anisotropic_noise()
 
-    def operations(transforms):
+    def operations(*transforms):
         arguments = volume, soft_transfer(), around(volume, (8, 8)), jv.March(0.07, transforms)
         return eqx.filter_jit(jv.render).lower(*arguments).compile().compiled.cost_analysis()["flops"]
 
-    assert operations(()) <= operations(transforms)
-    assert (operations(()) == operations(transforms)) == (transforms == ())
+    plain = operations()
+    assert 0 < plain < operations(jv.AlphaCorrection())
+    assert plain < operations(jv.EarlyTermination(0.1))
 
 
 def test_unknown_outputs_are_named():

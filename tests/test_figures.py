@@ -195,6 +195,7 @@ def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     assert kisti_table.table(record.read(record.RESULTS / "kisti.json")) in told
 
 
+@pytest.mark.slow
 def test_the_templates_in_the_readme_are_those_that_grow():
     told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     assert lee_tables.table() in told
