@@ -102,11 +102,19 @@ def render(
           `render_ray_reference`. Memory grows with the number of samples.
 
     **Returns:** a `Rendering` with leading shape (height, width), in float32; or, for the image alone, a
-    `Picture`.
+    `Picture`. Where a number on which all pixels depend is NaN or infinite (an entry of a transfer function
+    whose fit diverged, say), all of the image is NaN, and so is its gradient; a voxel that is NaN makes those
+    pixels NaN whose rays meet it.
+
+    Under `jax.vmap`, over any of the arguments, images are rendered one after the other, in one program, and
+    so are their gradients: in the time and the memory of a loop. `"direct"` renders them side by side, and so
+    does `"forward"` where the image is also differentiated, or compiled inside the `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, for one that is something else than its name says (an array
     for a `Volume`, a camera in the march's place), for unknown outputs or an unknown adjoint, and for
-    `"direct"` where the march or the spacing is traced and `march.max_samples` is not given.
+    `"direct"` where the march or the spacing is traced and `march.max_samples` is not given. Under the wrong
+    mode of differentiation, with the adjoint to pass (but for `jax.jvp` of a `jax.jit` under `"replay"`,
+    which is JAX's `TypeError`).
 
     Without `AlphaCorrection` the gradient of an image with respect to the camera, the spacing and
     whatever else moves the exit is wrong by the jumps made when a sample crosses the exit.
