@@ -1,4 +1,4 @@
-"""Small scenes that share shapes, so that one compiled program serves them all."""
+"""Small scenes that share shapes, so that one compiled program serves them all, in every file of tests."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

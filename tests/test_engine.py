@@ -51,7 +51,7 @@ def test_rays_of_ones_own_see_what_the_camera_sees():
 @pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
 def test_adjoints_share_one_image(adjoint):
     volume = anisotropic_noise()
-    camera = around(volume, (12, 10))
+    camera = around(volume)
     plain = jv.render(volume, soft_transfer(), camera, MARCH)
     assert_same(plain, jv.render(volume, soft_transfer(), camera, MARCH, adjoint=adjoint))
 
@@ -60,7 +60,7 @@ def test_adjoints_share_one_image(adjoint):
 def test_an_image_alone_is_the_same_with_its_gradient(adjoint):
     volume, transfer = anisotropic_noise(), soft_transfer()
     march = jv.March(0.07, (jv.AlphaCorrection(), jv.EmptySpaceJitter(), jv.EarlyTermination(0.1)))
-    camera = around(volume, (12, 10))
+    camera = around(volume)
 
     def seen(extinction, outputs="all"):
         changed = eqx.tree_at(lambda t: t.extinction, transfer, extinction)
@@ -83,7 +83,7 @@ def test_an_image_alone_is_the_same_with_its_gradient(adjoint):
 
 def test_crop_renders_the_same_pixels():
     volume = anisotropic_noise()
-    camera = around(volume, (30, 20))
+    camera = around(volume)
     whole = jv.render(volume, soft_transfer(), camera, MARCH)
     part = jv.render(volume, soft_transfer(), camera.crop(11, 4, 9, 7), MARCH)
     np.testing.assert_allclose(part.rgba, whole.rgba[4:11, 11:20], atol=2e-5)
@@ -102,7 +102,7 @@ def test_one_program_serves_all_cameras_steps_transfer_functions_and_volumes():
 
 def test_runs_inside_jit_and_vmap():
     volume = anisotropic_noise()
-    cameras = [around(volume, (6, 5)), around(volume, (6, 5)).zoom(2)]
+    cameras = [around(volume), around(volume).zoom(2)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
 
     @eqx.filter_jit

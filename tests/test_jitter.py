@@ -156,7 +156,7 @@ def test_seeds_do_not_compile_again_and_images_differ_by_noise_alone():
     Counting = counting()
     volume = anisotropic_noise()
     transfer = Counting(*jax.tree.leaves(soft_transfer()))
-    camera = around(volume, (24, 20))
+    camera = around(volume)
     images = [
         np.asarray(jv.render(volume, transfer, camera, jv.March(0.07, (jv.Jitter(seed),))).rgba)
         for seed in range(8)
