@@ -103,7 +103,8 @@ class Total(eqx.Module):
         sums = None
         if voxels:
             # many small parts are added up, which 16 bits would lose
-            sums = jnp.zeros(volume.data.size, jnp.promote_types(volume.data.dtype, jnp.float32))
+            dtype = volume.data.dtype
+            sums = jnp.zeros(volume.data.size, dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32)
         return cls(transfer, march, volume_, sums, lit)
 
 

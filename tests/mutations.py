@@ -60,7 +60,7 @@ LEAPT_GRADIENT = "test_gradient_matrix.py::test_replay_does_not_see_the_leaps[ji
 FORWARD_GRADIENT = "test_gradient_matrix.py::test_forward_is_replay[jittered-hierarchy-uint8]"
 DIFFERENCES = "test_gradient_matrix.py::test_gradients_are_central_differences[moving-hierarchy-float64]"
 FAULTS = "test_faults.py::test_what_is_no_number_reaches_image_and_gradient[leaping]"
-WHOLE_SCENES = "test_vmap.py::test_over_whole_scenes[float32]"
+IN_TURN = "test_vmap.py::test_over_one_part[cameras-uint8]"
 PACKED = "test_leaping.py::test_packed_voxels_are_the_same_values"
 RENDERED = "test_agreement.py::test_the_renderer_is_the_independent_marcher"
 
@@ -142,14 +142,14 @@ MUTATIONS = [
         "beams.py",
         "least(d, 1) - bulge / size,",
         "least(d, 1),",
-        ("test_leaping.py::test_no_beam_misses_what_is_seen",),
+        ("test_beams.py::test_a_box_holds_every_ray_of_its_beam",),
     ),
     Mutation(
         "survey: boxes of stretches end before the stretch does",
         "beams.py",
         "first + 1.01 * length)",
         "first + 0.5 * length)",
-        ("test_leaping.py::test_no_ray_misses_what_is_seen",),
+        ("test_beams.py::test_no_stretch_in_which_a_ray_meets_anything_is_empty",),
     ),
     Mutation(
         "survey: blocks without the nodes of their upper faces",
@@ -328,7 +328,7 @@ MUTATIONS = [
         "compiled.py",
         "return jax.lax.map(one, [leaf for leaf, moves in",
         "return jax.lax.map(one, [leaf[::-1] for leaf, moves in",
-        (WHOLE_SCENES,),
+        (IN_TURN,),
     ),
 ]
 

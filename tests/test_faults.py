@@ -34,8 +34,8 @@ WHOLE = {
 
 
 def scene(transforms=()):
-    """A volume with something to see in one half, and nothing in the other."""
-    data = np.zeros((12, 10, 11), np.float32)
+    """A volume with something to see at its near end, and nothing behind."""
+    data = np.zeros((12, 40, 11), np.float32)
     data[2:5, 3:7, 3:8] = 0.8
     volume = jv.Volume(data, (0.1, 0.1, 0.1))
     transfer = jv.TransferFunction([0.0, 0.2, 1.0], np.full((3, 3), 0.5), [0.0, 0.0, 9.0])
@@ -80,11 +80,12 @@ def test_what_is_no_number_reaches_image_and_gradient(transforms):
             assert np.isnan(gradient[1].colors).any(), (name, fault)
             assert np.isnan(where(gradient)).any(), (name, fault)
 
-    for place in ((3, 5, 5), (9, 5, 5)):  # a voxel that is seen, and one in empty space
+    for place in ((3, 5, 5), (9, 34, 5)):  # a voxel that is seen, and one in what is leapt over
         bad = eqx.tree_at(lambda f: f[0].data, floats, floats[0].data.at[place].set(np.nan))
         (value, image), gradient = both(bad)
         assert np.isnan(value), place
         assert np.isnan(image).any(), place
+        np.testing.assert_array_equal(np.isnan(image[..., :3]).all(axis=-1), np.isnan(image[..., 3]))
         assert not np.isnan(image).all(), "rays that do not meet it see what they saw"
         assert np.isnan(gradient[1].colors).any(), place
         assert np.isnan(gradient[0].data).any(), place

@@ -299,7 +299,7 @@ def test_gradients_under_jit_are_those_without(method):
 
 @slow
 def test_waves_and_batches_of_rays_do_not_show():
-    """1.07 million pixels: five waves, and tens of batches."""
+    """1.07 million pixels: two waves, and tens of batches."""
     gradients = {}
     for method in (None, "hierarchy"):
         volume, transfer, camera, march = scene_of("jittered", method)
