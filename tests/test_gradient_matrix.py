@@ -31,7 +31,7 @@ SETS = {
     "plain": ("left", ()),
     "aligned": ("midpoint", (jv.AlphaCorrection(),)),
     "jittered": ("left", (jv.Jitter(3), jv.AlphaCorrection(), jv.EarlyTermination(0.05))),
-    "moving": ("left", (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05))),
+    "moving": ("left", (jv.EmptySpaceJitter(4), jv.AlphaCorrection())),
     "residual": ("midpoint", (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())),
 }
 
@@ -84,7 +84,7 @@ def scene_of(name="jittered", method=None, dtype="uint8", camera="outside", max_
     quadrature, transforms = SETS[name]
     transforms = transforms if method is None else (*transforms, jv.SpaceLeaping(method, 4))
     volume = jv.Volume(blobs(dtype), (0.07, 0.09, 0.06), (0.2, -0.4, 0.1))
-    values, extinction = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 1.0]), np.array([0.0, 0.0, 1.0, 3.0, 0.0, 9.0])
+    values, extinction = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 1.0]), np.array([0.0, 0.0, 4.0, 12.0, 0.0, 36.0])
     if name == "moving":  # as many points as are looked up by searching
         few, values = values, np.linspace(0, 1, 31)
         extinction = np.interp(values, few, extinction)
@@ -113,10 +113,11 @@ def loss_and_opacity(scene, adjoint):
 
 
 def gradient(scene, adjoint="replay", *, empty=False):
-    """That of every leaf by name; of extinctions, where there is any. `empty`: some rays must see nothing."""
+    """That of every leaf by name; of extinctions, where there is any. `empty`: some rays must see nothing,
+    and others end early."""
     take = eqx.filter_grad(functools.partial(loss_and_opacity, adjoint=adjoint), has_aux=True)
     found, opacity = take(scene)
-    assert not empty or 0.05 < np.mean(opacity > 0) < 0.95
+    assert not empty or (0.05 < np.mean(opacity > 0) < 0.95 and opacity.max() > 0.95)
     leaves = {name: where(found) for name, where in LEAVES.items()}
     leaves["extinction"] = jnp.where(scene[1].extinction > 0, leaves["extinction"], 0)
     return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
@@ -145,8 +146,11 @@ def slopes(scene, adjoint="forward"):
     return {name: float(slope(tangent)) for name, tangent in directions(scene)}
 
 
-def central(scene, h=1e-6):
-    """The same by central differences of what `jax.value_and_grad` calls the value."""
+def central(scene, h=1e-7):
+    """The same by central differences of what `jax.value_and_grad` calls the value.
+
+    At 1e-6 some of the 40 000 samples cross a face of voxels or a control point between the two ends, where
+    the slope changes; at 1e-9 rounding shows."""
     value = eqx.filter_value_and_grad(loss)
 
     def moved(tangent, by):
@@ -261,14 +265,15 @@ def test_forward_is_replay(name, method, dtype):
     ("name", "method", "dtype"),
     [
         ("moving", "hierarchy", "float64"),
-        *(pytest.param(name, None, "float64", marks=slow) for name in SETS if name != "plain"),
+        *(pytest.param(name, None, "float64", marks=slow) for name in ("aligned", "moving", "residual")),
         *(pytest.param("moving", method, "uint8", marks=slow) for method in EXACT),
     ],
 )
 def test_gradients_are_central_differences(name, method, dtype):
-    """But for the plain march, whose image jumps where a sample crosses the exit."""
+    """Where nothing jumps: no sample crosses the exit uncut, none ends a ray, and from inside the empty space
+    the first transparent sample of each ray stays the first."""
     with in_float64():
-        scene = scene_of(name, method, dtype)
+        scene = scene_of(name, method, dtype, "inside")
         assert_slopes(central(scene), gradient(scene), scene, 1e-5)
 
 
