@@ -76,5 +76,7 @@ def scattered(
 ) -> Float[Array, " voxels"]:
     """Parts of a gradient added to the voxels that were asked for."""
     for place, part in zip(asked, parts, strict=True):
-        voxels = voxels.at[place].add(part, mode="promise_in_bounds", wrap_negative_indices=False)
+        voxels = voxels.at[place].add(
+            part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
+        )
     return voxels

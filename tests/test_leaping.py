@@ -1,9 +1,5 @@
 """Do speed-ups show? Leaping over empty space, sizes of tiles, packed voxels and devices change no pixel."""
 
-import os
-import subprocess
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -692,62 +688,12 @@ def test_images_of_integers_are_those_of_the_same_floats(dtype, shape):
         assert float(whole.rgba[..., 3].max()) > 0.1
 
 
-# ---- devices ----
+# ---- cropped cameras ----
 
 
-SHARDED = """
-import sys
-import jax
-import numpy as np
-from jax.sharding import Mesh, PartitionSpec as P
-import jaxvol as jv
-
-given = np.load(sys.argv[1])
-volume = jv.Volume(given["data"], given["spacing"])
-transfer = jv.TransferFunction(given["values"], given["colors"], given["extinction"])
-march = jv.March(0.013, (jv.SpaceLeaping("hierarchy", 4),))
-assert len(jax.devices()) == 4
-mesh = Mesh(np.array(jax.devices()), ("rays",))
-part = jax.shard_map(
-    lambda o, d: jv.render_rays(volume, transfer, o, d, march),
-    mesh=mesh, in_specs=(P("rays"), P("rays")), out_specs=P("rays"),
-    check_vma=False,  # equinox.error_if does not hold with it
-)
-sharded = jax.jit(part)(given["origins"], given["directions"])
-assert len(sharded.rgba.sharding.device_set) == 4
-camera = jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=(100, 100))
-image = jv.render(volume, transfer, camera, jv.March(0.013, (jv.SpaceLeaping("beam", 32),)))
-np.savez(sys.argv[2], sharded=sharded.rgba, samples=sharded.samples, image=image.rgba)
-"""
-
-
-@pytest.mark.slow
-def test_devices_do_not_show(tmp_path):
-    data, transfer = bytes_of(contents("blobs", 1)), table(1, 255)
-    volume = jv.Volume(data, SPACING)
-    origins, directions = random_rays(volume, data, transfer, 0)
-    names = ("values", "colors", "extinction")
-    scene = {name: np.asarray(getattr(transfer, name)) for name in names}
-    scene |= {"data": data, "spacing": SPACING, "origins": origins, "directions": directions}
-    np.savez(tmp_path / "given.npz", **scene)
-    (tmp_path / "sharded.py").write_text(SHARDED)
-    flags = "--xla_force_host_platform_device_count=4"
-    subprocess.run(
-        [sys.executable, tmp_path / "sharded.py", tmp_path / "given.npz", tmp_path / "seen.npz"],
-        env={
-            **os.environ,
-            "XLA_FLAGS": flags,
-            "JAX_PLATFORMS": "cpu",
-            "PYTHONPATH": ":".join(sys.path),
-        },
-        check=True,
-    )
-    seen = np.load(tmp_path / "seen.npz")
-    march = jv.March(0.013, leaping(PLAIN, "hierarchy"))
-    rays = jv.render_rays(volume, transfer, origins, directions, march)
-    # sharded rays are a program inside another one, which XLA rounds otherwise
-    np.testing.assert_allclose(seen["sharded"], rays.rgba, atol=1e-5, rtol=0)
-    camera = jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=(100, 100))
-    image = jv.render(volume, transfer, camera, jv.March(0.013, leaping(PLAIN, "beam", 32)))
-    assert float(image.rgba[..., 3].max()) > 0.1
-    np.testing.assert_allclose(seen["image"], image.rgba, atol=1e-6, rtol=0)
+def test_a_part_of_an_image_leaps_as_the_whole():
+    """What cells of pixels know is looked up by the pixel's place in the part, not in the whole."""
+    volume, transfer = jv.Volume(bytes_of(contents("blobs", 1)), SPACING), table(1, 255)
+    camera = PERSPECTIVE["around"](volume, (44, 40)).crop(23, 19, *SIZE)
+    whole = compare_methods(volume, transfer, camera, 0.05, MOVING, ["beam"])
+    assert float(whole.rgba[..., 3].max()) > 0.1

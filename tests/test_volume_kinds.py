@@ -1,0 +1,71 @@
+"""Volumes that measure in their own way, or keep their voxels in 16 bits: image and gradient see them so."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+from .scenes import around, soft_transfer
+
+
+class Inverted(jv.Volume):
+    """Dense where its voxels are 0: what is known of the voxels alone is wrong for it."""
+
+    def value(self, coordinate):
+        return 1 - super().value(coordinate) / 255
+
+
+@pytest.fixture(scope="module")
+def march():
+    return jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping()))
+
+
+def inverted(dtype):
+    data = np.full((12, 12, 12), 255)
+    data[4:8, 3:8, 5:9] = np.random.default_rng(0).integers(0, 120, (4, 5, 4))
+    return Inverted(data.astype(dtype), (0.1, 0.12, 0.08))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", pytest.param("float32", marks=pytest.mark.slow)])
+def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype, march):
+    """In the fast engine and in its gradient, as in the reference engine, which asks `value` alone."""
+    volume = inverted(dtype)
+    camera, transfer = around(volume), soft_transfer(0.2)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(16, 20, 4)), jnp.float32)
+
+    def of(adjoint):
+        def loss(moving):
+            data, position = eqx.combine(moving, (volume.data, camera.position))
+            scene = eqx.tree_at(lambda s: (s[0].data, s[1].position), (volume, camera), (data, position))
+            rgba = jv.render(scene[0], transfer, scene[1], march, adjoint=adjoint).rgba
+            return jnp.sum(rgba * weights), rgba
+
+        moving = eqx.filter((volume.data, camera.position), eqx.is_inexact_array)
+        return jax.value_and_grad(loss, has_aux=True)(moving)
+
+    ((_, image), replayed), ((_, truth), direct) = of("replay"), of("direct")
+    assert float(truth[..., 3].max()) > 0.3
+    np.testing.assert_allclose(image, truth, atol=2e-5, rtol=0)
+    for got, want in zip(jax.tree.leaves(replayed), jax.tree.leaves(direct), strict=True):
+        np.testing.assert_allclose(got, want, atol=2e-4 * np.linalg.norm(want) + 1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", ["float16", pytest.param("bfloat16", marks=pytest.mark.slow)])
+def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype, march):
+    """Each of few voxels gets part of the gradient from thousands of samples, which 16 bits would lose."""
+    data = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.9, (4, 4, 4)), dtype)
+    transfer, whole = soft_transfer(0.2), jv.Volume(data.astype(jnp.float32))
+    camera = around(whole, (48, 48))
+
+    def gradient(data):
+        def loss(data):
+            return jnp.sum(jv.render(jv.Volume(data), transfer, camera, march).rgba)
+
+        return np.asarray(jax.grad(loss)(data), np.float64)
+
+    expected = gradient(data.astype(jnp.float32))
+    error = np.abs(gradient(data) - expected).max() / np.abs(expected).max()
+    assert error < 2 * float(jnp.finfo(dtype).eps)
