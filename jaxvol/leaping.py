@@ -186,7 +186,7 @@ class _Distances(Survey):
             last = (n - 1 for n in reversed(self.starts.shape))
             # those that only fill up groups lie past the image
             x, y = (
-                jnp.minimum((pixel - first) // self.cell, n)
+                jnp.minimum((pixel - first.astype(pixel.dtype)) // self.cell, n)
                 for pixel, first, n in zip(rays.pixel, self.corner, last, strict=True)
             )
             depth = jnp.maximum(depth, self.starts[y, x] - rays.t_in)

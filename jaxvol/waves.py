@@ -178,7 +178,7 @@ def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
 
 
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
-    left, top = source.first_pixel
+    left, top = (first.astype(column.dtype) for first in source.first_pixel)
     return Line(*source.ray(column, row), (column + left, row + top))
 
 

@@ -104,8 +104,8 @@ MUTATIONS = [
     Mutation(
         "leaping: start distances of a crop are looked up by the pixel of the whole image",
         "leaping.py",
-        "jnp.minimum((pixel - first) // self.cell, n)",
-        "jnp.minimum((pixel - 0 * first) // self.cell, n)",
+        "jnp.minimum((pixel - first.astype(pixel.dtype)) // self.cell, n)",
+        "jnp.minimum(pixel // self.cell, n)",
         ("test_leaping.py::test_a_part_of_an_image_leaps_as_the_whole",),
     ),
     Mutation(
@@ -131,9 +131,9 @@ MUTATIONS = [
     ),
     Mutation(
         "jitter: a crop has numbers of its own",
-        "waves.py",
-        "left, top = jnp.round(source.corner).astype(column.dtype)",
-        "left, top = 0, 0",
+        "camera.py",
+        "left, top = jnp.round(self.corner).astype(jnp.int32)",
+        "left, top = jnp.zeros(2, jnp.int32)",
         ("test_jitter.py::test_a_crop_is_jittered_as_its_part_of_the_image",),
     ),
     # how they move on

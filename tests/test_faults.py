@@ -80,12 +80,15 @@ def test_what_is_no_number_reaches_image_and_gradient(transforms):
             assert np.isnan(gradient[1].colors).any(), (name, fault)
             assert np.isnan(where(gradient)).any(), (name, fault)
 
-    for place in ((3, 5, 5), (9, 34, 5)):  # a voxel that is seen, and one in what is leapt over
+    # voxels that are seen, and some in what is leapt over; several, since rays are few
+    for place in (np.s_[2:5, 3:7, 3:8], np.s_[7:11, 28:38, 2:9]):
         bad = eqx.tree_at(lambda f: f[0].data, floats, floats[0].data.at[place].set(np.nan))
         (value, image), gradient = both(bad)
         assert np.isnan(value), place
         assert np.isnan(image).any(), place
-        np.testing.assert_array_equal(np.isnan(image[..., :3]).all(axis=-1), np.isnan(image[..., 3]))
+        # colour also where a ray leaves the volume beside it: what is sampled past the exit weighs 0
+        assert np.isnan(image[..., :3])[np.isnan(image[..., 3])].all()
+        assert np.isnan(image[..., 3]).any(), place
         assert not np.isnan(image).all(), "rays that do not meet it see what they saw"
         assert np.isnan(gradient[1].colors).any(), place
         assert np.isnan(gradient[0].data).any(), place

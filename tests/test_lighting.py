@@ -11,7 +11,6 @@ import pytest
 
 import jaxvol as jv
 from jaxvol import reference, visible
-from jaxvol.engine import _prepared
 from jaxvol.lighting import (
     ConstantLight,
     Deferred,
@@ -1175,7 +1174,7 @@ BAD = {
     "lights": (lambda: ScattererTemplates(HALF, ()), "lights must be a light"),
     "materials": (lambda: ScattererTemplates((), SUN), "materials must hold a Material at least"),
     "lighting": (
-        lambda: _prepared(3, nodes({}), TRANSFER, jv.March(0.1)),
+        lambda: jv.render(nodes({}), TRANSFER, around(nodes({})), jv.March(0.1), lighting=3),
         "lighting must be None or a Lighting, such as ScattererTemplates; got 3",
     ),
     "deferred": (lambda: Deferred(3), "lighting must be a Lighting, such as ScattererTemplates; got 3"),
