@@ -722,7 +722,7 @@ def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(slope))
 
 
-@pytest.mark.parametrize("kind", ["float32", "uint8"])
+@pytest.mark.parametrize("kind", ["float32", pytest.param("uint8", marks=pytest.mark.slow)])
 def test_an_image_by_baked_light_has_the_gradient_of_all_but_the_light(kind):
     """Replay, the default, against JAX's own derivative of the reference."""
     sphere = scaled_phantom("sphere", 12)
