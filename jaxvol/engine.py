@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from .arguments import check_scene
 from .backward import pulled
 from .camera import Camera
-from .checks import Arrayable, finite_array, require
+from .checks import Arrayable, finite_array, is_traced, require
 from .compiled import compiled, forward_only, recomputed, transformations
 from .lighting.deferred import Deferred, lit_picture
 from .lighting.seam import Lighting, classification
@@ -249,6 +249,8 @@ def _light(
 
 def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
     """The image; in reverse mode, its derivative by a second march."""
+    if not is_traced(scene):  # a rule for derivatives would take 5 ms to make
+        return _image_in_turn(scene, how, known)
 
     @eqx.filter_custom_vjp
     def image(scene: Scene, known: Known) -> Picture:

@@ -103,7 +103,7 @@ def enter(
     entry = along(close, direction, start)
     length = jnp.where(hit, far - start, 0)
     ray = Ray(entry, direction, base + start, length, space.path(entry, direction), pixel)
-    return invalid(ray, jnp.isnan(near) | jnp.isnan(far))
+    return invalid(ray, ~jnp.isfinite(toward))
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
