@@ -107,7 +107,7 @@ def render(
     pixels NaN whose rays meet it, or leave the volume beside it.
 
     Under `jax.vmap`, over any of the arguments, images are rendered one after the other, in one program, and
-    so are their gradients: in the time and the memory of a loop. `"direct"` renders them side by side, and so
+    so are their gradients, as a loop would. `"direct"` renders them side by side, and so
     does `"forward"` where the image is also differentiated, or compiled inside the `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, for one that is something else than its name says (an array

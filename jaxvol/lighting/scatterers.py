@@ -79,9 +79,10 @@ class ScattererTemplates(Lighting):
     **Scale.** The paper's sum is E b (c + s), in no unit. Here the intensities of a template sum to 1 (but
     for `given` ones, and printed energy, which are taken as they are), and k R makes it radiance, on the
     scale of `path_trace`: k = 4 / (3π) is a constant, and R = `Optics.reflectance` that of the sample's
-    material, which falls from 1 to 0 with its opacity. So ratios between pixels of one material are the
-    paper's; to have its numbers, divide by k R. A flat face of white matter, of which nothing is seen but
-    its surface, has a radiance of R L under a `ConstantLight` of radiance L.
+    material, which falls from 1 to 0 as its opacity rises. So ratios between pixels of one material are
+    the paper's where its template held all energy before it was scaled; where the threshold cut some off, s
+    counts for more here. To have the paper's sum, divide by k R. A flat face of white matter, of which
+    nothing is seen but its surface, has a radiance of R L under a `ConstantLight` of radiance L.
 
     Measured on white half-spaces of opacities from 0.05 to 0.9, seen along the normal, against the exact
     radiance of multiple scattering: 0.91 to 1.13 times as bright in constant light, 0.88 to 1.27 in
