@@ -606,7 +606,8 @@ def test_one_program_serves_a_session():
         march = jv.March(0.02 + 0.003 * i, leaping(transforms, "hierarchy"))
         camera = drawn_camera(around if i % 2 else inside, volume, i)
         jax.block_until_ready(jv.render(volume, table(i, 255), camera, march))
-        before = Counting.traces if i == 0 else before
+        if i == 0:
+            before = Counting.traces
     assert Counting.traces == before
 
 

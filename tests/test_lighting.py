@@ -692,7 +692,7 @@ def test_light_is_baked_once_for_what_stays_the_same(monkeypatch):
 
     def prepared(volume=volume, transfer=PLAIN, light=SUN, path=0.12, step=0.1):
         lighting = ScattererTemplates(Material(0.5, path, 1.3), light, baked=9, **how)
-        return _prepared(lighting, volume, transfer, jv.March(step))
+        return lighting.prepared(volume, transfer, jv.March(step))
 
     first = prepared()
     assert prepared() is first
