@@ -164,6 +164,13 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
     return found
 
 
+def pictures(scene: Scene, templates: int, seed: int, path: Path) -> None:
+    """The head without light and with it, side by side."""
+    lit = ScattererTemplates(FLESH, LIGHTS, templates=templates, blend=True)
+    both = [frame(scene, lighting, seed).image((1.0, 1.0, 1.0)) for lighting in (None, lit)]
+    jv.save_png(path, np.concatenate(both, axis=1))
+
+
 def draw(result: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(11, 8.5), layout="constrained")
     cost, deferred, spread, energy = axes.flat
@@ -255,6 +262,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         command=["experiments.lighting", *given],
     )
     draw(result, path.with_suffix(".png"))
+    pictures(scene, many, chosen.seed, path.with_name("lit.png"))
     for row in result["deferring"]:
         print("deferred, " + ", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     for row in result["noise"]["blended"]:

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .lighting.seam import Surroundings
-from .locate import Ray
+from .locate import Ray, invalid
 from .packed import with_words
+from .reference import has_fault
 from .relight import Lit
 from .rendering import DepthPicture, Picture
 from .replay import Cotangents, Replay, Total
@@ -34,7 +35,7 @@ def pulled(
     places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
     packed = with_words(volume, known.words)
     waves, survey = Waves.of(source), survey_of(scene, known)
-    seen = transfer.over(packed)
+    seen, fault = transfer.over(packed), has_fault(volume, transfer, march, lighting)
     light, pull_light = None, None
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
@@ -44,7 +45,8 @@ def pulled(
 
         def made(moving: PyTree) -> Ray:
             volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
-            return waves.rays(source_, march_.locate(with_voxels(volume_, volume.data)), number)
+            space = march_.locate(with_voxels(volume_, volume.data))
+            return invalid(waves.rays(source_, space, number), fault)
 
         moving = floats((without_voxels(volume), source, march))
         rays, pull = eqx.filter_vjp(made, moving)

@@ -90,7 +90,7 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
     spelled = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
     given = value if is_traced(value) or isinstance(value, jax.Array) else _numbers(value)
     try:
-        if given is None:
+        if given is None or jnp.issubdtype(given.dtype, jnp.complexfloating):
             raise TypeError
         with np.errstate(over="ignore"):  # what becomes infinite is refused below
             cast = given.astype(jnp.result_type(float)) if isinstance(given, np.ndarray) else given

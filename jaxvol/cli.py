@@ -174,7 +174,6 @@ def _parser() -> argparse.ArgumentParser:
         "--direction",
         type=float,
         nargs=3,
-        default=(0.5, -1, 0.4),
         metavar=("X", "Y", "Z"),
         help="without --camera: the side from which to see the whole volume",
     )
@@ -297,10 +296,13 @@ def _render(options: argparse.Namespace) -> None:
         raise ValueError(
             "--parallel goes with --direction, from which the whole volume is seen; leave out --camera."
         )
+    if options.camera and options.direction:
+        raise ValueError("--camera says where the camera is; leave out --direction.")
     if options.camera:
         camera = Camera(options.camera[:3], options.camera[3:], **view)
     else:
-        camera = Camera.looking_at(volume, options.direction, parallel=options.parallel, **view)
+        side = options.direction or (0.5, -1, 0.4)
+        camera = Camera.looking_at(volume, side, parallel=options.parallel, **view)
     background = None if options.transparent else options.background
     camera = camera.zoom(options.zoom)
     _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
@@ -316,6 +318,8 @@ def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
                 )
         return read_transfer(options.transfer)
     unit_distance = 1.0 if options.unit_distance is None else options.unit_distance
+    if options.preset and options.opacity is not None:
+        raise ValueError("--opacity is for colormaps; a preset has its own.")
     if options.preset:
         return preset(options.preset, options.clim, unit_distance)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))

@@ -24,10 +24,10 @@ from .lighting.seam import Lighting, classification
 from .locate import invalid
 from .march import March
 from .packed import with_words
-from .reference import begin, end, samples_across, step
+from .reference import begin, end, has_fault, samples_across, step
 from .rendering import Found, Outputs, Picture, Rendering
 from .replay import Watch
-from .scene import Known, Scene, has_fault, survey_of
+from .scene import Known, Scene, survey_of
 from .sharding import shard_number, varying
 from .transfer import Transfer
 from .volume import Volume
@@ -244,7 +244,8 @@ def _light(
     volume = with_words(volume, known.words)
     space = march.locate(volume)
     seen = classification(volume, transfer, space, lighting)
-    return lit_picture(seen, space, partial(line, source), rgba, depth)
+    lit = lit_picture(seen, space, partial(line, source), rgba, depth)
+    return lit * jnp.where(has_fault(volume, transfer, march, lighting), jnp.nan, 1).astype(lit.dtype)
 
 
 def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
@@ -278,7 +279,7 @@ def _marched(scene: Scene, how: _How, known: Known, *, watch: bool = False) -> t
     waves, space = Waves.of(source, DIRECT_WAVE if direct else None), march.locate(volume)
     survey = None if direct else survey_of((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
-    fault = has_fault(scene)
+    fault = has_fault(volume, transfer, march, lighting)
 
     def wave(number: Int[Array, ""]) -> tuple[Picture, Span | None]:
         rays, spans = invalid(waves.rays(source, space, number), fault), None

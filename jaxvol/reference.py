@@ -9,13 +9,13 @@ so that the weights of a ray and the transmittance T = 1 - A that is left sum to
 in float32, taking thousands of small equal weights from a T near 1 would round the same way each time.
 """
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .arguments import check_scene
@@ -55,6 +55,13 @@ class Met(eqx.Module):
 
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
+
+
+def has_fault(volume: Volume, transfer: Transfer, march: March, lighting: Lighting | None) -> Bool[Array, ""]:
+    """Whether a number on which all pixels depend is NaN or infinite, or the step leads nowhere. A comparison
+    with NaN is false, and turns it into nothing seen: a fit that has diverged would look like one that has
+    converged. Of rays and voxels it is found out ray by ray."""
+    return ~(all_finite((without_voxels(volume), transfer, march, lighting)) & (march.step > 0))
 
 
 def begin(march: March, ray: Ray, outputs: Found | None = "all") -> Progress:
@@ -181,7 +188,9 @@ def end(ray: Ray, at: Progress) -> Picture:
     """What the ray has seen: with its depth, and with what it met, if it was to find that out."""
     assert at.color is not None
     valid = ~jnp.isnan(ray.t_in)
-    rgba, exhausted = jnp.where(valid, jnp.stack([*at.color, at.opacity]), jnp.nan), ~at.finished
+    # by a product, since the derivative of a choice would be 0
+    rgba = jnp.stack([*at.color, at.opacity]) * jnp.where(valid, 1, jnp.nan).astype(at.opacity.dtype)
+    exhausted = ~at.finished
     if at.moment is None:
         return Picture(rgba, exhausted)
     # of NaN neither more nor less than 0 is true, and it is handed on
@@ -229,7 +238,7 @@ def render_ray_reference(
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
-    ray = invalid(enter(space, *line), ~all_finite((without_voxels(volume), transfer, march, lighting)))
+    ray = invalid(enter(space, *line), has_fault(volume, transfer, march, lighting))
     lit = classification(volume, transfer, space, lighting)
     seen = transfer.over(volume) if isinstance(lighting, Deferred) else lit
 
@@ -264,5 +273,8 @@ def samples_across(volume: Volume, march: March) -> int:
         )
     with jax.ensure_compile_time_eval():
         diagonal = float(march.locate(volume).diagonal)
+        steps = diagonal / float(march.step) if march.step > 0 else math.nan
+    if not math.isfinite(steps):  # then nothing is marched, and NaN is seen
+        return 1
     # the first cell may begin a step early, one step finds the exit, one more is shortened by a jitter
-    return min(int(np.ceil(diagonal / float(march.step))) + 4, march.most_samples)
+    return min(math.ceil(steps) + 4, march.most_samples)

@@ -214,6 +214,13 @@ class Replay(Follower):
         taps = []
         if voxels:
             _, asked = jax.eval_shape(lambda: all_(march, volume, ray_floats, None))
+            if not asked and type(self.volume) is not Volume:
+                kind = type(self.volume).__name__
+                raise ValueError(
+                    f"the gradient to the voxels of a {kind}, whose value asks for none by Volume.value, is"
+                    ' not known to adjoint="replay": pass adjoint="direct"; or, where values do not depend'
+                    " on its voxels, leave volume.data out of what is differentiated."
+                )
             taps = [jnp.zeros(place.shape, self.volume.data.dtype) for place in asked]
         _, pull, asked = jax.vjp(all_, march, volume, ray_floats, taps, has_aux=True)
         of_march, of_volume, of_ray, of_taps = pull(wanted)

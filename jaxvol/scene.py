@@ -5,10 +5,9 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Int, UInt32
 
 from .camera import Camera
-from .checks import all_finite
 from .leaping import FirstHit
 from .lighting.seam import Lighting
 from .march import March, Survey, View
@@ -16,7 +15,6 @@ from .occupancy import Blocks
 from .packed import words_of
 from .reference import end
 from .rendering import Rendering
-from .taps import without_voxels
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, march_beams
@@ -35,14 +33,6 @@ class Known(eqx.Module):
     @classmethod
     def of(cls, volume: Volume, march: March) -> "Known":
         return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
-
-
-def has_fault(scene: Scene) -> Bool[Array, ""]:
-    """Whether any number on which all pixels depend is NaN or infinite. A comparison with one is false, and
-    turns it into nothing seen: a fit that has diverged would look like one that has converged. Of rays and
-    voxels it is found out ray by ray."""
-    volume, transfer, _, march, lighting = scene
-    return ~all_finite((without_voxels(volume), transfer, march, lighting))
 
 
 def survey_of(scene: Scene, known: Known) -> Survey | None:

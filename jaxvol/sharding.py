@@ -43,5 +43,6 @@ def shard_number(*arrays: Any) -> Int[Array, ""]:
     axes = frozenset().union(*map(varies_over, arrays))
     if not axes:
         return jnp.zeros((), jnp.int32)
+    # JAX does not tell in which order the axes follow each other where an array has several
     names = tuple(name for name in jax.sharding.get_abstract_mesh().axis_names if name in axes)
     return jax.lax.axis_index(names).astype(jnp.int32)

@@ -90,6 +90,21 @@ def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
     return jv.Camera(position, volume.center, (0, 1, 0), size=size, parallel_scale=0.55 * (high - low)[1])
 
 
+LEAVES: dict[str, Callable] = {
+    "voxels": lambda s: s[0].data,
+    "spacing": lambda s: s[0].spacing,
+    "origin": lambda s: s[0].origin,
+    "colors": lambda s: s[1].colors,
+    "extinction": lambda s: s[1].extinction,
+    "position": lambda s: s[2].position,
+    "focal_point": lambda s: s[2].focal_point,
+    "view_up": lambda s: s[2].view_up,
+    "view_angle": lambda s: s[2].view_angle,
+    "window": lambda s: s[2].window,
+    "step": lambda s: s[3].step,
+}
+"""What a scene (volume, transfer function, camera, march) is differentiated with respect to."""
+
 CAMERAS = {"around": around, "inside": inside, "orthographic": orthographic}
 
 KINDS: dict[str, jv.Transform] = {

@@ -27,7 +27,10 @@ ALONG_Z = jv.Camera((0.3, 0.2, -4.0), (0.3, 0.2, 0.0), (0, 1, 0), size=(40, 32),
 OBLIQUE = around(scaled_phantom("linear"), (40, 32))
 
 
-@pytest.mark.parametrize(("quadrature", "camera"), [("left", ALONG_Z), ("midpoint", OBLIQUE)])
+@pytest.mark.parametrize(
+    ("quadrature", "camera"),
+    [pytest.param("left", ALONG_Z, marks=pytest.mark.slow), ("midpoint", OBLIQUE)],
+)
 def test_the_error_of_the_exit_falls_by_more_than_twenty(quadrature, camera):
     _, bumpy = images((), quadrature, camera)
     rendering, smooth = images((jv.AlphaCorrection(),), quadrature, camera)
@@ -49,10 +52,11 @@ def test_without_it_the_exit_is_bumpy():
 @pytest.mark.parametrize(
     ("pattern", "quadrature"),
     [
-        ("white", "left"),
         ("blue", "midpoint"),
-        pytest.param("white", "midpoint", marks=pytest.mark.slow),
-        pytest.param("blue", "left", marks=pytest.mark.slow),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("white", "left"), ("white", "midpoint"), ("blue", "left"))
+        ),
     ],
 )
 def test_a_constant_volume_is_exact_under_jitter(pattern, quadrature):

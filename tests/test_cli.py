@@ -16,18 +16,19 @@ import jaxvol as jv
 from jaxvol.cli import main
 
 
-@pytest.fixture(autouse=True)
-def programs(tmp_path, monkeypatch):
-    """Compiled programs are kept in a folder of the test's own."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "programs"))
-
-
 @pytest.fixture
 def volume_file(tmp_path):
     volume = jv.phantom("engine", 24)
     path = tmp_path / "engine_24x24x24_uint8.raw"
     path.write_bytes(np.asarray(volume.data).transpose(2, 1, 0).tobytes())
     return path
+
+
+def scene_of(volume_file):
+    """As the command renders it, and of its shapes: one program serves all images of this file."""
+    view = jv.Camera((40, -30, 20), (11.5,) * 3, (0, 0, 1), size=(16, 16)).zoom(1.5)
+    march = jv.March(0.4, (jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
+    return jv.load(volume_file), jv.preset("engine"), view, march
 
 
 def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
@@ -59,12 +60,10 @@ def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
         "--zoom",
         "1.5",
     ]
-    look = ["--preset", "engine", "--size", "32", "24", "--step", "0.4", "--background", "0", "0", "0"]
+    look = ["--preset", "engine", "--size", "16", "16", "--step", "0.4", "--background", "0", "0", "0"]
     assert main(["render", str(volume_file), *camera, *look, "-o", str(output)]) == 0
     assert "million samples" in capsys.readouterr().out
-    view = jv.Camera((40, -30, 20), (11.5,) * 3, (0, 0, 1), size=(32, 24)).zoom(1.5)
-    march = jv.March(0.4, (jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
-    linear = jv.render(jv.load(volume_file), jv.preset("engine"), view, march).image((0, 0, 0))
+    linear = jv.render(*scene_of(volume_file)).image((0, 0, 0))
     assert np.abs(imread(output) - np.asarray(jv.to_srgb(linear)) * 255).max() <= 1
 
 
@@ -101,11 +100,23 @@ def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_
     images = []
     for number, look in enumerate((["--transfer", transfer], ["--preset", "engine"])):
         output = tmp_path / f"{number}.npy"
-        assert render_file(volume_file, *look, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
+        assert render_file(volume_file, *look, "-o", output) == 0
         images.append(np.load(output))
     assert images[0].dtype == np.float32
     assert images[0].std() > 0.02
     np.testing.assert_array_equal(*images)
+
+
+def test_parallel_rays_are_asked_for_by_an_option(volume_file, tmp_path, monkeypatch):
+    rendering = jv.render(*scene_of(volume_file))
+    cameras = []
+    monkeypatch.setattr("jaxvol.cli.render", lambda *scene: cameras.append(scene[2]) or rendering)
+    output = tmp_path / "x.png"
+    assert render_file(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
+    (camera,) = cameras
+    assert camera.parallel_scale is not None
+    away = np.asarray(camera.focal_point - camera.position)
+    np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
 
 
 def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
@@ -243,10 +254,10 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys
 def seen(volume_file, tmp_path):
     """Two pictures of the engine, and their cameras, in files."""
     volume, pictures, cameras = jv.load(volume_file), [], []
-    march = jv.March(0.5, (jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
+    march = scene_of(volume_file)[-1]
     for number, position in enumerate([(40, -30, 20), (-30, 5, 45)]):
         fields = {"position": position, "focal_point": [11.5] * 3, "view_up": [0, 0, 1], "view_angle": 35}
-        image = jv.render(volume, jv.preset("engine"), jv.Camera(**fields, size=(20, 16)), march).image()
+        image = jv.render(volume, jv.preset("engine"), jv.Camera(**fields, size=(16, 16)), march).image()
         pictures.append(str(jv.save_png(tmp_path / f"{number}.png", image)))
         cameras.append(fields)
     (tmp_path / "cameras.json").write_text(json.dumps(cameras))
@@ -318,7 +329,7 @@ def test_bad_cameras_are_named(case, seen, tmp_path):
 
 def test_a_picture_s_values_are_read_as_they_were_written(seen, tmp_path):
     views = jv.read_views(seen, tmp_path / "cameras.json")
-    assert [camera.size for camera, _ in views] == [(20, 16)] * 2
+    assert [camera.size for camera, _ in views] == [(16, 16)] * 2
     assert np.array_equal(np.asarray(jv.to_srgb(views[1][1]) * 255).round(), imread(seen[1]))
     np.testing.assert_array_equal(views[0][0].position, (40, -30, 20))
 

@@ -3,6 +3,8 @@
 What a constructor gets is checked there. Here leaves are replaced afterwards, as optimisers do, and traced.
 """
 
+import time
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,35 +13,27 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import around
+from .scenes import LEAVES, around
 
 
 SIZE = (9, 7)
 
 WHOLE = {
-    "spacing": lambda s: s[0].spacing,
-    "origin": lambda s: s[0].origin,
+    **{name: where for name, where in LEAVES.items() if name != "voxels"},
     "values": lambda s: s[1].values,
-    "colors": lambda s: s[1].colors,
-    "extinction": lambda s: s[1].extinction,
-    "position": lambda s: s[2].position,
-    "focal_point": lambda s: s[2].focal_point,
-    "view_up": lambda s: s[2].view_up,
-    "view_angle": lambda s: s[2].view_angle,
-    "window": lambda s: s[2].window,
-    "step": lambda s: s[3].step,
     "opacity_left": lambda s: s[3].transforms[1].opacity_left,
 }
 """Leaves on which every pixel depends."""
 
 
-def scene(transforms=()):
+def scene(transforms=(), max_samples=None):
     """A volume with something to see at its near end, and nothing behind."""
     data = np.zeros((12, 40, 11), np.float32)
     data[2:5, 3:7, 3:8] = 0.8
     volume = jv.Volume(data, (0.1, 0.1, 0.1))
     transfer = jv.TransferFunction([0.0, 0.2, 1.0], np.full((3, 3), 0.5), [0.0, 0.0, 9.0])
-    march = jv.March(0.05, (jv.AlphaCorrection(), jv.EarlyTermination(0.01), *transforms))
+    transforms = (jv.AlphaCorrection(), jv.EarlyTermination(0.01), *transforms)
+    march = jv.March(0.05, transforms, max_samples=max_samples)
     return volume, transfer, around(volume, SIZE), march
 
 
@@ -80,6 +74,11 @@ def test_what_is_no_number_reaches_image_and_gradient(transforms):
             assert np.isnan(gradient[1].colors).any(), (name, fault)
             assert np.isnan(where(gradient)).any(), (name, fault)
 
+    for step in (0.0, -0.05):
+        (value, image), gradient = both(eqx.tree_at(WHOLE["step"], floats, jnp.float32(step)))
+        assert np.isnan(image).all(), step
+        assert np.isnan(gradient[1].colors).any(), step
+
     # voxels that are seen, and some in what is leapt over; several, since rays are few
     for place in (np.s_[2:5, 3:7, 3:8], np.s_[7:11, 28:38, 2:9]):
         bad = eqx.tree_at(lambda f: f[0].data, floats, floats[0].data.at[place].set(np.nan))
@@ -92,6 +91,50 @@ def test_what_is_no_number_reaches_image_and_gradient(transforms):
         assert not np.isnan(image).all(), "rays that do not meet it see what they saw"
         assert np.isnan(gradient[1].colors).any(), place
         assert np.isnan(gradient[0].data).any(), place
+
+
+@pytest.mark.parametrize("adjoint", ["direct", pytest.param("forward", marks=pytest.mark.slow)])
+def test_other_adjoints_have_no_number_either(adjoint):
+    floats, rest = eqx.partition(scene(max_samples=16), eqx.is_inexact_array)
+
+    def image(floats):
+        return jv.render(*eqx.combine(floats, rest), adjoint=adjoint).rgba
+
+    @jax.jit
+    def derivative(floats):
+        """Of the colours, as a user has it who fits them."""
+
+        def loss(colors):
+            return jnp.sum(image(eqx.tree_at(WHOLE["colors"], floats, colors)) ** 2)
+
+        colors = WHOLE["colors"](floats)
+        if adjoint == "direct":
+            return jax.value_and_grad(loss)(colors)
+        return jax.jvp(loss, (colors,), (jnp.ones_like(colors),))
+
+    value, found = derivative(floats)
+    assert np.isfinite(value)
+    assert np.isfinite(found).all()
+    assert np.any(found != 0)
+    for name, where in WHOLE.items():
+        leaf = where(floats)
+        value, found = derivative(eqx.tree_at(where, floats, leaf.at[(0,) * leaf.ndim].set(np.nan)))
+        assert np.isnan(value), name
+        assert np.isnan(found).any(), name
+    # where no program is told how long its loop is
+    broken = eqx.tree_at(WHOLE["step"], scene(), jnp.float32(np.nan))
+    assert np.isnan(jv.render(*broken, adjoint=adjoint).rgba).all()
+
+
+def test_a_step_that_is_none_is_not_marched_in_the_gradient_either():
+    """Without leaps, each ray would take as many cells as it may: 131 072, in several minutes."""
+    floats, both = seen(())
+    jax.block_until_ready(both(floats))
+    begin = time.perf_counter()
+    (value, _), gradient = both(eqx.tree_at(WHOLE["step"], floats, jnp.float32(np.nan)))
+    assert np.isnan(value)
+    assert np.isnan(gradient[0].data).any()
+    assert time.perf_counter() - begin < 5
 
 
 def test_rays_that_are_none_are_refused_when_the_program_runs():

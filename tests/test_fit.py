@@ -149,6 +149,7 @@ def test_gradient_of_the_loss_is_that_of_the_triangle():
     np.testing.assert_allclose(whole[:, :-1].T @ whole[:, -1], flat, rtol=0, atol=1e-5 * abs(flat).max())
 
 
+@pytest.mark.slow
 def test_tiles_make_no_difference():
     """Three rows of a view at a time, of 20, so that the last piece reaches past the image."""
     free, y = Free.of(GREY, None, None)

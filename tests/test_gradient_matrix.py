@@ -20,7 +20,7 @@ from hypothesis import given, settings, strategies as st
 import jaxvol as jv
 from experiments import scenes as real_scenes
 
-from .scenes import doubled, in_float64
+from .scenes import LEAVES, doubled, in_float64
 
 
 SHAPE = (26, 21, 31)
@@ -49,20 +49,6 @@ CAMERAS = {
     "past it": ((3.1, -3.9, 2.4), (1.9, 0.9, 1.6), 30.0),
 }
 """Position, focal point and view angle. `"parallel"` is the first without perspective."""
-
-LEAVES = {
-    "voxels": lambda s: s[0].data,
-    "spacing": lambda s: s[0].spacing,
-    "origin": lambda s: s[0].origin,
-    "colors": lambda s: s[1].colors,
-    "extinction": lambda s: s[1].extinction,
-    "position": lambda s: s[2].position,
-    "focal_point": lambda s: s[2].focal_point,
-    "view_up": lambda s: s[2].view_up,
-    "view_angle": lambda s: s[2].view_angle,
-    "window": lambda s: s[2].window,
-    "step": lambda s: s[3].step,
-}
 
 slow = pytest.mark.slow
 
@@ -186,10 +172,8 @@ def assert_slopes(found, gradients, scene, tolerance, context=""):
         assert error <= tolerance, f"{context} {name}: off by {error:.1e} of its norm {norm:.3g}"
 
 
-QUICK = ["hierarchy", "beam"]
-"""`"distance"` is `"beam"` without a start."""
-
-FAST = {("jittered", method, "uint8") for method in QUICK}
+DEFAULT = "hierarchy"
+FAST = {("jittered", DEFAULT, "uint8")}
 TYPES = ["uint8", "uint16", "int16", "float32"]
 LEAPT = [
     *((name, method, "uint8") for name in SETS for method in EXACT),
@@ -208,7 +192,7 @@ def test_replay_does_not_see_the_leaps(name, method, dtype):
         assert_same(found, expected, 1e-4, camera)
 
 
-@pytest.mark.parametrize("method", [*QUICK, pytest.param("distance", marks=slow)])
+@pytest.mark.parametrize("method", [m if m == DEFAULT else pytest.param(m, marks=slow) for m in EXACT])
 def test_no_leap_shows_in_a_gradient_whatever_is_rendered(method):
     """Invariant 2, for gradients: other cameras, transfer functions, voxels, seeds and steps."""
 
@@ -252,7 +236,7 @@ FORWARD = [
 
 @pytest.mark.parametrize(
     ("name", "method", "dtype"),
-    [c if c == ("jittered", "hierarchy", "uint8") else pytest.param(*c, marks=slow) for c in FORWARD],
+    [case if case in FAST else pytest.param(*case, marks=slow) for case in FORWARD],
 )
 def test_forward_is_replay(name, method, dtype):
     """`"min_distance"`, whose image is another, too."""

@@ -9,7 +9,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import soft_transfer
+from .scenes import LEAVES, soft_transfer
 
 
 LEAPT = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05))
@@ -34,21 +34,6 @@ WAYS = {
 
 JUMPS = {("plain", leaf) for leaf in WAYS}
 """Where the gradient is wrong by nature: the image jumps whenever a sample crosses the exit."""
-
-
-LEAVES = {
-    "data": lambda s: s[0].data,
-    "spacing": lambda s: s[0].spacing,
-    "origin": lambda s: s[0].origin,
-    "colors": lambda s: s[1].colors,
-    "extinction": lambda s: s[1].extinction,
-    "position": lambda s: s[2].position,
-    "focal_point": lambda s: s[2].focal_point,
-    "view_up": lambda s: s[2].view_up,
-    "view_angle": lambda s: s[2].view_angle,
-    "window": lambda s: s[2].window,
-    "step": lambda s: s[3].step,
-}
 
 
 def summed_and_true(name):
@@ -128,16 +113,15 @@ EXTREMES = {
 """Voxels, extinction, and step."""
 
 OF_RAYS = {
-    **{leaf: LEAVES[leaf] for leaf in ("data", "spacing", "origin", "colors", "extinction")},
+    **{leaf: LEAVES[leaf] for leaf in ("voxels", "spacing", "origin", "colors", "extinction")},
     "origins": lambda s: s[2],
     "directions": lambda s: s[3],
     "step": lambda s: s[4].step,
 }
 
 
-@pytest.mark.parametrize(
-    "name", [n if n == "leapt" else pytest.param(n, marks=pytest.mark.slow) for n in SETS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SETS)
 def test_values_and_gradients_are_finite_and_agree_at_the_extremes(name):
     quadrature, transforms = SETS[name]
     origins, directions = (jnp.asarray(ends, jnp.float32) for ends in zip(*RAYS.values(), strict=True))

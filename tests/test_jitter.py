@@ -102,7 +102,7 @@ def test_jitter_starts_each_ray_a_part_of_a_step_in():
     np.testing.assert_allclose(see((jitter,)).rgba[:, 3], 1 - np.exp(-cells * STEP), atol=1e-6)
 
 
-@pytest.mark.parametrize("pattern", ["white", "blue"])
+@pytest.mark.parametrize("pattern", [pytest.param("white", marks=pytest.mark.slow), "blue"])
 def test_front_residual_gives_back_what_jitter_leaves_out(pattern):
     jitter = jv.Jitter(1, pattern, front_residual=True)
     rendering = see((jitter, jv.AlphaCorrection()))
@@ -186,7 +186,7 @@ def test_bad_input_is_named(case):
         make()
 
 
-@pytest.mark.parametrize("pattern", ["white", "blue"])
+@pytest.mark.parametrize("pattern", ["white", pytest.param("blue", marks=pytest.mark.slow)])
 def test_a_crop_is_jittered_as_its_part_of_the_image(pattern):
     volume = jv.phantom("sphere", 16)
     transfer = jv.TransferFunction.from_points([(0, (0, 0, 0), 0.0), (255, (1, 1, 1), 0.9)], 0.5)

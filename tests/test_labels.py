@@ -50,7 +50,7 @@ def test_functions_may_be_named_by_label_and_differ_in_points():
         assert seen[0, 3] > 0.5
 
 
-@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("quadrature", [pytest.param("left", marks=pytest.mark.slow), "midpoint"])
 @pytest.mark.parametrize("step", [0.3, 0.77, 2.9])
 def test_cells_are_cut_at_labels_and_exact_at_any_step(step, quadrature):
     volume = layers(4, 5, 6)
@@ -97,6 +97,7 @@ def label_runs(volume, camera, steps=1500):
     return shortest.reshape(camera.size[::-1])
 
 
+@pytest.mark.slow
 def test_faces_of_a_frog_stay_smooth_under_jitter():
     frog = jv.phantom("labels", 64)
     tissue = {1: (GREEN, 0.2), 2: (RED, 3.0), 3: (RED, 3.0), 4: ((0.4, 0.1, 0.1), 4.0), 5: (BLUE, 3.0)}

@@ -529,7 +529,8 @@ def test_gradients_do_not_see_the_leaps():
     assert_same_gradients(gradients((jv.SpaceLeaping(),)), gradients(()))
 
 
-@pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
 def test_forward_gradients_do_not_see_the_leaps(method):
     rng = np.random.default_rng(6)
     leaves = leaves_of()
@@ -615,8 +616,9 @@ def stack(items):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
 
 
-@pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
-@pytest.mark.parametrize("over", ["cameras", pytest.param("transfer functions", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("over", ["cameras", "transfer functions"])
 def test_under_vmap_each_is_as_it_is_alone(over, method):
     volume = jv.Volume(contents("blobs", 5).astype(np.float32), SPACING)
     march = jv.March(0.02, leaping(PLAIN, method))
@@ -694,7 +696,7 @@ def test_images_of_integers_are_those_of_the_same_floats(dtype, shape):
 
 def test_a_part_of_an_image_leaps_as_the_whole():
     """What cells of pixels know is looked up by the pixel's place in the part, not in the whole."""
-    volume, transfer = jv.Volume(bytes_of(contents("blobs", 1)), SPACING), table(1, 255)
-    camera = PERSPECTIVE["around"](volume, (44, 40)).crop(23, 19, *SIZE)
-    whole = compare_methods(volume, transfer, camera, 0.05, MOVING, ["beam"])
+    volume, transfer = jv.Volume(contents("blobs", 1).astype(np.float32), SPACING), table(1, 1.0)
+    camera = orthographic(volume, (44, 40)).crop(23, 19, *SIZE)
+    whole = compare_methods(volume, transfer, camera, 0.05, PLAIN, ["beam"])
     assert float(whole.rgba[..., 3].max()) > 0.1

@@ -29,11 +29,16 @@ from .scenes import in_float64
 
 OPACITIES = (0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99)
 INDEX = 1.4
-TEMPLATES = 1024
+TEMPLATES = 256
 
 # compiled as a whole, with numbers of the material as arguments
 grow = eqx.filter_jit(scatterer_template)
 KEY = jax.random.key(0)
+
+
+def in_turn(function):
+    """For each of what is given: compiled in half the time that `jax.vmap` takes."""
+    return jax.jit(lambda each: jax.lax.map(function, each))
 
 
 def totals(template):
@@ -59,8 +64,14 @@ def simulated_total(opacity, *, packets, threshold, index, templates=20_000):
 
 @pytest.fixture(scope="module")
 def grown():
-    """Conserving templates of all opacities, grown at once: (opacities, templates, photons)."""
-    return scatterer_templates([Material(a, 1.0, INDEX) for a in OPACITIES], 3, count=TEMPLATES, merge=0)
+    """Conserving templates of all opacities: (opacities, templates, photons)."""
+    levels = max(template_levels(Material(a, 1.0)) for a in OPACITIES)
+
+    def one(opacity, key):
+        return scatterer_template(Material(opacity, 1.0, INDEX), key, merge=0, levels=levels)
+
+    keys = jax.random.split(jax.random.key(3), (len(OPACITIES), TEMPLATES))
+    return in_turn(lambda a: jax.lax.map(lambda key: one(a[0], key), a[1]))((jnp.asarray(OPACITIES), keys))
 
 
 def test_a_conserving_template_holds_what_the_threshold_leaves(grown):
@@ -97,7 +108,7 @@ def test_the_printed_form_makes_and_loses_energy(opacity):
         Material(opacity, 1.0),
         KEY,
         packets=1,
-        threshold=1e-3,
+        threshold=3e-3,
         levels=68,
         energy="printed",
         flights=False,
@@ -109,24 +120,22 @@ def test_the_printed_form_makes_and_loses_energy(opacity):
 
 
 def test_the_printed_form_loses_most_light_on_its_flights():
-    """A flight leaves exp(-Δx/λ) cos θ, a quarter in the mean, and α of that is passed on."""
-    printed = jax.jit(
-        jax.vmap(
-            lambda key: scatterer_template(
-                Material(0.9, 1.0),
-                key,
-                packets=1,
-                threshold=1e-3,
-                energy="printed",
-                critical_angle=2.0,
-                merge=0,
-                levels=6,
-            )
+    """A flight leaves exp(-Δx/λ) cos θ, a quarter in the mean, and α of that is passed on: three times."""
+    printed = in_turn(
+        lambda key: scatterer_template(
+            Material(0.9, 1.0),
+            key,
+            packets=1,
+            threshold=1e-3,
+            energy="printed",
+            critical_angle=2.0,
+            merge=0,
+            levels=3,
         )
     )
     found = totals(printed(jax.random.split(jax.random.key(0), 8192)))
     factor = 0.9 / 4
-    np.testing.assert_allclose(found.mean(), factor / (1 - factor), rtol=0.03)
+    np.testing.assert_allclose(found.mean(), factor + factor**2 + factor**3, rtol=0.03)
 
 
 def test_first_flights_are_exponential_with_the_mean_free_path():
@@ -145,26 +154,28 @@ def test_first_flights_are_exponential_with_the_mean_free_path():
     assert np.abs((direction + 1) / 2 - part[:, None]).max() < 2 / np.sqrt(number)
 
 
-def lopsided(packets):
-    """How far the middle of the light lies from the origin, on average."""
-    several = jax.vmap(lambda key: grow(Material(0.5, 1.0, INDEX), key, packets=packets, merge=0, levels=5))
-    grown = several(jax.random.split(KEY, 512))
-    middle = np.einsum("tn,tnx->tx", grown.intensity, grown.offset) / totals(grown)[:, None]
-    return np.linalg.norm(middle, axis=-1).mean()
+def test_four_packets_are_half_as_lopsided_as_one(grown):
+    """By how far the middle of the light lies from the origin, on average."""
+    one = in_turn(
+        lambda key: scatterer_template(Material(0.5, 1.0, INDEX), key, packets=1, merge=0, levels=3)
+    )
+    four = jax.tree.map(lambda leaf: leaf[OPACITIES.index(0.5)], grown)
 
+    def lopsided(template):
+        middle = np.einsum("tn,tnx->tx", template.intensity, template.offset) / totals(template)[:, None]
+        return np.linalg.norm(middle, axis=-1).mean()
 
-def test_four_packets_are_half_as_lopsided_as_one():
-    assert lopsided(4) <= 0.5 * lopsided(1)
+    assert lopsided(four) <= 0.5 * lopsided(one(jax.random.split(KEY, 512)))
 
 
 def test_offsets_scale_with_the_mean_free_path_and_intensities_do_not_change():
-    one, other = (grow(Material(0.5, path, INDEX), KEY, levels=5) for path in (1.0, 4.0))
+    one, other = (grow(Material(0.5, path, INDEX), KEY, levels=2) for path in (1.0, 4.0))
     np.testing.assert_array_equal(other.offset, 4 * np.asarray(one.offset))
     np.testing.assert_array_equal(other.intensity, one.intensity)
 
 
 def test_another_key_draws_another_template():
-    one, other = (grow(Material(0.5, 1.0, INDEX), jax.random.key(seed), levels=5) for seed in (1, 2))
+    one, other = (grow(Material(0.5, 1.0, INDEX), jax.random.key(seed), levels=2) for seed in (1, 2))
     assert np.abs(np.asarray(one.offset[:4] - other.offset[:4])).min() > 1e-4
 
 
@@ -186,7 +197,7 @@ def test_light_is_refracted_within_the_critical_angle():
 def test_by_default_the_cone_is_that_of_total_reflection():
     for index in (1.4, 1 / 1.4):
         default, given = (
-            grow(Material(0.5, 1.0, index), KEY, levels=5, critical_angle=angle)
+            grow(Material(0.5, 1.0, index), KEY, levels=2, critical_angle=angle)
             for angle in (None, math.degrees(math.asin(1 / 1.4)))
         )
         np.testing.assert_allclose(default.offset, given.offset, atol=1e-4)
@@ -215,16 +226,16 @@ def test_a_photon_that_joins_one_that_joins_another_is_not_lost():
 
 def test_merging_keeps_the_total():
     apart, some, one = (
-        grow(Material(0.5, 1.0, INDEX), KEY, levels=5, merge=merge) for merge in (0, 0.3, 1e3)
+        grow(Material(0.5, 1.0, INDEX), KEY, levels=2, merge=merge) for merge in (0, 0.3, 1e3)
     )
     filled = [int(np.sum(np.asarray(each.intensity) > 0)) for each in (apart, some, one)]
     assert filled[0] > filled[1] > filled[2] == 1
     np.testing.assert_allclose([totals(some), totals(one)], totals(apart), rtol=1e-6)
 
 
-@pytest.mark.parametrize(("energy", "lowest"), [("conserving", 0.02), ("printed", 5e-4)])
+@pytest.mark.parametrize(("energy", "lowest"), [("conserving", 0.11), ("printed", 6e-3)])
 def test_gradients_match_central_differences(energy, lowest):
-    """Photons fade at the threshold rather than vanish, so that a sum over them is smooth."""
+    """Photons fade at the threshold, as one at least does here, so that a sum over them is smooth."""
     with in_float64():
 
         @jax.jit
@@ -236,7 +247,7 @@ def test_gradients_match_central_differences(energy, lowest):
                 energy=energy,
                 packets=2,
                 threshold=lowest,
-                levels=4,
+                levels=2,
                 merge=0,
             )
             waves = jnp.sin(template.offset @ jnp.asarray([0.7, -1.1, 0.4]) + 0.3)
@@ -255,11 +266,9 @@ def test_the_total_is_continuous_where_a_photon_fades():
     """Over an opacity at which photons come and go, it changes by no more than its slope tells."""
     with in_float64():
         opacities = jnp.linspace(0.2, 0.4, 4001)
-        several = jax.jit(
-            jax.vmap(
-                lambda a: scatterer_template(
-                    Material(a, 1.0, INDEX), 0, packets=1, threshold=0.05, levels=4, merge=0
-                )
+        several = in_turn(
+            lambda a: scatterer_template(
+                Material(a, 1.0, INDEX), 0, packets=1, threshold=0.05, levels=3, merge=0
             )
         )
         grown = several(opacities)
@@ -270,7 +279,7 @@ def test_the_total_is_continuous_where_a_photon_fades():
 
 def test_the_gradient_is_0_where_the_critical_angle_has_none():
     def total(index):
-        return jnp.sum(scatterer_template(Material(0.5, 1.0, index), 0, levels=3, merge=0).intensity ** 2)
+        return jnp.sum(scatterer_template(Material(0.5, 1.0, index), 0, levels=2, merge=0).intensity ** 2)
 
     slope = jax.jit(jax.grad(total))
     assert slope(1.0) == 0
@@ -279,7 +288,7 @@ def test_the_gradient_is_0_where_the_critical_angle_has_none():
 
 def test_many_templates_are_those_grown_one_by_one():
     several, key = [Material(0.5, 1.0, 1.4), Material(0.8, 0.3, 1.2)], jax.random.key(7)
-    how = {"packets": 2, "threshold": 0.02, "levels": 4}
+    how = {"packets": 2, "threshold": 0.02, "levels": 1}
     grown = eqx.filter_jit(scatterer_templates)(several, key, count=2, **how)
     for m, one in enumerate(several):
         for number in range(2):
@@ -306,7 +315,8 @@ def test_the_threshold_that_is_advised_keeps_something():
 
 
 def test_where_an_opacity_is_traced_a_template_that_keeps_nothing_is_nan():
-    found = jax.vmap(lambda a: grow(Material(a, 1.0), KEY, levels=2))(jnp.asarray([0.0, 0.031, 0.05]))
+    grow_traced = in_turn(lambda a: scatterer_template(Material(a, 1.0), KEY, levels=1))
+    found = grow_traced(jnp.asarray([0.0, 0.031, 0.05]))
     np.testing.assert_array_equal(np.isnan(found.intensity).all(axis=-1), [True, True, False])
     np.testing.assert_array_equal(np.isnan(found.intensity).any(axis=-1), [True, True, False])
 

@@ -489,7 +489,7 @@ def reference_image(volume, transfer, camera, march):
 @pytest.mark.parametrize(
     ("names", "quadrature"),
     [
-        pytest.param(*case, marks=[] if case == ("all", "left") else pytest.mark.slow)
+        pytest.param(*case, marks=[] if case == ("jittered", "left") else pytest.mark.slow)
         for case in itertools.product(COMBINED, ("left", "midpoint"))
     ],
 )
@@ -554,10 +554,8 @@ def independent_march(data, probe, points, origins, directions, d, midpoint, ali
 @pytest.mark.parametrize(
     ("align", "quadrature"),
     [
-        (False, "left"),
-        (True, "midpoint"),
-        pytest.param(False, "midpoint", marks=pytest.mark.slow),
-        pytest.param(True, "left", marks=pytest.mark.slow),
+        pytest.param(*case, marks=[] if case == (True, "midpoint") else pytest.mark.slow)
+        for case in itertools.product((False, True), ("left", "midpoint"))
     ],
 )
 def test_an_independent_marcher_sees_the_same(align, quadrature):

@@ -74,9 +74,16 @@ def extinction_and_majorant(volume, blocks, transfer, materials, coordinates):
     return jax.vmap(at)(coordinates)
 
 
-@pytest.mark.parametrize("with_materials", [False, True])
 @pytest.mark.parametrize(
-    ("transfers", "points"), [(random_transfer, 6), (random_transfer, 40), (random_labelled, 6)]
+    ("transfers", "points", "with_materials"),
+    [
+        (random_transfer, 6, False),
+        (random_transfer, 40, True),
+        (random_labelled, 6, True),
+        pytest.param(random_transfer, 6, True, marks=pytest.mark.slow),
+        pytest.param(random_transfer, 40, False, marks=pytest.mark.slow),
+        pytest.param(random_labelled, 6, False, marks=pytest.mark.slow),
+    ],
 )
 def test_no_extinction_exceeds_its_majorant(transfers, points, with_materials):
     for seed in range(25):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.transfer import seen_between
+from jaxvol.transfer import points_below, seen_between
 
 
 def evaluate(transfer, values):
@@ -186,12 +186,9 @@ def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
     def image(transfer, march, adjoint="replay"):
         return jv.render(volume, transfer, camera, march, outputs="rgba", adjoint=adjoint).rgba
 
-    rgba = image(step, leaping)
-    np.testing.assert_allclose(rgba, image(step, plain), atol=2e-6)
-    assert 0.1 < float((rgba[..., 3] > 0).mean()) < 0.9
-    # as the steepest ramp that a viewer without steps draws
-    ramp = jv.TransferFunction([0, np.nextafter(np.float32(60), 0), 60, 255], step.colors, step.extinction)
-    np.testing.assert_allclose(rgba, image(ramp, plain), atol=1e-5)
+    def loss(transfer, march, adjoint="replay"):
+        rgba = image(transfer, march, adjoint)
+        return jnp.sum(rgba**2), rgba
 
     # in any direction but that of an extinction of 0, whose derivative leaps leave out
     random = np.random.default_rng(0)
@@ -199,8 +196,18 @@ def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
         step.values, random.random((4, 3)), np.sign(np.asarray(step.extinction)) * random.random(4)
     )
     ways = eqx.tree_at(lambda t: t.values, ways, jnp.zeros(4))
-    _, slope = jax.jvp(lambda t: jnp.sum(image(t, plain, "forward") ** 2), (step,), (ways,))
-    gradient = jax.grad(lambda transfer: jnp.sum(image(transfer, leaping) ** 2))(step)
+
+    def forward(transfer):
+        """Image and slope come out of one program."""
+        return jax.jvp(lambda t: loss(t, plain, "forward"), (transfer,), (ways,), has_aux=True)[1:]
+
+    gradient, rgba = jax.grad(loss, has_aux=True)(step, leaping)
+    slope, whole = forward(step)
+    np.testing.assert_allclose(rgba, whole, atol=2e-6)
+    assert 0.1 < float((rgba[..., 3] > 0).mean()) < 0.9
+    # as the steepest ramp that a viewer without steps draws
+    ramp = jv.TransferFunction([0, np.nextafter(np.float32(60), 0), 60, 255], step.colors, step.extinction)
+    np.testing.assert_allclose(rgba, forward(ramp)[1], atol=1e-5)
     assert np.isfinite(gradient.extinction).all()
     products = [jnp.vdot(a, b) for a, b in zip(*map(jax.tree.leaves, (gradient, ways)), strict=True)]
     np.testing.assert_allclose(sum(products), slope, rtol=1e-4)
@@ -290,3 +297,47 @@ def test_bad_input_is_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_points_that_lie_nearly_evenly_are_counted_exactly():
+    """4096 of them, each a little nearer to or farther from the one before: in the middle they are several
+    intervals away from where even ones would lie."""
+    n = 4096
+    gaps = np.where(np.arange(n - 1) < n / 2, 1 - 9e-4, 1 + 9e-4)
+    values = np.concatenate([[0], np.cumsum(gaps)]).astype(np.float32)
+    between = (values[1:] + values[:-1]) / 2
+    for strictly in (False, True):
+        found = points_below(jnp.asarray(values), jnp.asarray(between), strictly=strictly)
+        np.testing.assert_array_equal(found, np.arange(1, n))
+
+
+class Gained(jv.TransferFunction):
+    """With a leaf of its own, by which its extinction is multiplied."""
+
+    gain: jax.Array
+
+    def __init__(self, *points):
+        super().__init__(*points)
+        self.gain = jnp.asarray(2.0)
+
+    def classifier(self):
+        classify = super().classifier()
+
+        def gained(measured):
+            color, extinction = classify(measured)
+            return color, self.gain * extinction
+
+        return gained
+
+
+def test_a_transfer_function_of_ones_own_pulls_as_its_look_up_says():
+    for n in (4, 40):
+        function = Gained(np.linspace(0, 1, n), np.full((n, 3), 0.5), np.linspace(1, 3, n))
+        value = jnp.asarray([0.1, 0.45, 0.8])
+        search = function.search()
+        measured = (value,) if search is None else (value, *search((value,)))
+        ones = jnp.ones(3)
+        pulled, (of_value, *_) = function.pull(measured, (0 * ones,) * 3, ones)
+        np.testing.assert_allclose(pulled.gain, np.sum(1 + 2 * value), rtol=1e-5)
+        np.testing.assert_allclose(jnp.sum(pulled.extinction), 2 * 3, rtol=1e-5)
+        np.testing.assert_allclose(of_value, 2 * 2, rtol=1e-4)

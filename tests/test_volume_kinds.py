@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.occupancy import Blocks
 
 from .scenes import around, soft_transfer
 
@@ -18,11 +19,6 @@ class Inverted(jv.Volume):
         return 1 - super().value(coordinate) / 255
 
 
-@pytest.fixture(scope="module")
-def march():
-    return jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping()))
-
-
 def inverted(dtype):
     data = np.full((12, 12, 12), 255)
     data[4:8, 3:8, 5:9] = np.random.default_rng(0).integers(0, 120, (4, 5, 4))
@@ -30,10 +26,11 @@ def inverted(dtype):
 
 
 @pytest.mark.parametrize("dtype", ["uint8", pytest.param("float32", marks=pytest.mark.slow)])
-def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype, march):
+def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype):
     """In the fast engine and in its gradient, as in the reference engine, which asks `value` alone."""
     volume = inverted(dtype)
     camera, transfer = around(volume), soft_transfer(0.2)
+    march = jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping()))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(16, 20, 4)), jnp.float32)
 
     def of(adjoint):
@@ -54,11 +51,11 @@ def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype, march):
 
 
 @pytest.mark.parametrize("dtype", ["float16", pytest.param("bfloat16", marks=pytest.mark.slow)])
-def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype, march):
+def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype):
     """Each of few voxels gets part of the gradient from thousands of samples, which 16 bits would lose."""
     data = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.9, (4, 4, 4)), dtype)
     transfer, whole = soft_transfer(0.2), jv.Volume(data.astype(jnp.float32))
-    camera = around(whole, (48, 48))
+    camera, march = around(whole, (48, 48)), jv.March(0.07, (jv.AlphaCorrection(),))
 
     def gradient(data):
         def loss(data):
@@ -69,3 +66,37 @@ def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype, march):
     expected = gradient(data.astype(jnp.float32))
     error = np.abs(gradient(data) - expected).max() / np.abs(expected).max()
     assert error < 2 * float(jnp.finfo(dtype).eps)
+
+
+class Nearest(jv.Volume):
+    """Of its voxels, which it reads by itself."""
+
+    def value(self, coordinate):
+        i, j, k = (jnp.round(c).astype(jnp.int32) for c in coordinate)
+        return self.data[i, j, k]
+
+
+class Relabelled(jv.Volume):
+    """Of one label, whatever its labels are."""
+
+    def label(self, coordinate):
+        return jnp.ones(jnp.shape(coordinate[0]), jnp.int32)
+
+
+def test_voxels_that_a_volume_reads_by_itself_have_no_gradient_by_replay():
+    data = jnp.asarray(np.random.default_rng(0).random((5, 5, 5)), jnp.float32)
+
+    def loss(data):
+        volume = Nearest(data)
+        return jnp.sum(jv.render(volume, soft_transfer(), around(volume), jv.March(0.3)).rgba)
+
+    with pytest.raises(ValueError, match=r"the voxels of a Nearest, .* pass adjoint=\"direct\""):
+        jax.eval_shape(jax.grad(loss), data)
+
+
+def test_nothing_is_known_of_the_blocks_of_a_volume_of_another_kind():
+    data, labels = np.full((9, 9, 9), 0.5, np.float32), np.zeros((9, 9, 9), np.uint8)
+    shown = jv.LabelTransferFunction([None, soft_transfer()])
+    for kind, visible in ((jv.Volume, False), (Relabelled, True), (Inverted, True)):
+        blocks = Blocks.of(kind(data, labels=labels))
+        assert np.all(np.asarray(shown.visible(blocks)) == visible), kind

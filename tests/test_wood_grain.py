@@ -122,7 +122,7 @@ def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
 
 
 @pytest.mark.parametrize(("scale", "bound"), [(0.125, 1 / 5), (0.5, 1 / 2.5)])
-@pytest.mark.parametrize("name", JITTERS)
+@pytest.mark.parametrize("name", ["jitter", pytest.param("empty space", marks=pytest.mark.slow)])
 def test_blue_jitter_leaves_less_slow_error_where_the_rings_are_wide(name, scale, bound):
     """The error is a function of ξ + φ, where φ runs through 0 … 1 once per ring. That moves the spectrum
     of the noise by the comb's frequency, and rings that are narrow (0.5: 11 pixels) move fast noise to
@@ -188,9 +188,11 @@ def engine_scene(real_volume):
 @pytest.mark.parametrize(
     "make",
     [
-        sphere_scene,
         engine_scene,
-        *(pytest.param(make, marks=pytest.mark.slow) for make in (head_scene, skin_scene, airway_scene)),
+        *(
+            pytest.param(make, marks=pytest.mark.slow)
+            for make in (sphere_scene, head_scene, skin_scene, airway_scene)
+        ),
     ],
 )
 def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
@@ -223,7 +225,8 @@ def cut_skull_scene(_):
     return cut_head(jv.preset("head", unit_distance=0.01))[0]
 
 
-@pytest.mark.parametrize("make", [cut_skull_scene, pytest.param(chest_scene, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [cut_skull_scene, chest_scene])
 def test_empty_space_jitter_leaves_wood_grain_behind_material_alone(make, real_volume):
     """Its limit: a ray that meets nothing transparent is not jittered."""
     scene = make(real_volume)

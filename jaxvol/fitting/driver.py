@@ -1,6 +1,7 @@
 """How are parameters found that make a residual small? By a solver of Optimistix, step by step."""
 
 import math
+import numbers
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -136,7 +137,7 @@ def fit(
     `ImportError` where Optax or the progress bar is asked for and missing.
     """
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
-        if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
+        if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
     check_residual(residual)
     file = None if checkpoint is None else output_file("checkpoint", checkpoint)

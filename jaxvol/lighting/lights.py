@@ -118,7 +118,7 @@ def lights_of(lights: Light | tuple[Light, ...] | Any) -> tuple[Light, ...]:
     if not isinstance(several, tuple | list) or not several:
         raise ValueError(f"lights must be a light, or a tuple of some; got {lights!r}.")
     for light in several:
-        if not isinstance(light, Light):
+        if not isinstance(light, LocatedLight | ConstantLight):
             raise ValueError(f"lights must hold jaxvol lights, such as DirectionalLight; got {light!r}.")
     return tuple(several)
 

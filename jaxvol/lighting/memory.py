@@ -1,6 +1,7 @@
 """Would that fit into memory? Asked before it is taken, since what does not fit ends the process."""
 
 import os
+from pathlib import Path
 
 import jax
 
@@ -13,9 +14,16 @@ def require_room(wanted: int, of: str) -> None:
 
 
 def memory_of_device() -> int:
-    """Bytes that the default device may use: what it says itself, or else the machine's memory."""
-    told = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
-    return told or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    """Bytes that the default device may use: what it says itself, or else what the machine, or a container on
+    it, has."""
+    device = jax.config.read("jax_default_device") or jax.local_devices()[0]
+    told = (device.memory_stats() or {}).get("bytes_limit") if isinstance(device, jax.Device) else None
+    if told:
+        return told
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    container = Path("/sys/fs/cgroup/memory.max")
+    limit = container.read_text().strip() if container.is_file() else "max"
+    return machine if limit == "max" else min(machine, int(limit))
 
 
 def _spelled(count: int) -> str:

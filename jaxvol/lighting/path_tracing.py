@@ -11,17 +11,17 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, PyTree, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
 from ..arguments import check_scene
 from ..camera import Camera
-from ..checks import Arrayable, integer, is_traced, number
+from ..checks import Arrayable, all_finite, integer, is_traced, number
 from ..compiled import compiled
 from ..locate import Affine, enter
 from ..noise import hashed_uniforms_4
 from ..occupancy import Blocks
 from ..packed import with_words, words_of
-from ..taps import floats, without_voxels
+from ..taps import without_voxels
 from ..transfer import Transfer
 from ..triple import Scalar
 from ..volume import Volume
@@ -237,8 +237,10 @@ def _trace(
     """The pixels row by row, in waves that bound the memory."""
     given, camera = jax.tree.map(_single, (given, camera))
     scene, (width, height) = given.scene(), camera.size
-    sound = _finite((without_voxels(given.volume), given.blocks, scene.majorants, given.transfer))
-    sound &= _finite((given.materials, given.lights, given.anisotropy, camera))
+    # walks compare, and a comparison with NaN has an answer
+    sound = all_finite((without_voxels(given.volume), scene.majorants, given.transfer))
+    sound &= all_finite((given.materials, given.lights, given.anisotropy, camera))
+    sound &= ~jnp.any(given.blocks.unordered)
     pixels = how.pixels(camera)
     waves = -(-width * height // pixels)
     count = pixels * how.paths
@@ -265,11 +267,6 @@ def _trace(
         lambda leaf: jnp.where(sound, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, sums
     )
     return PathTraced(*sums, seed=seed, paths=how.paths)
-
-
-def _finite(tree: PyTree) -> Bool[Array, ""]:
-    """Whether all its numbers are. Walks compare them, and a comparison with NaN has an answer."""
-    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(floats(tree))]))
 
 
 def _single(leaf: Array) -> Array:

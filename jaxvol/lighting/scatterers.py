@@ -167,8 +167,12 @@ class ScattererTemplates(Lighting):
         if occlusion not in get_args(Occlusion):
             raise ValueError(f"occlusion must be one of {', '.join(get_args(Occlusion))}; got {occlusion!r}.")
         self.occlusion, self.seed = occlusion, integer("seed", seed, 0)
-        self.reach = tuple(float(r) for r in reach)
-        if not all(b > a for a, b in zip((1.0, *self.reach), self.reach, strict=False)):
+        try:
+            self.reach = tuple(float(r) for r in reach)
+            grows = all(b > a for a, b in zip((1.0, *self.reach), (*self.reach, math.inf), strict=True))
+        except TypeError:
+            grows = False
+        if not grows:
             raise ValueError(f"reach must be multiples above 1 that increase; got {reach!r}.")
         if cutoff is None:
             cutoff = 0.02 if occlusion == "hard" else 0.0
@@ -182,6 +186,8 @@ class ScattererTemplates(Lighting):
         # True: fine enough for what scatters over several voxels
         self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
         self.given = given
+        if not isinstance(given, ScattererTemplate | None):
+            raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")
         if given is not None:
             whole = given.intensity.shape[-1]
             if given.intensity.ndim != 3 or given.intensity.shape[0] != len(self.materials):
@@ -237,8 +243,9 @@ class ScattererTemplates(Lighting):
         known = memory.get(tree)
         if known is None or not all(_same(a, b) for a, b in zip(known[0], leaves, strict=True)):
             memory.clear()
-            around = Surroundings(volume, transfer, march.locate(volume))
-            memory[tree] = known = leaves, _baked(self, around)
+            with jax.ensure_compile_time_eval():  # what is kept must outlive a `jax.jit` around
+                around = Surroundings(volume, transfer, march.locate(volume))
+                memory[tree] = known = leaves, _baked(self, around)
         return known[1]
 
     def over(self, around: Surroundings) -> Shading:
