@@ -101,10 +101,10 @@ def render(
         - `"direct"`: both, and higher derivatives, by letting JAX differentiate
           `render_ray_reference`. Memory grows with the number of samples.
 
-    **Returns:** a `Rendering` with leading shape (height, width), in float32; or, for the image alone, a
-    `Picture`. Where a number on which all pixels depend is NaN or infinite (an entry of a transfer function
-    whose fit diverged, say), all of the image is NaN, and so is its gradient; a voxel that is NaN makes those
-    pixels NaN whose rays meet it, or leave the volume beside it.
+    **Returns:** a `Rendering` with leading shape (height, width), in JAX's default float type; or, for the
+    image alone, a `Picture`. Where a number on which all pixels depend is NaN or infinite (an entry of a
+    transfer function whose fit diverged, say), all of the image is NaN, and so is its gradient; a voxel that
+    is NaN makes those pixels NaN whose rays meet it, or leave the volume beside it.
 
     Under `jax.vmap`, over any of the arguments, images are rendered one after the other, in one program, and
     so are their gradients, as a loop would. `"direct"` renders them side by side, and so

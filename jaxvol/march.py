@@ -108,9 +108,9 @@ class Transform(eqx.Module):
         return steps, memory
 
     def settled(self, memory: Any) -> Bool[Array, ""]:
-        """Whether `advance` answers with whole steps from here on, whatever the samples are like. Two
-        transparent samples in a row must settle a ray: over empty space a march leaps in whole steps. Asked
-        where there is an `advance` of its own."""
+        """Whether `advance` answers with whole steps from here on, whatever the samples are like. Where
+        marches leap, the first transparent sample must settle a ray: over empty space `advance` is asked
+        once, and what follows is whole steps. Asked where there is an `advance` of its own."""
         return jnp.zeros((), bool)
 
     def survey(self, occupancy: Occupancy, view: View | None) -> Survey | None:

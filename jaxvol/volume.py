@@ -53,6 +53,10 @@ class Volume(eqx.Module):
     **Raises:** `ValueError` naming the argument for data that are not 3-D, have an axis of one
     voxel, another type, or voxels that are NaN or infinite, also in float32 alone; for integers that no type
     holds exactly; for spacing that is not positive; and for labels of another shape or type, or beyond int32.
+
+    A subclass may override `value` (a field of its own, say), which every engine and adjoint then measures;
+    `SpaceLeaping` leaps over nothing of it. The gradient to its voxels under `"replay"` takes those that it
+    asks `super().value` for.
     """
 
     data: Shaped[Array, "nx ny nz"]

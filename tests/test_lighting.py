@@ -742,6 +742,17 @@ def test_light_is_baked_once_for_what_stays_the_same(monkeypatch):
         assert len(calls) == number + 2, changed
 
 
+def test_light_that_was_baked_inside_a_program_serves_outside():
+    volume, _, how = baked_scene()
+    lighting = ScattererTemplates(FLESH, DAY, baked=5, **how)
+
+    def prepared():
+        return jax.tree.leaves(lighting.prepared(volume, PLAIN, jv.March(0.1)))
+
+    jax.eval_shape(lambda x: (prepared(), x)[1], 0.0)
+    assert not any(isinstance(leaf, jax.core.Tracer) for leaf in prepared())
+
+
 def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
     volume, points, how = baked_scene()
     lighting = ScattererTemplates(FLESH, DAY, baked=5, **how)

@@ -16,7 +16,7 @@ def require_room(wanted: int, of: str) -> None:
 def memory_of_device() -> int:
     """Bytes that the default device may use: what it says itself, or else what the machine, or a container on
     it, has."""
-    device = jax.config.read("jax_default_device") or jax.local_devices()[0]
+    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
     told = (device.memory_stats() or {}).get("bytes_limit") if isinstance(device, jax.Device) else None
     if told:
         return told
