@@ -35,6 +35,8 @@ def pulled(
     places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
     packed = with_words(volume, known.words)
     waves, survey = Waves.of(source), survey_of(scene, known)
+    if survey is not None and spans is not None:
+        survey = survey.within_spans()
     seen, fault = transfer.over(packed), has_fault(volume, transfer, march, lighting)
     light, pull_light = None, None
     if lighting is not None:

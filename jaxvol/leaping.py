@@ -176,6 +176,10 @@ class _Distances(Survey):
     def seen(self, notes: None) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
+    def within_spans(self) -> Survey:
+        # Found out once more, by other rounding, a start may lie behind what was seen.
+        return replace(self, starts=None, corner=None)
+
     def clear(
         self, notes: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:

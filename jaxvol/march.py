@@ -77,6 +77,10 @@ class Survey(eqx.Module):
         """For some of the rays, from these beams: a depth, no less than `depth`, up to which nothing is
         seen."""
 
+    def within_spans(self) -> "Survey":
+        """What of it is of use where it is known at which cells each ray begins and ends to see."""
+        return self
+
 
 class Transform(eqx.Module):
     """One change to a march. Override the seam that the idea is about; each default changes nothing.

@@ -269,7 +269,8 @@ def points_below(
         return guess + sum(each.astype(jnp.int32) for each in reached)
 
     # by their places: small deviations of each from the one before would add up
-    even = jnp.all(jnp.abs(values - (first + step * jnp.arange(last + 1, dtype=values.dtype))) < 0.4 * step)
+    places = first + step * jnp.arange(last + 1, dtype=values.dtype)
+    even = jnp.all(jnp.abs(values - places) < 0.4 * step)
     return jax.lax.cond(even, counted, searched, value)
 
 

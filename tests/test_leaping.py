@@ -111,7 +111,7 @@ def compare_methods(volume, transfer, camera, step, transforms, methods, quadrat
 # ---- invariant 2 ----
 
 
-@pytest.mark.parametrize("method", ["hierarchy", "distance", SLOWLY[-1]])
+@pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
 def test_leaping_does_not_show(method):
     @settings(**EVERY)
     @given(kind=KINDS, seed=SEEDS, view=st.sampled_from(list(PERSPECTIVE)), step=st.floats(0.01, 0.3))
@@ -146,7 +146,7 @@ def test_leaping_does_not_show_whatever_the_transforms(view, transforms, quadrat
     check()
 
 
-@pytest.mark.parametrize("method", ["hierarchy", "distance", SLOWLY[-1]])
+@pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
 def test_samples_fall_where_there_is_nothing(method):
     volume = jv.Volume(bytes_of(contents("blobs", 3)), SPACING)
     camera, step = around(volume, SIZE).zoom(2), 0.01
@@ -156,7 +156,7 @@ def test_samples_fall_where_there_is_nothing(method):
     assert np.asarray(leapt.samples).sum() < 0.85 * np.asarray(whole.samples).sum()
 
 
-@pytest.mark.parametrize("method", ["hierarchy", "distance", SLOWLY[-1]])
+@pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
 @pytest.mark.parametrize("name", ["sphere", "head"])
 def test_the_jitter_happens_at_the_same_sample(name, method):
     """In a head there is air in front, within and behind: the first transparent sample is mostly in front."""
@@ -171,7 +171,7 @@ def test_the_jitter_happens_at_the_same_sample(name, method):
                 assert float(whole.rgba[..., 3].max()) > 0.5
 
 
-@pytest.mark.parametrize("method", ["hierarchy", "distance", SLOWLY[-1]])
+@pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
 def test_the_jitter_happens_at_the_same_sample_where_air_lies_beyond_the_last_point(method):
     """Its extinction must be exactly the last point's, 0: rounding would make it other than transparent."""
     volume = jv.Volume(bytes_of(1 - contents("blobs", 3)), SPACING)
@@ -387,10 +387,9 @@ def test_bad_arguments_are_named(arguments, message):
 @pytest.mark.parametrize(
     ("method", "transforms"),
     [
-        ("hierarchy", "plain"),
-        pytest.param("distance", "plain", marks=pytest.mark.slow),
-        pytest.param("beam", "plain", marks=pytest.mark.slow),
-        *(pytest.param(method, "moving", marks=pytest.mark.slow) for method in METHODS),
+        pytest.param(method, name, marks=() if (method, name) == ("hierarchy", "plain") else pytest.mark.slow)
+        for name in ("plain", "moving")
+        for method in METHODS
     ],
 )
 def test_leaping_does_not_show_under_a_toroidal_map(method, transforms):

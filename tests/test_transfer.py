@@ -145,10 +145,11 @@ def test_the_derivative_at_a_step_is_finite_and_that_of_jax(case):
         (r, g, b), sigma = jax.vmap(transfer)(where)
         return jnp.sum(r + 2 * g + 3 * b + 4 * sigma)
 
-    expected, slope = jax.grad(summed, (0, 1))(transfer, where)
+    expected, slope = jax.jit(jax.grad(summed, (0, 1)))(transfer, where)
     search, one = transfer.search(), jnp.ones_like(where)
     measured = (where,) if search is None else (where, *jax.vmap(lambda v: search((v,)))(where))
-    found, (of_value, *_) = transfer.pull(measured, (one, 2 * one, 3 * one), 4 * one)
+    pull = jax.jit(lambda transfer, *given: transfer.pull(*given))
+    found, (of_value, *_) = pull(transfer, measured, (one, 2 * one, 3 * one), 4 * one)
     for name in ("colors", "extinction"):
         assert np.isfinite(getattr(found, name)).all()
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-5, atol=1e-4)
@@ -172,6 +173,7 @@ def test_what_a_step_shows_is_known_to_be_visible(many):
             assert seen[i, j] == dense[within].any(), (low[i, j], high[i, j])
 
 
+@pytest.mark.slow
 def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
     data = np.zeros((24, 20, 20), np.uint8)
     data[4:9, 5:15, 5:15] = 100

@@ -238,9 +238,10 @@ def _trace(
     given, camera = jax.tree.map(_single, (given, camera))
     scene, (width, height) = given.scene(), camera.size
     # walks compare, and a comparison with NaN has an answer
-    sound = all_finite((without_voxels(given.volume), scene.majorants, given.transfer))
+    # of a volume that measures in its own way nothing is known, and its ranges are infinite
+    ranges = given.blocks if type(given.volume) is Volume else None
+    sound = all_finite((without_voxels(given.volume), ranges, scene.majorants, given.transfer))
     sound &= all_finite((given.materials, given.lights, given.anisotropy, camera))
-    sound &= ~jnp.any(given.blocks.unordered)
     pixels = how.pixels(camera)
     waves = -(-width * height // pixels)
     count = pixels * how.paths
