@@ -9,11 +9,6 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-
-# A quarter less to compile, for programs that are a tenth slower and compute the same numbers. It is read
-# when JAX first computes, and by the processes that tests start.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_llvm_disable_expensive_passes=true"
-
 from . import typechecker  # noqa: F401  (the hook looks it up by name)
 
 
@@ -33,6 +28,13 @@ def pytest_configure(config):
     The folder is new every time and removed at the end, so that nothing old is tested."""
     if hasattr(config, "workerinput"):
         return  # a worker of pytest-xdist: the environment tells it
+    if config.option.markexpr == "not slow":
+        # The fast tests spend most of their time compiling. LLVM without its dear passes takes a quarter less
+        # of it, for programs that are a tenth slower and compute the same numbers. The slow tests, and those
+        # that are chosen in another way, compile as users do.
+        os.environ["XLA_FLAGS"] = (
+            f"{os.environ.get('XLA_FLAGS', '')} --xla_llvm_disable_expensive_passes=true"
+        )
     folder = config.stash[PROGRAMS] = tempfile.mkdtemp(prefix="jaxvol-programs-")
     settings = {
         "jax_compilation_cache_dir": folder,
