@@ -20,20 +20,23 @@ class Inverted(jv.Volume):
 
 
 def inverted(dtype):
-    data = np.full((12, 12, 12), 255)
-    data[4:8, 3:8, 5:9] = np.random.default_rng(0).integers(0, 120, (4, 5, 4))
+    """Inside of what is seen are whole blocks of zeros, which the transfer function hides."""
+    data = np.full((14, 14, 14), 255)
+    data[3:11, 3:11, 3:11] = np.random.default_rng(0).integers(0, 60, (8, 8, 8))
+    data[4:9, 4:9, 4:9] = 0
     return Inverted(data.astype(dtype), (0.1, 0.12, 0.08))
 
 
 @pytest.mark.parametrize("dtype", ["uint8", pytest.param("float32", marks=pytest.mark.slow)])
 def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype):
-    """In the fast engine and in its gradient, as in the reference engine, which asks `value` alone."""
+    """In the fast engine and in its gradient: as a volume of those values, by the reference engine."""
     volume = inverted(dtype)
+    plain = jv.Volume(1 - np.asarray(volume.data, np.float32) / 255, volume.spacing)
     camera, transfer = around(volume), soft_transfer(0.2)
     march = jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping()))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(16, 20, 4)), jnp.float32)
 
-    def of(adjoint):
+    def of(volume, adjoint):
         def loss(moving):
             data, position = eqx.combine(moving, (volume.data, camera.position))
             scene = eqx.tree_at(lambda s: (s[0].data, s[1].position), (volume, camera), (data, position))
@@ -41,13 +44,19 @@ def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype):
             return jnp.sum(rgba * weights), rgba
 
         moving = eqx.filter((volume.data, camera.position), eqx.is_inexact_array)
-        return jax.value_and_grad(loss, has_aux=True)(moving)
+        (_, image), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
+        return image, gradient
 
-    ((_, image), replayed), ((_, truth), direct) = of("replay"), of("direct")
+    (image, (of_data, of_position)), (truth, (of_values, expected)) = (
+        of(volume, "replay"),
+        of(plain, "direct"),
+    )
     assert float(truth[..., 3].max()) > 0.3
     np.testing.assert_allclose(image, truth, atol=2e-5, rtol=0)
-    for got, want in zip(jax.tree.leaves(replayed), jax.tree.leaves(direct), strict=True):
-        np.testing.assert_allclose(got, want, atol=2e-4 * np.linalg.norm(want) + 1e-6, rtol=0)
+    np.testing.assert_allclose(of_position, expected, atol=2e-4 * np.linalg.norm(expected), rtol=0)
+    if dtype == "float32":
+        expected = -of_values / 255
+        np.testing.assert_allclose(of_data, expected, atol=2e-4 * np.linalg.norm(expected) + 1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", ["float16", pytest.param("bfloat16", marks=pytest.mark.slow)])
