@@ -139,11 +139,13 @@ def directions(gradient: np.ndarray, seed: int) -> list[np.ndarray]:
 def probes(plain: Measured, size: int, seed: int) -> list[Probe]:
     noise = gaussian_filter(np.random.default_rng(seed).normal(size=(size, size, 4)), (3, 3, 0))
     uneven = np.clip(1 + 0.3 * noise / noise.std(), 0.1, None)
-    return [
-        Probe(name, direction, uneven * np.sign(plain.tangent(name, direction)))
-        for name in plain.leaves
-        for direction in directions(plain.gradient(name, uneven), seed)
-    ]
+    found = []
+    for name in plain.leaves:
+        for direction in directions(plain.gradient(name, uneven), seed):
+            tangent = plain.tangent(name, direction)
+            if np.any(tangent):  # none of an extinction of 0
+                found.append(Probe(name, direction, uneven * np.sign(tangent)))
+    return found
 
 
 def measure(scene: Scene, methods: Sequence[str], size: int, seed: int) -> dict[str, Any]:
