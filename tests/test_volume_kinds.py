@@ -32,8 +32,9 @@ def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype):
     """In the fast engine and in its gradient: as a volume of those values, by the reference engine."""
     volume = inverted(dtype)
     plain = jv.Volume(1 - np.asarray(volume.data, np.float32) / 255, volume.spacing)
-    camera, transfer = around(volume), soft_transfer(0.2)
-    march = jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping()))
+    camera, transfer = around(volume), soft_transfer(1.0)
+    # by distances, since a beam of so small an image is as wide as the volume
+    march = jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping("distance")))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(16, 20, 4)), jnp.float32)
 
     def of(volume, adjoint):
