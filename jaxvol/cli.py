@@ -175,7 +175,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="without --camera: the side from which to see the whole volume",
+        help="without --camera: the side from which to see the whole volume (default: 0.5 -1 0.4)",
     )
     view.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
     view.add_argument(
