@@ -29,9 +29,9 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         return  # a worker of pytest-xdist: the environment tells it
     if config.option.markexpr == "not slow":
-        # The fast tests spend most of their time compiling. LLVM without its expensive passes takes a quarter less
-        # of it, for programs that are a tenth slower and compute the same numbers. The slow tests, and those
-        # that are chosen in another way, compile as users do.
+        # The fast tests spend most of their time compiling. LLVM without its expensive passes takes a quarter
+        # less of it, for programs that are a tenth slower and compute the same numbers. The slow tests, and
+        # those that are chosen in another way, compile as users do.
         os.environ["XLA_FLAGS"] = (
             f"{os.environ.get('XLA_FLAGS', '')} --xla_llvm_disable_expensive_passes=true"
         )
