@@ -250,25 +250,33 @@ def _light(
 
 def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
     """The image; in reverse mode, its derivative by a second march."""
-    if not is_traced(scene):  # a rule for derivatives would take 5 ms to make
+    if not is_traced(scene):  # a rule for derivatives takes milliseconds
         return _image_in_turn(scene, how, known)
-
-    @eqx.filter_custom_vjp
-    def image(scene: Scene, known: Known) -> Picture:
-        return _image_in_turn(scene, how, known)
-
-    @image.def_fwd
-    def _(perturbed: Any, scene: Scene, known: Known) -> tuple[Picture, Any]:
-        rendering, spans = _watched(scene, how, known)
-        return rendering, (rendering, spans)
-
-    @image.def_bwd
-    def _(left: Any, gradient: Picture, perturbed: Any, scene: Scene, known: Known) -> Any:
-        return _pulled(scene, perturbed, known, left, gradient)
-
-    if any("JVPTracer" in transformations(leaf) for leaf in jax.tree.leaves(scene)):
+    kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
+    if any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds):
         raise ValueError(WRONG_WAY["replay"])  # JAX's own error names neither argument nor remedy
-    return image(scene, jax.lax.stop_gradient(known))
+    # JAX has such rules inside `jax.shard_map` only under `jax.jit`
+    image = _image_by_shard if any("ShardMapTracer" in kind for kind in kinds) else _image_by_replay
+    return image(scene, how, jax.lax.stop_gradient(known))
+
+
+@eqx.filter_custom_vjp
+def _image_by_replay(scene: Scene, how: _How, known: Known) -> Picture:
+    return _image_in_turn(scene, how, known)
+
+
+@_image_by_replay.def_fwd
+def _(perturbed: Any, scene: Scene, how: _How, known: Known) -> tuple[Picture, Any]:
+    rendering, spans = _watched(scene, how, known)
+    return rendering, (rendering, spans)
+
+
+@_image_by_replay.def_bwd
+def _(left: Any, gradient: Picture, perturbed: Any, scene: Scene, how: _How, known: Known) -> Any:
+    return _pulled(scene, perturbed, known, left, gradient)
+
+
+_image_by_shard = eqx.filter_jit(_image_by_replay)
 
 
 def _marched(scene: Scene, how: _How, known: Known, *, watch: bool = False) -> tuple[Picture, Span | None]:

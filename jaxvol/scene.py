@@ -18,7 +18,7 @@ from .rendering import Rendering
 from .transfer import Transfer
 from .volume import Volume
 from .wavefront import Beams, march_beams
-from .waves import OwnRays, Waves, each_ray
+from .waves import OwnRays, Waves, each_ray, lines
 
 
 Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
@@ -47,8 +47,9 @@ def survey_of(scene: Scene, known: Known) -> Survey | None:
 
     def first_hit(survey: Survey, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
         first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
-        ends = jax.vmap(source.ray)(columns.reshape(-1), rows.reshape(-1))
-        own, none = OwnRays(*(jnp.stack(end, axis=-1) for end in ends)), jnp.zeros((), jnp.int32)
+        through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
+        ends = (jnp.stack(end, axis=-1) for end in (through.origin, through.direction))
+        own, none = OwnRays(*ends), jnp.zeros((), jnp.int32)
         waves = Waves.of(own, columns.size)
         rays = waves.rays(own, space, none)
         beams = Beams(rays, waves.beams, waves.box(own, rays, none))

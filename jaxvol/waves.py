@@ -17,6 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .beams import Box
 from .camera import Camera
+from .checks import all_finite
+from .compiled import in_memory
 from .lighting.deferred import Line
 from .locate import Ray, Space, enter
 from .occupancy import Occupancy
@@ -107,8 +109,7 @@ class _OfPixels(Waves):
         column, row = self._pixels(wave, group_y * SIDE + y, group_x * SIDE + x)
         column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
         width, height = self.size
-        origin, direction, pixel = each_ray(partial(_of_pixel, source))(column, row)
-        return entering(space, origin, direction, pixel, (column < width) & (row < height))
+        return entering(space, *lines(source, column, row), (column < width) & (row < height))
 
     def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
@@ -180,6 +181,25 @@ def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
     left, top = (first.astype(column.dtype) for first in source.first_pixel)
     return Line(*source.ray(column, row), (column + left, row + top))
+
+
+@jax.custom_jvp
+def lines(camera: Camera, columns: Lanes, rows: Lanes) -> Line:
+    """The rays of pixels, rounded alike in every program.
+
+    A program that also differentiates them would round them by other roundings, 1e-4 of a voxel away; and a
+    sample that comes to lie beyond a face of voxels has the slope of the other side. So they are a branch of
+    their own, of which a derivative is no part."""
+    return in_memory(all_finite(camera), each_ray(partial(_of_pixel, camera)), columns, rows)
+
+
+@lines.defjvp
+def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -> tuple[Line, Line]:
+    camera, columns, rows = primals
+    _, change = jax.jvp(
+        lambda camera: each_ray(partial(_of_pixel, camera))(columns, rows), (camera,), tangents[:1]
+    )
+    return lines(*primals), change
 
 
 def each_ray(f: Callable[..., Any]) -> Callable[..., Any]:

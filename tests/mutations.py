@@ -81,6 +81,13 @@ MUTATIONS = [
         ("test_rays.py::test_depth_is_the_mean_distance_of_what_is_seen",),
     ),
     Mutation(
+        "camera: rays are rounded anew by every program that differentiates them",
+        "waves.py",
+        "return in_memory(all_finite(camera), each_ray(partial(_of_pixel, camera)), columns, rows)",
+        "return each_ray(partial(_of_pixel, camera))(columns, rows)",
+        ("test_camera.py::test_rays_round_alike_whether_or_not_they_are_differentiated",),
+    ),
+    Mutation(
         "start: no transform is asked where the first cell begins",
         "reference.py",
         "offset=march.start(ray),",

@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 from ..arguments import check_scene
 from ..camera import Camera
-from ..checks import Arrayable, all_finite, integer, is_traced, number
+from ..checks import Arrayable, all_finite, described, integer, is_traced, number
 from ..compiled import compiled
 from ..locate import Affine, enter
-from ..noise import hashed_uniforms_4
+from ..noise import hashed_uniforms_4, is_key
 from ..occupancy import Blocks
 from ..packed import with_words, words_of
 from ..taps import without_voxels
@@ -181,16 +181,13 @@ class _How(eqx.Module):
 
 def _seed(key: Any) -> UInt32[Array, ""]:
     """A word from a seed, or from a key of `jax.random`."""
-    if isinstance(key, jax.Array) and (
-        jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or (key.dtype == jnp.uint32 and key.shape == (2,))
-    ):
-        if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape != ():
-            raise ValueError(f"key must be a single one; got keys of shape {key.shape}.")
-        return jax.random.bits(key, (), jnp.uint32)
-    try:
-        return jax.random.bits(jax.random.key(integer("key", key, 0)), (), jnp.uint32)
-    except ValueError as fault:
-        raise ValueError(f"key must be a seed, or a key of jax.random; got {key!r}.") from fault
+    if not is_key(key):
+        if not is_traced(key):
+            key = integer("key", key, 0, otherwise=", or a key of jax.random")
+        elif key.shape != () or not jnp.issubdtype(key.dtype, jnp.integer):
+            raise ValueError(f"key must be an integer, or a key of jax.random; got {described(key)}.")
+        key = jax.random.key(key)
+    return jax.random.bits(key, (), jnp.uint32)
 
 
 def _checked(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
