@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import Arrayable, output_file
+from .checks import Arrayable, described, output_file
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
@@ -41,13 +41,17 @@ def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
 
     **Returns:** the path. Its folder is made where there is none.
 
-    **Raises:** `ValueError` for another ending, a shape that the format does not hold, NaN, colours that are
-    infinite, and a path that cannot be written.
+    **Raises:** `ValueError` for what is no array, another ending, a shape that the format does not hold, NaN,
+    colours that are infinite, and a path that cannot be written.
 
     A viewer blends a transparent PNG over its background in sRGB; `Rendering.image` does so in linear light,
     which looks different where the opacity lies between 0 and 1.
     """
-    image = np.asarray(linear, np.float32)
+    try:
+        image = np.asarray(linear, np.float32)
+    except (TypeError, ValueError) as fault:
+        given = f"linear must be an array of numbers; got {described(linear)}."
+        raise ValueError(f"{given} Of a Rendering, give rendering.image() or rendering.rgba.") from fault
     channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else None
     if channels not in (0, 3, 4) or 0 in image.shape:
         raise ValueError(

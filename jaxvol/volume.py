@@ -266,6 +266,10 @@ def _array(name: str, value: Arrayable) -> Array | np.ndarray:
         raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
     if is_traced(value) or isinstance(value, jax.Array):
         return jnp.asarray(value)
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(
+            f"{name} must be an array without a mask; got a masked one. Fill it: data.filled(0)."
+        )
     try:
         array = np.asarray(value)
     except ValueError as fault:  # sequences of different lengths

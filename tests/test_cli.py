@@ -222,7 +222,7 @@ BAD = {
     "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of depth must end in one of .tif"),
     "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
     "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
-    "no transfer": (["FILE", "--transfer", "nowhere.json"], "nowhere.json"),
+    "no transfer": (["FILE", "--transfer", "nowhere.json"], "nowhere.json cannot be read"),
     "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--parallel goes with --direction"),
     "no file": (["nowhere.raw"], "there is no file"),
     "preset": (["FILE", "--preset", "moon"], "preset must be one of"),

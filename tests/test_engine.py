@@ -192,3 +192,25 @@ def test_direct_under_jit_with_the_number_of_samples_given():
     np.testing.assert_allclose(
         image(0.07), jv.render(volume, soft_transfer(), around(volume), MARCH).rgba, atol=2e-5
     )
+
+
+WRONG_WAYS = {
+    "jvp": ("replay", lambda loss, x: jax.jvp(loss, (x,), (x,)), 'pass adjoint="forward"'),
+    "grad of grad": ("replay", lambda loss, x: jax.grad(lambda x: jax.grad(loss)(x) ** 2)(x), '"direct"'),
+    "hessian": ("replay", lambda loss, x: jax.hessian(loss)(x), 'higher derivatives, adjoint="direct"'),
+    "grad": ("forward", lambda loss, x: jax.grad(loss)(x), 'pass adjoint="replay"'),
+    "grad of jit": ("forward", lambda loss, x: jax.grad(jax.jit(loss))(x), 'pass adjoint="replay"'),
+}
+
+
+@pytest.mark.parametrize("way", WRONG_WAYS)
+def test_the_wrong_way_to_differentiate_is_named_with_what_to_pass(way):
+    adjoint, differentiate, message = WRONG_WAYS[way]
+    volume, transfer = anisotropic_noise(), soft_transfer()
+    camera = around(volume)
+
+    def loss(step):
+        return jv.render(volume, transfer, camera, jv.March(step), adjoint=adjoint).rgba.sum()
+
+    with pytest.raises(ValueError, match=message):
+        differentiate(loss, jnp.asarray(0.07))

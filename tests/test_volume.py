@@ -154,6 +154,7 @@ BAD = {
         lambda: jv.Volume(np.zeros((4, 1, 4), np.uint8)),
         r"at least 2 voxels.*\(4, 1, 4\)",
     ),
+    "a mask": (lambda: jv.Volume(np.ma.zeros(SHAPE)), r"data must be an array without a mask"),
     "objects": (lambda: jv.Volume(np.full(SHAPE, None)), r"data must be of type.*got object"),
     "beyond 2**24": (
         lambda: jv.Volume(np.arange(210).reshape(SHAPE) + 2**24),

@@ -69,7 +69,11 @@ class Fit(eqx.Module):
     @property
     def message(self) -> str:
         """How the fit ended, in words."""
-        return "The solver converged." if self.success else Outcome[self.solution.result]
+        if self.success:
+            return "The solver converged."
+        if self.solution.result == Outcome.nonlinear_max_steps_reached:  # Optimistix fears for other problems
+            return "The fit took the maximum number of steps, max_steps, before it converged."
+        return Outcome[self.solution.result]
 
 
 def fit(
@@ -122,10 +126,10 @@ def fit(
     - `callback`: `callback(step, parameters, loss)` after each step but the first, which looks at the start.
     - `progress`: shows a progress bar (`pip install "jaxvol[fit]"`).
     - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, at the end, and when the
-      fit is interrupted (Ctrl-C; `KeyboardInterrupt` is raised again, and says so). Whether it can be written
-      is tried first. If it exists, the fit goes on from there, and ends with the same parameters, to the
-      bit, as if it had never stopped (on the same machine). A damaged file is told by a warning, and the one
-      before it used.
+      fit is interrupted after its first step (Ctrl-C; `KeyboardInterrupt` is raised again, and says so).
+      Whether it can be written is tried first. If it exists, the fit goes on from there, and ends with the
+      same parameters, to the bit, as if it had never stopped (on the same machine). A damaged file is told
+      by a warning, and the one before it used.
 
     **Returns:** a `Fit`. A solver that fails, stalls or runs out of steps is told by `Fit.success`,
     `Fit.message` and `Fit.solution.result`; the parameters are then the best ones that were seen. Directions

@@ -33,8 +33,7 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
       `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`, as
       `Camera` takes them.
 
-    **Raises:** `ValueError`, naming the file, for files that do not hold this, and `OSError` for
-    those that are not there.
+    **Raises:** `ValueError`, naming the file, for one that is not there, or does not hold this.
     """
     found = _json(cameras)
     if not isinstance(found, list):
@@ -53,7 +52,7 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
 def read_transfer(path: File) -> TransferFunction:
     """The transfer function in a JSON file with the fields `values`, `colors` and `extinction`.
 
-    **Raises:** `ValueError`, naming the file, for one that does not hold this."""
+    **Raises:** `ValueError`, naming the file, for one that is not there, or does not hold this."""
     fields = _fields(str(path), _json(path), TRANSFER, TRANSFER)
     try:
         return TransferFunction(**fields)
@@ -73,6 +72,8 @@ def write_transfer(path: File, transfer: TransferFunction) -> Path:
 def _json(path: File) -> Any:
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as fault:
+        raise ValueError(f"{path} cannot be read ({fault.strerror}).") from fault
     except (json.JSONDecodeError, UnicodeDecodeError) as fault:
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
