@@ -29,9 +29,9 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         return  # a worker of pytest-xdist: the environment tells it
     if config.option.markexpr == "not slow":
-        # The fast tests spend most of their time compiling. LLVM at its first level, without expensive passes,
-        # takes two fifths less of it, for programs that are somewhat slower and compute the same numbers. The
-        # slow tests, and those that are chosen in another way, compile as users do.
+        # The fast tests spend most of their time compiling. LLVM at its first level, without expensive
+        # passes, takes a third less of it, for programs that are somewhat slower and compute the same
+        # numbers. The slow tests, and those that are chosen in another way, compile as users do.
         less = "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {less}"
     folder = config.stash[PROGRAMS] = tempfile.mkdtemp(prefix="jaxvol-programs-")

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from ..chunks import Chosen
 from ..triple import Triple
-from ..volume import split
+from ..volume import Volume, split
 from .memory import require_room
 from .seam import Lighting, Sample, Shading, Surroundings, lit
 
@@ -91,18 +91,23 @@ class BakedShading(Shading):
         return r, g, b
 
 
-def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighting:
-    """The light on a grid with so many nodes along the volume's longest side, and as many in proportion along
+def nodes_for(volume: Volume, resolution: int) -> tuple[int, int, int]:
+    """The shape of a grid with so many nodes along the volume's longest side, and as many in proportion along
     the others.
 
-    NaN in what it is made of makes all of it NaN. **Raises** `ValueError` where it does not fit into memory.
-    """
-    shading, around = jax.lax.stop_gradient((shading, around))
-    longest = max(around.volume.shape)
-    nx, ny, nz = (max(2, round(resolution * n / longest)) for n in around.volume.shape)
+    **Raises:** `ValueError` where light on it would not fit into memory."""
+    longest = max(volume.shape)
+    nx, ny, nz = (max(2, round(resolution * n / longest)) for n in volume.shape)
     require_room(
         nx * ny * nz * BYTES, f"a grid of {nx} x {ny} x {nz} nodes for baked={resolution}; take a coarser one"
     )
+    return nx, ny, nz
+
+
+def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) -> BakedLighting:
+    """The light on a grid of nodes. NaN in what it is made of makes all of it NaN."""
+    shading, around = jax.lax.stop_gradient((shading, around))
+    nx, ny, nz = nodes
     classification = around.transfer.over(around.volume)
 
     def node(number: Int[Array, ""]) -> Sample:

@@ -26,7 +26,7 @@ from ..taps import without_voxels
 from ..transfer import Transfer
 from ..triple import Scalar, Triple, along
 from ..volume import Volume
-from .baked import BakedLighting, bake
+from .baked import BakedLighting, bake, nodes_for
 from .lights import ConstantLight, Light, LocatedLight, lights_of
 from .materials import Material, Optics, materials_of, shares, smoothstep, step
 from .seam import Lighting, Sample, Shading, Surroundings
@@ -260,7 +260,8 @@ class ScattererTemplates(Lighting):
         return jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
 
     def _bake(self, around: Surroundings) -> BakedLighting:
-        return bake(TemplateShading(self, self.grown(blend=True), self._optics, None), around, self.baked)
+        nodes = nodes_for(around.volume, self.baked)  # before templates are grown
+        return bake(TemplateShading(self, self.grown(blend=True), self._optics, None), around, nodes)
 
 
 def _memory(_: Array) -> dict:
