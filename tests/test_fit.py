@@ -124,6 +124,7 @@ def test_every_solver_finds_the_same_curve(solver):
     assert float(result.parameters["rate"][0]) == pytest.approx(rate, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_adam_lowers_the_loss_of_an_image_by_the_gradient_alone():
     pytest.importorskip("optax", reason="pip install -e '.[fit]'")
     result = jv.fit(RESIDUAL, GREY, solver="adam", max_steps=30)
@@ -193,6 +194,7 @@ def test_covariance_is_of_the_parameters_and_not_of_the_free_numbers():
     assert free.names == ["['rate'][0]", "['top']"]
 
 
+@pytest.mark.slow
 def test_covariance_is_the_scatter_of_repeated_fits():
     rng = np.random.default_rng(1)
     noise = 0.05 * rng.normal(size=(200, 40)).astype(np.float32)

@@ -123,6 +123,7 @@ def test_leaping_does_not_show(method):
     check()
 
 
+@pytest.mark.slow
 @settings(**EVERY)
 @given(kind=KINDS, seed=SEEDS, step=st.floats(0.01, 0.3))
 def test_leaping_does_not_show_in_parallel_views_of_floats(kind, seed, step):
@@ -384,14 +385,9 @@ def test_bad_arguments_are_named(arguments, message):
 # ---- other spaces, other transfer functions ----
 
 
-@pytest.mark.parametrize(
-    ("method", "transforms"),
-    [
-        pytest.param(method, name, marks=() if (method, name) == ("hierarchy", "plain") else pytest.mark.slow)
-        for name in ("plain", "moving")
-        for method in METHODS
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("transforms", ["plain", "moving"])
+@pytest.mark.parametrize("method", METHODS)
 def test_leaping_does_not_show_under_a_toroidal_map(method, transforms):
     transforms, seen = SETS[transforms], 0
     for name in ("spheres", "shells"):
@@ -561,6 +557,7 @@ def test_forward_gradients_do_not_see_the_leaps(method):
 # ---- long marches ----
 
 
+@pytest.mark.slow
 def test_ten_thousand_samples_in_float32_lose_nothing_that_is_seen():
     haze, thin = scaled_phantom("constant"), scaled_phantom("sphere")
     rng = np.random.default_rng(0)

@@ -697,6 +697,7 @@ def baked_scene():
     return volume, points, {"given": few(), "reach": (2.0,)}
 
 
+@pytest.mark.slow
 def test_baked_light_comes_closer_to_the_blended_one_as_its_grid_gets_finer():
     volume, points, how = baked_scene()
     blended = ScattererTemplates(FLESH, DAY, reach=(2.0,), given=as_one(few()))

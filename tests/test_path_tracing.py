@@ -321,6 +321,7 @@ def test_lights_add_up():
     np.testing.assert_array_equal(each[0].opacity, each[1].opacity)  # the camera's rays are the same
 
 
+@pytest.mark.slow
 def test_more_paths_are_those_of_all_at_once_however_many_go_on_side_by_side():
     volume, camera, lights = anisotropic_noise(), inside(anisotropic_noise()), lit(SUN, LAMP, SKY)
     some = trace(volume, spiky(), camera, lights, key=3)

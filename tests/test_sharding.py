@@ -76,7 +76,8 @@ def sharded(scene, tmp_path_factory):
         weights=weights,
     )
     (folder / "sharded.py").write_text(SHARDED)
-    devices = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    devices = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     subprocess.run(
         [sys.executable, folder / "sharded.py", folder / "given.npz", folder / "seen.npz"],
         env={**os.environ, **devices, "PYTHONPATH": ":".join(sys.path)},

@@ -421,6 +421,7 @@ def seen_past_the_sphere(volume, impact, extinction, step):
     return np.asarray(jv.render_rays(volume, transfer, *rays_past_the_sphere(impact), march).rgba[..., 3])
 
 
+@pytest.mark.slow
 def test_a_sphere_acquired_by_a_probe_renders_as_a_sphere():
     """At the silhouette a ramp of width h adds a chord of about sqrt(R h), over a ring of width h: so the
     largest error falls with h^½, and the root mean square with h."""
@@ -486,13 +487,9 @@ def reference_image(volume, transfer, camera, march):
     return jax.vmap(jax.vmap(one))(*camera.rays(), column, row)
 
 
-@pytest.mark.parametrize(
-    ("names", "quadrature"),
-    [
-        pytest.param(*case, marks=[] if case == ("jittered", "left") else pytest.mark.slow)
-        for case in itertools.product(COMBINED, ("left", "midpoint"))
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("names", COMBINED)
 def test_it_composes_with_other_transforms(names, quadrature):
     probe = probe_of("across the middle")
     volume, transfer, camera = noise_volume(), ramp_transfer(), view(probe)

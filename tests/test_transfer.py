@@ -336,10 +336,14 @@ def test_a_transfer_function_of_ones_own_pulls_as_its_look_up_says():
     for n in (4, 40):
         function = Gained(np.linspace(0, 1, n), np.full((n, 3), 0.5), np.linspace(1, 3, n))
         value = jnp.asarray([0.1, 0.45, 0.8])
-        search = function.search()
-        measured = (value,) if search is None else (value, *search((value,)))
-        ones = jnp.ones(3)
-        pulled, (of_value, *_) = function.pull(measured, (0 * ones,) * 3, ones)
+
+        @jax.jit
+        def pull(function, value):
+            search, ones = function.search(), jnp.ones(3)
+            measured = (value,) if search is None else (value, *search((value,)))
+            return function.pull(measured, (0 * ones,) * 3, ones)
+
+        pulled, (of_value, *_) = pull(function, value)
         np.testing.assert_allclose(pulled.gain, np.sum(1 + 2 * value), rtol=1e-5)
         np.testing.assert_allclose(jnp.sum(pulled.extinction), 2 * 3, rtol=1e-5)
         np.testing.assert_allclose(of_value, 2 * 2, rtol=1e-4)

@@ -121,8 +121,9 @@ def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
         assert slow["blue"] <= slow["white"] / 5, seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "bound"), [(0.125, 1 / 5), (0.5, 1 / 2.5)])
-@pytest.mark.parametrize("name", ["jitter", pytest.param("empty space", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["jitter", "empty space"])
 def test_blue_jitter_leaves_less_slow_error_where_the_rings_are_wide(name, scale, bound):
     """The error is a function of ξ + φ, where φ runs through 0 … 1 once per ring. That moves the spectrum
     of the noise by the comb's frequency, and rings that are narrow (0.5: 11 pixels) move fast noise to
@@ -185,16 +186,8 @@ def engine_scene(real_volume):
     return volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=SIZE).zoom(2), 2.0
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        engine_scene,
-        *(
-            pytest.param(make, marks=pytest.mark.slow)
-            for make in (sphere_scene, head_scene, skin_scene, airway_scene)
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [engine_scene, sphere_scene, head_scene, skin_scene, airway_scene])
 def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
     scene = make(real_volume)
     reference = converged(scene, 8)
