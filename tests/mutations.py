@@ -350,6 +350,44 @@ MUTATIONS = [
         ("test_transfer.py::test_a_transfer_function_of_ones_own_pulls_as_its_look_up_says",),
     ),
     Mutation(
+        "light: what lies behind a photon does not hide it",
+        "lighting/scatterers.py",
+        "seen = intensity * self._visible(around, sample, offset, place.extinction)",
+        "seen = intensity",
+        ("test_lighting.py::test_step_2_a_wall_behind_a_photon_hides_it_within_reach[soft]",),
+    ),
+    Mutation(
+        "light: photons on the far side from a light are lit",
+        "lighting/scatterers.py",
+        "near = closer - length**2 / (2 * distance)",
+        "near = -closer - length**2 / (2 * distance)",
+        ("test_lighting.py::test_step_1_photons_toward_the_sun_are_lit[soft]",),
+    ),
+    Mutation(
+        "light: of templates, brighter by what a material absorbs",
+        "lighting/scatterers.py",
+        "scale = matter * WHITE * notes.optics.reflectance",
+        "scale = matter * WHITE",
+        ("test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
+    ),
+    Mutation(
+        "path tracing: a block's majorant without the points within its range",
+        "lighting/majorants.py",
+        "return jnp.maximum(ends, inside) + ROUNDING * extinction.max()",
+        "return ends + ROUNDING * extinction.max()",
+        ("test_tracking.py::test_no_extinction_exceeds_its_majorant",),
+    ),
+    Mutation(
+        "path tracing: a material absorbs nothing",
+        "lighting/medium.py",
+        "kept = jnp.where(here, 1 - material.opacity, kept)",
+        "kept = jnp.where(here, 1, kept)",
+        (
+            "test_path_tracing.py::test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_"
+            "its_opacity",
+        ),
+    ),
+    Mutation(
         "light: what was baked inside a program is kept as its tracers",
         "lighting/scatterers.py",
         "with jax.ensure_compile_time_eval():  #",
