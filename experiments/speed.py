@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.compiled import OPTIONS
+from jaxvol._util.xla import OPTIONS
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks, Sums
 

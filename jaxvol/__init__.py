@@ -6,7 +6,6 @@ back into a `Rendering`.
 """
 
 from . import lighting as lighting, metrics as metrics
-from .alignment import AlphaCorrection as AlphaCorrection
 from .camera import Camera as Camera
 from .display import (
     from_srgb as from_srgb,
@@ -14,7 +13,6 @@ from .display import (
     save_png as save_png,
     to_srgb as to_srgb,
 )
-from .engine import render as render, render_rays as render_rays
 from .fitting import (
     Fit as Fit,
     Fixed as Fixed,
@@ -30,16 +28,13 @@ from .fitting import (
     write_transfer as write_transfer,
 )
 from .formats import load as load
-from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .labels import LabelTransferFunction as LabelTransferFunction
-from .leaping import SpaceLeaping as SpaceLeaping
 from .lighting import (
     Material as Material,
-    PathTraced as PathTraced,
-    path_trace as path_trace,
     scatterer_template as scatterer_template,
 )
 from .march import March as March, Transform as Transform
+from .path_tracing import PathTraced as PathTraced, path_trace as path_trace
 from .phantoms import (
     colon_path as colon_path,
     phantom as phantom,
@@ -47,8 +42,15 @@ from .phantoms import (
 )
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
+from .render import render as render, render_rays as render_rays
 from .rendering import Picture as Picture, Rendering as Rendering
-from .termination import EarlyTermination as EarlyTermination
-from .toroidal import ToroidalMap as ToroidalMap
 from .transfer import TransferFunction as TransferFunction
+from .transforms import (
+    AlphaCorrection as AlphaCorrection,
+    EarlyTermination as EarlyTermination,
+    EmptySpaceJitter as EmptySpaceJitter,
+    Jitter as Jitter,
+    SpaceLeaping as SpaceLeaping,
+    ToroidalMap as ToroidalMap,
+)
 from .volume import Volume as Volume

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .locate import Ray
+from ._util.sharding import varying
+from ._util.vec3 import Scalar, Triple, along
 from .occupancy import Index, Occupancy, Sums
-from .sharding import varying
-from .triple import Scalar, Triple, along
+from .space import Ray
 
 
 STRETCHES = 128

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from .checks import Arrayable, described, finite_array, integer, number, require
-from .triple import Triple, along, apart
+from ._util.checks import Arrayable, described, finite_array, integer, number, require
+from ._util.vec3 import Triple, along, apart
 from .volume import Volume
 
 

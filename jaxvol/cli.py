@@ -13,19 +13,19 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from .alignment import AlphaCorrection
+from ._util.checks import output_file
 from .camera import Camera
-from .checks import output_file
 from .display import image_file, save_image
-from .engine import render
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
-from .leaping import SpaceLeaping
 from .march import March
 from .phantoms import phantom
 from .presets import PRESETS, colormap, preset
-from .termination import EarlyTermination
+from .render import render
 from .transfer import TransferFunction
+from .transforms.alpha_correction import AlphaCorrection
+from .transforms.early_termination import EarlyTermination
+from .transforms.space_leaping import SpaceLeaping
 from .unseen import why_unseen
 from .volume import Volume
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import Arrayable, described, output_file
+from ._util.checks import Arrayable, described, output_file
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:

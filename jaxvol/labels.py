@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .checks import described, integer
+from ._util.checks import described, integer
+from ._util.vec3 import Scalar, Triple
 from .occupancy import Blocks
 from .transfer import (
     Classify,
@@ -20,7 +21,6 @@ from .transfer import (
     row_of,
     seen_between,
 )
-from .triple import Scalar, Triple
 from .volume import Volume
 
 

@@ -22,11 +22,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._util.checks import described, integer, number
+from ._util.vec3 import Scalar, Triple
 from .beams import Box
-from .checks import described, integer, number
-from .locate import Affine, Ray, Space
 from .occupancy import Occupancy
-from .triple import Scalar, Triple
+from .space import Affine, Ray, Space
 from .volume import Volume
 
 

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
-from .kept import kept
-from .sharding import varying
-from .triple import Triple
+from ._util.memo import kept
+from ._util.sharding import varying
+from ._util.vec3 import Triple
 from .volume import Volume
 
 

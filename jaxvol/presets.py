@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import Arrayable, described, finite_array, integer, unit_interval
+from ._util.checks import Arrayable, described, finite_array, integer, unit_interval
 from .display import from_srgb
 from .transfer import TransferFunction, extinction_of
 

@@ -18,18 +18,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .arguments import check_scene
-from .checks import Arrayable, all_finite, finite_array, is_traced
+from ._util.checks import Arrayable, all_finite, finite_array, is_traced
+from ._util.sharding import varying
+from ._util.vec3 import Scalar, Triple, along, apart
 from .lighting.deferred import Deferred, Line, lit_once
-from .lighting.seam import Lighting, Sample, classification
-from .locate import Ray, enter, invalid
+from .lighting.shading import Lighting, Sample, classification
 from .march import Cell, March
 from .rendering import DepthPicture, Found, Picture, Rendering
-from .sharding import varying
-from .taps import without_voxels
+from .scene import check_scene
+from .space import Ray, enter, invalid
 from .transfer import Classification, Measured, Transfer
-from .triple import Scalar, Triple, along, apart
-from .volume import Volume
+from .volume import Volume, without_voxels
 
 
 class Progress(eqx.Module):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .checks import finite, is_traced
+from ._util.checks import finite, is_traced
 
 
 Outputs: TypeAlias = Literal["all", "rgba"]

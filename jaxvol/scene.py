@@ -1,61 +1,55 @@
-"""What is rendered, and what is known of it before any ray is marched?"""
+"""Are these a volume, a transfer function, a camera and a march? What renders asks before all else."""
 
-from typing import TypeAlias
+from types import NoneType
+from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Int, UInt32
-
+from ._util.checks import described
 from .camera import Camera
-from .leaping import FirstHit
-from .lighting.seam import Lighting
-from .march import March, Survey, View
-from .occupancy import Blocks
-from .packed import words_of
-from .reference import end
-from .rendering import Rendering
+from .lighting.shading import Lighting
+from .march import March
 from .transfer import Transfer
 from .volume import Volume
-from .wavefront import Beams, march_beams
-from .waves import OwnRays, Waves, each_ray, lines
 
 
-Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
+WANTED: dict[str, tuple[tuple[type, ...], str, str]] = {
+    "volume": (
+        (Volume,),
+        "a jaxvol Volume",
+        "Pass jv.Volume(data, spacing=...) for an array, jv.load(path) for a file, or jv.phantom(name).",
+    ),
+    "transfer": (
+        (Transfer,),
+        "a transfer function",
+        "Pass jv.preset(name), jv.colormap(cmap, clim) or jv.TransferFunction.from_points(points).",
+    ),
+    "camera": (
+        (Camera,),
+        "a jaxvol Camera",
+        "Pass jv.Camera.looking_at(volume) or jv.Camera(position, focal_point).",
+    ),
+    "march": ((March,), "a jaxvol March", "Pass jv.March(step) or jv.March(step, transforms)."),
+    "lighting": (
+        (Lighting, NoneType),
+        "None or a Lighting, such as ScattererTemplates",
+        "Pass lights as jv.lighting.ScattererTemplates(materials, lights).",
+    ),
+}
+"""By the argument's name: what it may be, that in words, and how one is made."""
 
 
-class Known(eqx.Module):
-    """What was found out about a volume before, and is found out anew for other voxels."""
+def check_scene(call: str, **arguments: Any) -> None:
+    """Refuse arguments that are something else than their names say.
 
-    words: UInt32[Array, " voxels"] | None
-    blocks: Blocks | None
+    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`: told
+    where arguments have changed places.
 
-    @classmethod
-    def of(cls, volume: Volume, march: March) -> "Known":
-        return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
-
-
-def survey_of(scene: Scene, known: Known) -> Survey | None:
-    """What is known of empty space. Nothing of it has a gradient."""
-    volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
-    if known.blocks is None:
-        return None
-    space = march.locate(volume)
-    occupancy = space.occupancy(transfer.visible(known.blocks) | known.blocks.unordered)
-    if isinstance(source, OwnRays):
-        return march.survey(occupancy, None)
-
-    def first_hit(survey: Survey, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
-        first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
-        through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
-        ends = (jnp.stack(end, axis=-1) for end in (through.origin, through.direction))
-        own, none = OwnRays(*ends), jnp.zeros((), jnp.int32)
-        waves = Waves.of(own, columns.size)
-        rays = waves.rays(own, space, none)
-        beams = Beams(rays, waves.beams, waves.box(own, rays, none))
-        at, _ = march_beams(first, volume, transfer.over(volume), survey, beams)
-        seen = each_ray(end)(rays, at)
-        assert isinstance(seen, Rendering)
-        return waves.assemble(seen.depth[None]).reshape(columns.shape)
-
-    return march.survey(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))
+    **Raises:** `ValueError` naming the first such argument, what came, and what to pass.
+    """
+    for name, value in arguments.items():
+        kinds, wanted, remedy = WANTED[name]
+        if isinstance(value, kinds):
+            continue
+        elsewhere = [n for n, (other, *_) in WANTED.items() if value is not None and isinstance(value, other)]
+        if elsewhere:
+            remedy = f"That is the {elsewhere[0]}: the order is {call}."
+        raise ValueError(f"{name} must be {wanted}; got {described(value)}. {remedy}")

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .checks import Arrayable, finite_array, number, require, unit_interval
+from ._util.checks import Arrayable, finite_array, number, require, unit_interval
+from ._util.vec3 import Scalar, Triple
 from .occupancy import Blocks
-from .triple import Scalar, Triple
 from .volume import Volume
 
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ._util.vec3 import apart
 from .camera import Camera
-from .locate import Affine, Ray, enter
 from .rendering import Picture
+from .space import Affine, Ray, enter
 from .transfer import Transfer, TransferFunction
-from .triple import apart
 from .volume import Volume
 
 

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
-from .checks import Arrayable, described, finite, finite_array, is_traced, require
-from .triple import Scalar, Triple
+from ._util.checks import Arrayable, described, finite, finite_array, is_traced, require
+from ._util.vec3 import Scalar, Triple
 
 
 DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
@@ -299,3 +299,13 @@ def _fetch(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Arr
 def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
     # a + f (b - a) would round differently at f = 1; this form gives a and b exactly at the ends
     return a * (1 - fraction) + b * fraction
+
+
+def without_voxels(volume: Volume) -> Volume:
+    """A volume but for its voxels, of which there are too many to be handed around."""
+    return eqx.tree_at(lambda v: v.data, volume, None)
+
+
+def with_voxels(volume: Volume, data: Array) -> Volume:
+    """The volume with these voxels."""
+    return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)

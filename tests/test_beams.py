@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol._util.vec3 import apart
 from jaxvol.beams import Box, stretches
 from jaxvol.occupancy import Occupancy
-from jaxvol.triple import apart
 
 
 VOLUME = jv.Volume(np.zeros((33, 41, 29), np.uint8), (0.1, 0.07, 0.12), (-1.0, 0.3, 2.0))

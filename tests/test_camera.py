@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.waves import lines
+from jaxvol.engine.tiles import lines
 
 
 POSITION, FOCUS = (3.0, -4.0, 2.0), (0.5, 1.0, 0.0)

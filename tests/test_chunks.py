@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.chunks import CHUNK, Chosen
+from jaxvol._util.compaction import CHUNK, Chosen
 
 
 @pytest.mark.parametrize(

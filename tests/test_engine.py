@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol import engine, waves
+from jaxvol import render as engine
+from jaxvol.engine import tiles as waves
 
 from .scenes import anisotropic_noise, around, counting, soft_transfer
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.special import erf
 
 import jaxvol as jv
-from jaxvol.locate import Affine, enter
-from jaxvol.triple import apart
+from jaxvol._util.vec3 import apart
+from jaxvol.space import Affine, enter
 
 from . import oracle
 from .scenes import (

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
-from jaxvol import packed, wavefront, waves
+from jaxvol._util.vec3 import apart
+from jaxvol.engine import packing as packed, tiles as waves, wavefront
 from jaxvol.phantoms import toroidal_phantom
-from jaxvol.triple import apart
 
 from .scenes import CAMERAS, around, counting, doubled, in_float64, inside, orthographic, scaled_phantom
 

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol import reference, visible
+from jaxvol import reference
+from jaxvol._util.vec3 import apart
+from jaxvol.engine import shading as visible
 from jaxvol.lighting import (
     ConstantLight,
     Deferred,
@@ -20,14 +22,13 @@ from jaxvol.lighting import (
     PointLight,
     ScattererTemplate,
     ScattererTemplates,
-    scatterers,
-    seam,
+    scatterer_templates as scatterers,
+    shading as seam,
 )
 from jaxvol.lighting.baked import BakedLighting
 from jaxvol.lighting.deferred import Line, lit_picture
-from jaxvol.lighting.seam import Sample, Shading, Surroundings, lit
-from jaxvol.locate import Affine
-from jaxvol.triple import apart
+from jaxvol.lighting.shading import Sample, Shading, Surroundings, lit
+from jaxvol.space import Affine
 
 from .half_space import chandrasekhar, reflected, under_sky
 from .scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer

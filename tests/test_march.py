@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.locate import Affine
 from jaxvol.march import Cell
+from jaxvol.space import Affine
 
 from .scenes import around, scaled_phantom, soft_transfer, uniform_transfer
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.ndimage import distance_transform_cdt, map_coordinates
 
 import jaxvol as jv
-from jaxvol.kept import kept
+from jaxvol._util.memo import kept
 from jaxvol.occupancy import BLOCK, Blocks, Occupancy, Sums
 from jaxvol.transfer import seen_between
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.lighting.phase import phase, scattered, scattered_cosine, turned
+from jaxvol.path_tracing.phase import phase, scattered, scattered_cosine, turned
 
 
 ANISOTROPIES = [-0.95, -0.5, -1e-4, 0.0, 1e-6, 0.3, 0.9, 0.99]

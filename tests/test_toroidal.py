@@ -10,9 +10,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
-from jaxvol.locate import enter, world_gradient
+from jaxvol._util.vec3 import apart
 from jaxvol.phantoms import toroidal_phantom
-from jaxvol.triple import apart
+from jaxvol.space import enter, world_gradient
 
 from .scenes import in_float64, uniform_transfer
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol._util.noise import hashed_uniforms_4
+from jaxvol._util.vec3 import apart
 from jaxvol.lighting import Material
-from jaxvol.lighting.majorants import Majorants, greatest_between
-from jaxvol.lighting.medium import Medium
-from jaxvol.lighting.tracking import Flight, fly
-from jaxvol.noise import hashed_uniforms_4
 from jaxvol.occupancy import Blocks
-from jaxvol.triple import apart
+from jaxvol.path_tracing.majorants import Majorants, greatest_between
+from jaxvol.path_tracing.medium import Medium
+from jaxvol.path_tracing.tracking import Flight, fly
 
 from .scenes import anisotropic_noise
 

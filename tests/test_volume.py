@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
-from jaxvol.triple import apart
+from jaxvol._util.vec3 import apart
 
 
 DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32"]

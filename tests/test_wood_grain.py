@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.jitter import Noise
 from jaxvol.metrics import (
     boundary_noise,
     comb_frequency,
@@ -16,6 +15,7 @@ from jaxvol.metrics import (
     rmse,
     wood_grain_energy,
 )
+from jaxvol.transforms.jitter import Noise
 
 
 JITTERS = {"jitter": jv.Jitter, "empty space": jv.EmptySpaceJitter}

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._util.checks import Arrayable, finite_array, number, require
 from ..camera import Camera
-from ..checks import Arrayable, finite_array, number, require
 
 
 MARGIN = 1e-3

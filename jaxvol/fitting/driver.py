@@ -18,7 +18,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from ..checks import integer, output_file
+from .._util.checks import integer, output_file
 from . import checkpoints
 from .constraints import Free, Where
 from .damping import LevenbergMarquardt

@@ -22,11 +22,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._util.checks import Arrayable, described, finite, finite_array
 from ..camera import Camera
-from ..checks import Arrayable, described, finite, finite_array
-from ..engine import Adjoint, render
-from ..lighting.seam import Lighting
+from ..lighting.shading import Lighting
 from ..march import March
+from ..render import Adjoint, render
 from ..transfer import Transfer
 from ..volume import Volume
 from .constraints import Free, size

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import Arrayable, finite_array, integer, require
+from .._util.checks import Arrayable, finite_array, integer, require
 from ..transfer import TransferFunction
 from ..volume import Volume
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from ..checks import Arrayable
+from .._util.checks import Arrayable
 from ..volume import Volume
 from .files import Header
 from .medical import read_medical

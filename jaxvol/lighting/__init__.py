@@ -8,10 +8,8 @@ from .lights import (
     PointLight as PointLight,
 )
 from .materials import Material as Material, material as material
-from .path_traced import PathTraced as PathTraced
-from .path_tracing import path_trace as path_trace
-from .scatterers import ScattererTemplates as ScattererTemplates
-from .seam import Lighting as Lighting
+from .scatterer_templates import ScattererTemplates as ScattererTemplates
+from .shading import Lighting as Lighting
 from .template import (
     ScattererTemplate as ScattererTemplate,
     scatterer_template as scatterer_template,

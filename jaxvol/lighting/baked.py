@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from ..chunks import Chosen
-from ..triple import Triple
+from .._util.compaction import Chosen
+from .._util.memory import require_room
+from .._util.vec3 import Triple
 from ..volume import Volume, split
-from .memory import require_room
-from .seam import Lighting, Sample, Shading, Surroundings, lit
+from .shading import Lighting, Sample, Shading, Surroundings, lit
 
 
 LEVELS = 2**10 - 1

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..chunks import CHUNK, in_front
-from ..locate import Space
+from .._util.compaction import CHUNK, in_front
+from .._util.vec3 import Scalar, Triple, along
 from ..march import March
+from ..space import Space
 from ..transfer import Classification, Transfer
-from ..triple import Scalar, Triple, along
 from ..volume import Volume
-from .seam import Lighting, Sample, Shading, Surroundings
+from .shading import Lighting, Sample, Shading, Surroundings
 
 
 class Deferred(Lighting):

@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks import Arrayable, finite_array, require
-from ..triple import Scalar, Triple, apart
+from .._util.checks import Arrayable, finite_array, require
+from .._util.vec3 import Scalar, Triple, apart
 
 
 class Arriving(NamedTuple):

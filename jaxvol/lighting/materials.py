@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks import Arrayable, finite_array, integer, number, require, unit_interval
-from ..triple import Scalar, Triple
+from .._util.checks import Arrayable, finite_array, integer, number, require, unit_interval
+from .._util.vec3 import Scalar, Triple
 from ..volume import Volume
 
 

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ..checks import integer, is_traced, number
+from .._util.checks import integer, is_traced, number
+from .._util.memory import require_room
+from .._util.vec3 import Scalar
 from ..formats.npy import read_arrays
-from ..triple import Scalar
 from .materials import Material, Optics, materials_of, smoothstep
-from .memory import require_room
 
 
 Energy = Literal["conserving", "printed"]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import integer
+from .._util.checks import integer
 from ..volume import Volume
 from . import colon, engine, formulas, frog, head, vessels
 from .colon import colon_path as colon_path

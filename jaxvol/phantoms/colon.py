@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..checks import integer
+from .._util.checks import integer
 from .canvas import FAR, Canvas
 from .shapes import ball, box, capsule, lengths, to_segment
 from .waves import Waves

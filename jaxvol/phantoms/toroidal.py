@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..checks import integer
-from ..toroidal import ToroidalMap
+from .._util.checks import integer
+from ..transforms.toroidal_map import ToroidalMap
 from ..volume import Volume
 from .canvas import SLAB, _smaller
 from .shapes import Block, Shape, ball, capsule, ellipsoid, tube

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
-from ..compiled import in_memory
-from ..noise import hashed_uniforms_4
-from ..triple import Scalar, Triple, apart
+from .._util.noise import hashed_uniforms_4
+from .._util.vec3 import Scalar, Triple, apart
+from .._util.xla import in_memory
+from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
 from ..volume import Volume
-from .lights import Arriving, ConstantLight, Light, LocatedLight
 from .majorants import Majorants
 from .medium import Medium
 from .phase import phase, scattered, turned

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from .checks import described, integer, is_traced
-from .triple import Triple
+from .vec3 import Triple
 
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:

@@ -14,25 +14,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .arguments import check_scene
-from .backward import pulled
+from ._util.checks import Arrayable, finite_array, is_traced, require
+from ._util.sharding import shard_number, varying
+from ._util.xla import compiled, forward_only, recomputed, transformations
 from .camera import Camera
-from .checks import Arrayable, finite_array, is_traced, require
-from .compiled import compiled, forward_only, recomputed, transformations
+from .engine.acceleration import Known, Scene, survey_of
+from .engine.gradients import pulled
+from .engine.packing import with_words
+from .engine.replay import Watch
+from .engine.tiles import OwnRays, Waves, each_ray, line
+from .engine.wavefront import Beams, Span, march_beams
 from .lighting.deferred import Deferred, lit_picture
-from .lighting.seam import Lighting, classification
-from .locate import invalid
+from .lighting.shading import Lighting, classification
 from .march import March
-from .packed import with_words
 from .reference import begin, end, has_fault, samples_across, step
 from .rendering import Found, Outputs, Picture, Rendering
-from .replay import Watch
-from .scene import Known, Scene, survey_of
-from .sharding import shard_number, varying
+from .scene import check_scene
+from .space import invalid
 from .transfer import Transfer
 from .volume import Volume
-from .wavefront import Beams, Span, march_beams
-from .waves import OwnRays, Waves, each_ray, line
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]

@@ -11,11 +11,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from .locate import Ray
-from .march import Cell, Transform
-from .noise import blue_tile, hashed_uniforms, seed_word
-from .triple import Scalar
-from .volume import Volume
+from .._util.noise import blue_tile, hashed_uniforms, seed_word
+from .._util.vec3 import Scalar
+from ..march import Cell, Transform
+from ..space import Ray
+from ..volume import Volume
 
 
 Pattern = Literal["white", "blue"]

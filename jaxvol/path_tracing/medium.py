@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from .._util.vec3 import Scalar, Triple
+from ..lighting.materials import Material, shares
 from ..transfer import Measured, Transfer
-from ..triple import Scalar, Triple
 from ..volume import Volume
-from .materials import Material, shares
 
 
 class Medium(NamedTuple):

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from ..compiled import in_memory
-from ..locate import Space
+from .._util.vec3 import Scalar, Triple
+from .._util.xla import in_memory
 from ..march import March
+from ..space import Space
 from ..transfer import Classification, Measured, Transfer
-from ..triple import Scalar, Triple
 from ..volume import Volume
 
 

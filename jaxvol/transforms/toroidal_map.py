@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .checks import Arrayable, finite_array, number, require
-from .locate import Path, Space, slab_interval
-from .march import Transform
-from .occupancy import BLOCK, Occupancy, Sums
-from .triple import Scalar, Triple, along, apart
-from .volume import Volume
+from .._util.checks import Arrayable, finite_array, number, require
+from .._util.vec3 import Scalar, Triple, along, apart
+from ..march import Transform
+from ..occupancy import BLOCK, Occupancy, Sums
+from ..space import Path, Space, slab_interval
+from ..volume import Volume
 
 
 STEPS = 64

@@ -11,19 +11,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .lighting.seam import Surroundings
-from .locate import Ray, invalid
-from .packed import with_words
-from .reference import has_fault
-from .relight import Lit
-from .rendering import DepthPicture, Picture
+from .._util.sharding import varying
+from .._util.trees import added, floats
+from ..lighting.shading import Surroundings
+from ..reference import has_fault
+from ..rendering import DepthPicture, Picture
+from ..space import Ray, invalid
+from ..volume import Volume, with_voxels, without_voxels
+from .acceleration import Known, Scene, survey_of
+from .packing import with_words
 from .replay import Cotangents, Replay, Total
-from .scene import Known, Scene, survey_of
-from .sharding import varying
-from .taps import added, floats, with_voxels, without_voxels
-from .volume import Volume
+from .shading_gradient import Lit
+from .tiles import Waves
 from .wavefront import Beams, Span, march_beams
-from .waves import Waves
 
 
 def pulled(

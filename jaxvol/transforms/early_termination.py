@@ -4,9 +4,9 @@ from typing import Any
 
 from jaxtyping import Array, Bool, Float
 
-from .checks import number
-from .march import Transform
-from .triple import Scalar
+from .._util.checks import number
+from .._util.vec3 import Scalar
+from ..march import Transform
 
 
 class EarlyTermination(Transform):

@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from .lighting.seam import Shading, Surroundings, lit
-from .locate import Ray
-from .march import March
-from .taps import Tapped, added, floats, scattered
-from .transfer import Classification
-from .triple import Scalar, Triple
-from .visible import Weighed, samples_of, visible
+from .._util.trees import added, floats
+from .._util.vec3 import Scalar, Triple
+from ..lighting.shading import Shading, Surroundings, lit
+from ..march import March
+from ..space import Ray
+from ..transfer import Classification
+from .shading import Weighed, samples_of, visible
+from .voxel_gradient import Tapped, scattered
 from .wavefront import Samples
 
 

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._util.vec3 import Scalar, Triple
 from ..labels import LabelTransferFunction
-from ..locate import Affine
+from ..lighting.materials import Material
 from ..occupancy import BLOCK, Blocks
+from ..space import Affine
 from ..transfer import Transfer, TransferFunction, points_below
-from ..triple import Scalar, Triple
 from ..volume import Volume
-from .materials import Material
 
 
 ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)

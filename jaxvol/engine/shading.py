@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .chunks import Chosen
-from .lighting.seam import Sample
-from .locate import Ray
-from .march import Cell, March
-from .reference import Progress
-from .transfer import Classification, Measured
-from .triple import Scalar, Triple, along
+from .._util.compaction import Chosen
+from .._util.vec3 import Scalar, Triple, along
+from ..lighting.shading import Sample
+from ..march import Cell, March
+from ..reference import Progress
+from ..space import Ray
+from ..transfer import Classification, Measured
 
 
 class Weighed(NamedTuple):

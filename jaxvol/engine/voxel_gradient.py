@@ -8,10 +8,9 @@ from functools import cache
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
-from .volume import Volume
+from ..volume import Volume
 
 
 class Tapped(Volume):
@@ -49,26 +48,6 @@ class Tapped(Volume):
 @cache
 def _kind(kind: type[Volume]) -> type[Tapped]:
     return type(f"Tapped{kind.__name__}", (Tapped, kind), {})
-
-
-def floats(tree: PyTree) -> PyTree:
-    """What of it can have a gradient."""
-    return eqx.filter(tree, eqx.is_inexact_array)
-
-
-def without_voxels(volume: Volume) -> Volume:
-    """A volume but for its voxels, of which there are too many to be handed around."""
-    return eqx.tree_at(lambda v: v.data, volume, None)
-
-
-def with_voxels(volume: Volume, data: Array) -> Volume:
-    """The volume with these voxels."""
-    return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
-
-
-def added(a: PyTree, b: PyTree) -> PyTree:
-    """Leaf by leaf."""
-    return jax.tree.map(jnp.add, a, b)
 
 
 def scattered(

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from .._util.vec3 import Scalar, Triple, along
 from ..occupancy import BLOCK
-from ..triple import Scalar, Triple, along
 from .majorants import Block, Majorants
 
 

@@ -18,18 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..checks import integer, is_traced, number
-from ..kept import kept
+from .._util.checks import integer, is_traced, number
+from .._util.memo import kept
+from .._util.noise import hashed_uniforms
+from .._util.vec3 import Scalar, Triple, along
 from ..march import March, Transform
-from ..noise import hashed_uniforms
-from ..taps import without_voxels
 from ..transfer import Transfer
-from ..triple import Scalar, Triple, along
-from ..volume import Volume
+from ..volume import Volume, without_voxels
 from .baked import BakedLighting, bake, nodes_for
 from .lights import ConstantLight, Light, LocatedLight, lights_of
 from .materials import Material, Optics, materials_of, shares, smoothstep, step
-from .seam import Lighting, Sample, Shading, Surroundings
+from .shading import Lighting, Sample, Shading, Surroundings
 from .template import (
     Energy,
     ScattererTemplate,

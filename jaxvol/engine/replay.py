@@ -25,17 +25,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from .locate import Ray
-from .march import March
-from .packed import with_words
-from .reference import Progress, contained, front, pieces
-from .relight import LightTotal, Lit, Relit, relit
-from .rendering import DepthPicture, Picture
-from .taps import Tapped, added, floats, scattered, with_voxels, without_voxels
-from .transfer import Classification, Transfer
-from .triple import Scalar, Triple, along
-from .visible import Weighed, weighed
-from .volume import Volume
+from .._util.trees import added, floats
+from .._util.vec3 import Scalar, Triple, along
+from ..march import March
+from ..reference import Progress, contained, front, pieces
+from ..rendering import DepthPicture, Picture
+from ..space import Ray
+from ..transfer import Classification, Transfer
+from ..volume import Volume, with_voxels, without_voxels
+from .packing import with_words
+from .shading import Weighed, weighed
+from .shading_gradient import LightTotal, Lit, Relit, relit
+from .voxel_gradient import Tapped, scattered
 from .wavefront import CELLS, Follower, Samples, Span, over_cells
 
 

@@ -13,25 +13,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32
 
-from ..arguments import check_scene
+from .._util.checks import Arrayable, all_finite, described, integer, is_traced, number
+from .._util.memory import require_room
+from .._util.noise import hashed_uniforms_4, is_key
+from .._util.vec3 import Scalar
+from .._util.xla import compiled
 from ..camera import Camera
-from ..checks import Arrayable, all_finite, described, integer, is_traced, number
-from ..compiled import compiled
-from ..locate import Affine, enter
-from ..noise import hashed_uniforms_4, is_key
+from ..engine.packing import with_words, words_of
+from ..lighting.lights import Light, lights_of
+from ..lighting.materials import Material, materials_of
 from ..occupancy import Blocks
-from ..packed import with_words, words_of
-from ..taps import without_voxels
+from ..scene import check_scene
+from ..space import Affine, enter
 from ..transfer import Transfer
-from ..triple import Scalar
-from ..volume import Volume
-from .crowd import Brought, walk_all
-from .lights import Light, lights_of
+from ..volume import Volume, without_voxels
+from .lanes import Brought, walk_all
 from .majorants import Majorants
-from .materials import Material, materials_of
 from .medium import Medium
-from .memory import require_room
-from .path_traced import PathTraced
+from .result import PathTraced
 from .walks import Scene, Walk, Words, step
 
 

@@ -27,19 +27,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .beams import Box
-from .chunks import in_front
-from .compiled import in_memory
-from .locate import Ray
-from .march import Cell, March, Survey
-from .occupancy import Occupancy
-from .reference import Progress, begin, blend, counts, front, measure, move, opacity, pieces
-from .rendering import Found
-from .sharding import varying
-from .transfer import Classification, Measured
-from .triple import Scalar
-from .visible import lit_colors
-from .volume import Volume
+from .._util.compaction import in_front
+from .._util.sharding import varying
+from .._util.vec3 import Scalar
+from .._util.xla import in_memory
+from ..beams import Box
+from ..march import Cell, March, Survey
+from ..occupancy import Occupancy
+from ..reference import Progress, begin, blend, counts, front, measure, move, opacity, pieces
+from ..rendering import Found
+from ..space import Ray
+from ..transfer import Classification, Measured
+from ..volume import Volume
+from .shading import lit_colors
 
 
 CELLS = 8

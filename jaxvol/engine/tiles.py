@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .beams import Box
-from .camera import Camera
-from .checks import all_finite
-from .compiled import in_memory
-from .lighting.deferred import Line
-from .locate import Ray, Space, enter
-from .occupancy import Occupancy
-from .triple import Triple
+from .._util.checks import all_finite
+from .._util.vec3 import Triple
+from .._util.xla import in_memory
+from ..beams import Box
+from ..camera import Camera
+from ..lighting.deferred import Line
+from ..occupancy import Occupancy
+from ..space import Ray, Space, enter
 from .wavefront import GROUP
 
 

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from ..triple import Scalar, Triple
+from .._util.vec3 import Scalar, Triple
 
 
 def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Shaped, UInt32
 
-from .checks import is_traced
-from .kept import kept
-from .triple import Scalar, Triple
-from .volume import Cube, Volume, split
+from .._util.checks import is_traced
+from .._util.memo import kept
+from .._util.vec3 import Scalar, Triple
+from ..volume import Cube, Volume, split
 
 
 LIMIT = 2**30

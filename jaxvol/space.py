@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from ._util.vec3 import Scalar, Triple, along, apart
 from .occupancy import BLOCK, Occupancy
-from .triple import Scalar, Triple, along, apart
 from .volume import Volume
 
 

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from .beams import Box, Stretches, stretches
-from .checks import integer
-from .locate import Ray
-from .march import Survey, Transform, View
-from .occupancy import FARTHEST, Occupancy, Sums
-from .triple import Scalar, Triple
+from .._util.checks import integer
+from .._util.vec3 import Scalar, Triple
+from ..beams import Box, Stretches, stretches
+from ..march import Survey, Transform, View
+from ..occupancy import FARTHEST, Occupancy, Sums
+from ..space import Ray
 
 
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .locate import Ray
-from .march import Cell, Transform
-from .triple import Scalar
-from .volume import Volume
+from .._util.vec3 import Scalar
+from ..march import Cell, Transform
+from ..space import Ray
+from ..volume import Volume
 
 
 Region: TypeAlias = Callable[[Scalar], Int[Array, ""]]

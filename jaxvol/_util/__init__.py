@@ -1,0 +1,1 @@
+"""What any numerical package has: of no volume, and no image."""

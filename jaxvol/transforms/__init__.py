@@ -1,0 +1,7 @@
+"""One idea of one paper each: the transforms of a march."""
+
+from .alpha_correction import AlphaCorrection as AlphaCorrection
+from .early_termination import EarlyTermination as EarlyTermination
+from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
+from .space_leaping import SpaceLeaping as SpaceLeaping
+from .toroidal_map import ToroidalMap as ToroidalMap
