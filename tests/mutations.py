@@ -56,12 +56,12 @@ class Mutation(NamedTuple):
         return text.replace(self.old, self.new)
 
 
-LEAPT_GRADIENT = "test_gradient_matrix.py::test_replay_does_not_see_the_leaps[jittered-hierarchy-uint8]"
-FORWARD_GRADIENT = "test_gradient_matrix.py::test_forward_is_replay[jittered-hierarchy-uint8]"
-DIFFERENCES = "test_gradient_matrix.py::test_gradients_are_central_differences[moving-hierarchy-float64]"
-FAULTS = "test_faults.py::test_what_is_no_number_reaches_image_and_gradient[leaping]"
-IN_TURN = "test_vmap.py::test_over_one_part[cameras-uint8]"
-PACKED = "test_leaping.py::test_packed_voxels_are_the_same_values"
+LEAPT_GRADIENT = "engine/test_gradient_matrix.py::test_replay_does_not_see_the_leaps[jittered-hierarchy-uint8]"
+FORWARD_GRADIENT = "engine/test_gradient_matrix.py::test_forward_is_replay[jittered-hierarchy-uint8]"
+DIFFERENCES = "engine/test_gradient_matrix.py::test_gradients_are_central_differences[moving-hierarchy-float64]"
+FAULTS = "engine/test_faults.py::test_what_is_no_number_reaches_image_and_gradient[leaping]"
+IN_TURN = "engine/test_vmap.py::test_over_one_part[cameras-uint8]"
+PACKED = "transforms/test_space_leaping.py::test_packed_voxels_are_the_same_values"
 RENDERED = "test_agreement.py::test_the_renderer_is_the_independent_marcher"
 
 MUTATIONS = [
@@ -71,14 +71,14 @@ MUTATIONS = [
         "transforms/toroidal_map.py",
         "return half + _atan2(y, z), half + _atan2(x, off)",
         "return half - _atan2(y, z), half + _atan2(x, off)",
-        ("test_toroidal.py::test_map_and_inverse_agree_with_each_other_and_with_the_printed_formula",),
+        ("transforms/test_toroidal_map.py::test_map_and_inverse_agree_with_each_other_and_with_the_printed_formula",),
     ),
     Mutation(
         "locate: distances of a far camera counted from its base, not from its origin",
         "space.py",
         "ray = Ray(entry, direction, base + start, length,",
         "ray = Ray(entry, direction, start, length,",
-        ("test_rays.py::test_depth_is_the_mean_distance_of_what_is_seen",),
+        ("test_space.py::test_depth_is_the_mean_distance_of_what_is_seen",),
     ),
     Mutation(
         "camera: rays are rounded anew by every program that differentiates them",
@@ -92,7 +92,7 @@ MUTATIONS = [
         "reference.py",
         "offset=march.start(ray),",
         "offset=zero,",
-        ("test_jitter.py::test_jitter_starts_each_ray_a_part_of_a_step_in",),
+        ("transforms/test_jitter.py::test_jitter_starts_each_ray_a_part_of_a_step_in",),
     ),
     Mutation(
         "jitter: keyed by the place in a beam, not by the pixel",
@@ -106,42 +106,42 @@ MUTATIONS = [
         "engine/tiles.py",
         "return self.first + place, jnp.zeros_like(place)",
         "return place, jnp.zeros_like(place)",
-        ("test_sharding.py::test_image_and_gradient_are_those_of_one_device",),
+        ("engine/test_sharding.py::test_image_and_gradient_are_those_of_one_device",),
     ),
     Mutation(
         "leaping: start distances of a crop are looked up by the pixel of the whole image",
         "transforms/space_leaping.py",
         "jnp.minimum((pixel - first.astype(pixel.dtype)) // self.cell, n)",
         "jnp.minimum(pixel // self.cell, n)",
-        ("test_leaping.py::test_a_part_of_an_image_leaps_as_the_whole",),
+        ("transforms/test_space_leaping.py::test_a_part_of_an_image_leaps_as_the_whole",),
     ),
     Mutation(
         "packing: a volume that measures in its own way is packed",
         "engine/packing.py",
         "if type(volume) is not Volume:",
         "if False and type(volume) is not Volume:",
-        ("test_volume_kinds.py::test_a_volume_that_measures_in_its_own_way_keeps_it[uint8]",),
+        ("engine/test_volume_kinds.py::test_a_volume_that_measures_in_its_own_way_keeps_it[uint8]",),
     ),
     Mutation(
         "occupancy: of a volume that measures in its own way, taken from its voxels",
         "occupancy.py",
         "if type(volume) is not Volume:  #",
         "if False:  #",
-        ("test_volume_kinds.py::test_a_volume_that_measures_in_its_own_way_keeps_it[uint8]",),
+        ("engine/test_volume_kinds.py::test_a_volume_that_measures_in_its_own_way_keeps_it[uint8]",),
     ),
     Mutation(
         "replay: gradients of 16-bit voxels are summed in 16 bits",
         "engine/replay.py",
         "dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32",
         "dtype",
-        ("test_volume_kinds.py::test_gradients_of_voxels_in_16_bits_are_summed_in_32[float16]",),
+        ("engine/test_volume_kinds.py::test_gradients_of_voxels_in_16_bits_are_summed_in_32[float16]",),
     ),
     Mutation(
         "jitter: a crop has numbers of its own",
         "camera.py",
         "left, top = jnp.round(self.corner).astype(jnp.int32)",
         "left, top = jnp.zeros(2, jnp.int32)",
-        ("test_jitter.py::test_a_crop_is_jittered_as_its_part_of_the_image",),
+        ("transforms/test_jitter.py::test_a_crop_is_jittered_as_its_part_of_the_image",),
     ),
     # how they move on
     Mutation(
@@ -149,7 +149,7 @@ MUTATIONS = [
         "transforms/jitter.py",
         "jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)",
         "jnp.where(transparent, steps - 1 + memory, steps), memory",
-        ("test_jitter.py::test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample",),
+        ("transforms/test_jitter.py::test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample",),
     ),
     Mutation(
         "leap: one cell too far",
@@ -234,7 +234,7 @@ MUTATIONS = [
         "transforms/alpha_correction.py",
         "cell = Cell(cell.front, jnp.where(reaches_past, left, cell.width),",
         "cell = Cell(cell.front, cell.width,",
-        ("test_alignment.py::test_a_constant_volume_is_exact_under_jitter",),
+        ("transforms/test_alpha_correction.py::test_a_constant_volume_is_exact_under_jitter",),
     ),
     Mutation(
         "cut: the part behind a label's face dropped",
@@ -305,7 +305,7 @@ MUTATIONS = [
         "transfer.py",
         "at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))",
         "at_points = sums[:, :4]",
-        ("test_gradients.py::test_tables_pull_as_jax_does",),
+        ("engine/test_gradients.py::test_tables_pull_as_jax_does",),
     ),
     Mutation(
         "faults: a leaf that is NaN leaves the image black",
@@ -326,14 +326,14 @@ MUTATIONS = [
         "engine/gradients.py",
         "return invalid(waves.rays(source_, space, number), fault)",
         "return waves.rays(source_, space, number)",
-        ("test_faults.py::test_a_step_that_is_none_is_not_marched_in_the_gradient_either",),
+        ("engine/test_faults.py::test_a_step_that_is_none_is_not_marched_in_the_gradient_either",),
     ),
     Mutation(
         "faults: an image that is NaN has the derivative 0",
         "reference.py",
         "rgba = jnp.stack([*at.color, at.opacity]) * jnp.where(valid, 1, jnp.nan).astype(at.opacity.dtype)",
         "rgba = jnp.where(valid, jnp.stack([*at.color, at.opacity]), jnp.nan)",
-        ("test_faults.py::test_other_adjoints_have_no_number_either[direct]",),
+        ("engine/test_faults.py::test_other_adjoints_have_no_number_either[direct]",),
     ),
     Mutation(
         "transfer function: points taken for even whose deviations add up",
@@ -354,28 +354,28 @@ MUTATIONS = [
         "lighting/scatterer_templates.py",
         "seen = intensity * self._visible(around, sample, offset, place.extinction)",
         "seen = intensity",
-        ("test_lighting.py::test_step_2_a_wall_behind_a_photon_hides_it_within_reach[soft]",),
+        ("lighting/test_lighting.py::test_step_2_a_wall_behind_a_photon_hides_it_within_reach[soft]",),
     ),
     Mutation(
         "light: photons on the far side from a light are lit",
         "lighting/scatterer_templates.py",
         "near = closer - length**2 / (2 * distance)",
         "near = -closer - length**2 / (2 * distance)",
-        ("test_lighting.py::test_step_1_photons_toward_the_sun_are_lit[soft]",),
+        ("lighting/test_lighting.py::test_step_1_photons_toward_the_sun_are_lit[soft]",),
     ),
     Mutation(
         "light: of templates, brighter by what a material absorbs",
         "lighting/scatterer_templates.py",
         "scale = matter * WHITE * notes.optics.reflectance",
         "scale = matter * WHITE",
-        ("test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
+        ("lighting/test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
     ),
     Mutation(
         "path tracing: a block's majorant without the points within its range",
         "path_tracing/majorants.py",
         "return jnp.maximum(ends, inside) + ROUNDING * extinction.max()",
         "return ends + ROUNDING * extinction.max()",
-        ("test_tracking.py::test_no_extinction_exceeds_its_majorant",),
+        ("path_tracing/test_tracking.py::test_no_extinction_exceeds_its_majorant",),
     ),
     Mutation(
         "path tracing: a material absorbs nothing",
@@ -383,7 +383,7 @@ MUTATIONS = [
         "kept = jnp.where(here, 1 - material.opacity, kept)",
         "kept = jnp.where(here, 1, kept)",
         (
-            "test_path_tracing.py::test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_"
+            "path_tracing/test_path_trace.py::test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_"
             "its_opacity",
         ),
     ),
@@ -392,7 +392,7 @@ MUTATIONS = [
         "lighting/scatterer_templates.py",
         "with jax.ensure_compile_time_eval():  #",
         "if True:  #",
-        ("test_lighting.py::test_light_that_was_baked_inside_a_program_serves_outside",),
+        ("lighting/test_lighting.py::test_light_that_was_baked_inside_a_program_serves_outside",),
     ),
     # what a loss sees of it
     Mutation(

@@ -74,7 +74,7 @@ def test_a_constant_volume_is_exact_at_any_step_under_alpha_correction(step, ext
 
 @eqx.filter_jit
 def rounded_lengths(volume, camera):
-    """Length of each ray inside the volume, as float32 has it; `test_rays` checks it."""
+    """Length of each ray inside the volume, as float32 has it; `test_space` checks it."""
     space = Affine(volume)
     enter_all = jax.vmap(
         jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (jnp.int32(0), jnp.int32(0))).length)

@@ -14,9 +14,9 @@ from typing import Any, TypeAlias
 
 from .._util.checks import Arrayable
 from ..volume import Volume
-from .files import Header
+from .._util.files import Header
 from .medical import read_medical
-from .npy import read_npy, read_npz
+from .._util.npy import read_npy, read_npz
 from .raw import read_raw
 
 

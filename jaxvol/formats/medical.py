@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .files import MOST_VOXELS, Header, as_array, check_size, chunks, decoding, file_size
+from .._util.files import MOST_VOXELS, Header, as_array, check_size, chunks, decoding, file_size
 
 
 def read_medical(path: Path, header: Header) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, read_all
+from .._util.files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, read_all
 
 
 JSON_KEYS = {"size": "shape", "type": "dtype", "spacing": "spacing", "origin": "origin"}

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from .._util.checks import integer, is_traced, number
 from .._util.memory import require_room
 from .._util.vec3 import Scalar
-from ..formats.npy import read_arrays
+from .._util.npy import read_arrays
 from .materials import Material, Optics, materials_of, smoothstep
 
 

@@ -16,8 +16,8 @@ from scipy.ndimage import map_coordinates
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, Material, PointLight
 
-from .half_space import reflected, under_sky
-from .scenes import anisotropic_noise, around, in_float64, inside, soft_transfer, uniform_transfer
+from ..half_space import reflected, under_sky
+from ..scenes import anisotropic_noise, around, in_float64, inside, soft_transfer, uniform_transfer
 
 
 EXTINCTION = np.array([0.0, 0.0, 1.0, 4.0, 0.5, 0.0, 7.0, 7.0])

@@ -22,7 +22,7 @@ from jaxvol.fitting.constraints import Free
 from jaxvol.fitting.residuals import OwnResidual, Problem
 from jaxvol.metrics import psnr
 
-from .scenes import in_float64
+from ..scenes import in_float64
 
 
 SIZE = (24, 20)
@@ -536,7 +536,7 @@ def test_a_fit_that_is_killed_at_random_ends_with_the_same_bits(tmp_path):
             str(tmp_path / f"{name}.ckpt"),
             str(tmp_path / f"{name}.npy"),
         ]
-        root = str(Path(__file__).parent.parent)
+        root = str(Path(__file__).parent.parent.parent)
         return subprocess.Popen(
             command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": root}
         )

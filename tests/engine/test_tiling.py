@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol import render as engine
 from jaxvol.engine import tiles as waves
+from jaxvol.render import _How
 
-from .scenes import anisotropic_noise, around, counting, soft_transfer
+from ..scenes import anisotropic_noise, around, counting, soft_transfer
 
 
 MARCH = jv.March(0.07, (jv.AlphaCorrection(),))
@@ -168,7 +168,7 @@ def test_unknown_outputs_are_named():
 def test_an_unknown_adjoint_is_named():
     # not through render, whose annotation the checker of the tests enforces first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
-        engine._How.of("all", "reverse", anisotropic_noise(), MARCH)
+        _How.of("all", "reverse", anisotropic_noise(), MARCH)
 
 
 def test_direct_under_jit_asks_for_the_number_of_samples():

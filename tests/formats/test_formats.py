@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from jaxvol import formats
-from jaxvol.formats import files, load, register
+from jaxvol._util import files
+from jaxvol.formats import load, register
 
 
 SHAPE = (5, 4, 3)

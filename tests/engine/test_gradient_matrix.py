@@ -20,7 +20,7 @@ from hypothesis import given, settings, strategies as st
 import jaxvol as jv
 from experiments import scenes as real_scenes
 
-from .scenes import LEAVES, doubled, in_float64
+from ..scenes import LEAVES, doubled, in_float64
 
 
 SHAPE = (26, 21, 31)

@@ -24,7 +24,7 @@ from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import PRESETS, materials_of
 from jaxvol.lighting.template import FADES, _merged, photons_above, template_levels
 
-from .scenes import in_float64
+from ..scenes import in_float64
 
 
 OPACITIES = (0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99)

@@ -9,7 +9,7 @@ import pytest
 import jaxvol as jv
 from jaxvol.occupancy import Blocks
 
-from .scenes import around, soft_transfer
+from ..scenes import around, soft_transfer
 
 
 class Inverted(jv.Volume):

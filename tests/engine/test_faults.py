@@ -11,7 +11,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import LEAVES, around
+from ..scenes import LEAVES, around
 
 
 SIZE = (9, 7)

@@ -14,7 +14,7 @@ from jaxvol._util.vec3 import apart
 from jaxvol.phantoms import toroidal_phantom
 from jaxvol.space import enter, world_gradient
 
-from .scenes import in_float64, uniform_transfer
+from ..scenes import in_float64, uniform_transfer
 
 
 HALF = np.pi / 2

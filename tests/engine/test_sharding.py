@@ -11,7 +11,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import around, soft_transfer
+from ..scenes import around, soft_transfer
 
 
 SHARDED = """

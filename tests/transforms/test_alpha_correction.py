@@ -5,7 +5,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import around, scaled_phantom, soft_transfer, uniform_transfer
+from ..scenes import around, scaled_phantom, soft_transfer, uniform_transfer
 
 
 def translucent_cube():

@@ -12,7 +12,7 @@ from jaxvol._util.vec3 import apart
 from jaxvol.engine import packing as packed, tiles as waves, wavefront
 from jaxvol.phantoms import toroidal_phantom
 
-from .scenes import CAMERAS, around, counting, doubled, in_float64, inside, orthographic, scaled_phantom
+from ..scenes import CAMERAS, around, counting, doubled, in_float64, inside, orthographic, scaled_phantom
 
 
 SHAPE = (24, 20, 28)

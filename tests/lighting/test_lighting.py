@@ -30,8 +30,8 @@ from jaxvol.lighting.deferred import Line, lit_picture
 from jaxvol.lighting.shading import Sample, Shading, Surroundings, lit
 from jaxvol.space import Affine
 
-from .half_space import chandrasekhar, reflected, under_sky
-from .scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer
+from ..half_space import chandrasekhar, reflected, under_sky
+from ..scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer
 
 
 # ---------------------------------------------------------------- samples lit one by one

@@ -14,7 +14,7 @@ from jaxvol.path_tracing.majorants import Majorants, greatest_between
 from jaxvol.path_tracing.medium import Medium
 from jaxvol.path_tracing.tracking import Flight, fly
 
-from .scenes import anisotropic_noise
+from ..scenes import anisotropic_noise
 
 
 SHAPE = (9, 6, 14)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import jaxvol as jv
 from jaxvol.fitting.bijections import MARGIN, rotate
 
-from .scenes import in_float64
+from ..scenes import in_float64
 
 
 BOUNDED = {

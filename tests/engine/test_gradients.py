@@ -9,7 +9,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import LEAVES, soft_transfer
+from ..scenes import LEAVES, soft_transfer
 
 
 LEAPT = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05))

@@ -7,7 +7,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import anisotropic_noise, around, counting, soft_transfer, uniform_transfer
+from ..scenes import anisotropic_noise, around, counting, soft_transfer, uniform_transfer
 
 
 BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long

@@ -10,7 +10,7 @@ import pytest
 
 import jaxvol as jv
 
-from .scenes import CAMERAS, RESOLUTION, inside, scaled_phantom, soft_transfer
+from ..scenes import CAMERAS, RESOLUTION, inside, scaled_phantom, soft_transfer
 
 
 SIZE = (20, 18)
