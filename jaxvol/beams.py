@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._util.sharding import varying
-from ._util.vec3 import Scalar, Triple, along
+from ._util.vec3 import Scalar, Vec3, along
 from .occupancy import Index, Occupancy, Sums
 from .space import Ray
 
@@ -28,10 +28,10 @@ class Box(eqx.Module):
 
     near: Float[Array, "*beams"]
     far: Float[Array, "*beams"]
-    low: Triple
-    high: Triple
-    low_rate: Triple
-    high_rate: Triple
+    low: Vec3
+    high: Vec3
+    low_rate: Vec3
+    high_rate: Vec3
 
     @classmethod
     def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
@@ -45,7 +45,7 @@ class Box(eqx.Module):
         return cls._of(occupancy, start, rays.direction, near, far, hit, jnp.zeros_like(near))
 
     @classmethod
-    def within(cls, occupancy: Occupancy, origin: Triple, direction: Triple) -> "Box":
+    def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
         """The box of all rays of a camera between those of a beam's corners, which are the last axis."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
         spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
@@ -68,8 +68,8 @@ class Box(eqx.Module):
     def _of(
         cls,
         occupancy: Occupancy,
-        start: Triple,
-        direction: Triple,
+        start: Vec3,
+        direction: Vec3,
         near: Scalar,
         far: Scalar,
         counts: Bool[Array, "*beams rays"],
@@ -94,7 +94,7 @@ class Box(eqx.Module):
         low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
         return cls(near, far, low, high, low_rate, high_rate)
 
-    def between(self, first: Scalar, last: Scalar) -> tuple[Triple, Triple]:
+    def between(self, first: Scalar, last: Scalar) -> tuple[Vec3, Vec3]:
         """The box of everything from `near + first` to `near + last`, both ≥ 0."""
         low = jax.tree.map(lambda s, r: s + jnp.minimum(first * r, last * r), self.low, self.low_rate)
         high = jax.tree.map(lambda s, r: s + jnp.maximum(first * r, last * r), self.high, self.high_rate)
@@ -130,7 +130,7 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
         for a, b, n in zip(low, high, shape, strict=True):
             inside &= (b >= 0) & (a <= n)
 
-        def cells(corner: Triple) -> Index:
+        def cells(corner: Vec3) -> Index:
             """The cells of a corner, in the grid; some cell for boxes that are not."""
             x, y, z = (
                 jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)

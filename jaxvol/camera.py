@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
 from ._util.checks import Arrayable, described, finite_array, integer, number, require
-from ._util.vec3 import Triple, along, apart
+from ._util.vec3 import Vec3, along, apart
 from .volume import Volume
 
 
@@ -166,7 +166,7 @@ class Camera(eqx.Module):
         factor = number("zoom factor", factor, above=0)
         return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
-    def ray(self, column: Num[Array, ""], row: Num[Array, ""]) -> tuple[Triple, Triple]:
+    def ray(self, column: Num[Array, ""], row: Num[Array, ""]) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; between whole numbers, of a ray between pixels'."""
         dtype = self.position.dtype
         x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ._util.checks import described, integer
-from ._util.vec3 import Scalar, Triple
+from ._util.vec3 import Scalar, Vec3
 from .occupancy import Blocks
 from .transfer import (
     Classify,
@@ -59,7 +59,7 @@ class LabelTransferFunction(Transfer):
         each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
         self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
-    def measured(self, volume: Volume, coordinate: Triple) -> Measured:
+    def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
         """Value and label at a grid coordinate."""
         return volume.value(coordinate), volume.label(coordinate)
 
@@ -69,7 +69,7 @@ class LabelTransferFunction(Transfer):
         unseen, points = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
-        def classify(measured: Measured) -> tuple[Triple, Scalar]:
+        def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             value, label = measured
             label = jnp.where((label < 0) | (label > unseen), unseen, label)
             values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)

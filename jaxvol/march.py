@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import described, integer, number
-from ._util.vec3 import Scalar, Triple
+from ._util.vec3 import Scalar, Vec3
 from .beams import Box
 from .occupancy import Occupancy
 from .space import Affine, Ray, Space
@@ -51,13 +51,13 @@ class View(NamedTuple):
       where there is none; found with the help of what is known already.
     """
 
-    ray: Callable[[Scalar, Scalar], tuple[Triple, Triple]]
+    ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
     size: tuple[int, int]
     corner: tuple[Int[Array, ""], Int[Array, ""]]
-    first_hit: Callable[["Survey", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
+    first_hit: Callable[["EmptySpaceIndex", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
 
 
-class Survey(eqx.Module):
+class EmptySpaceIndex(eqx.Module):
     """What is known about empty space. Rays come in beams: arrays of shape (beams, rays in a beam)."""
 
     @abstractmethod
@@ -77,7 +77,7 @@ class Survey(eqx.Module):
         """For some of the rays, from these beams: a depth, no less than `depth`, up to which nothing is
         seen."""
 
-    def within_spans(self) -> "Survey":
+    def within_spans(self) -> "EmptySpaceIndex":
         """What of it is of use where it is known at which cells each ray begins and ends to see."""
         return self
 
@@ -117,7 +117,7 @@ class Transform(eqx.Module):
         once, and what follows is whole steps. Asked where there is an `advance` of its own."""
         return jnp.zeros((), bool)
 
-    def survey(self, occupancy: Occupancy, view: View | None) -> Survey | None:
+    def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """What is known about empty space ahead of rays; None if nothing is. Asked once for each image.
         `view` tells of the image that the rays belong to; None for rays of one's own."""
         return None
@@ -187,7 +187,7 @@ class March(eqx.Module):
         """`max_samples`, or its default."""
         return 2**17 if self.max_samples is None else self.max_samples
 
-    def survey(self, occupancy: Occupancy, view: View | None) -> Survey | None:
+    def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """What is known about empty space, by the one transform that knows."""
         surveys = [transform.survey(occupancy, view) for transform in self.transforms]
         return next((survey for survey in surveys if survey is not None), None)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from ._util.memo import kept
 from ._util.sharding import varying
-from ._util.vec3 import Triple
+from ._util.vec3 import Vec3
 from .volume import Volume
 
 
@@ -101,8 +101,8 @@ class Occupancy(eqx.Module):
     """
 
     occupied: Bool[Array, "cx cy cz"]
-    origin: Triple
-    size: Triple
+    origin: Vec3
+    size: Vec3
 
     def sums(self) -> Sums:
         """For questions about boxes."""
@@ -133,7 +133,7 @@ class Occupancy(eqx.Module):
         _, distance, _ = jax.lax.while_loop(go_on, grow, varying(start))
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
-    def cell(self, point: Triple) -> Triple:
+    def cell(self, point: Vec3) -> Vec3:
         """Where a world point lies, counted in cells."""
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z

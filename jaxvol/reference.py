@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
-from ._util.vec3 import Scalar, Triple, along, apart
+from ._util.vec3 import Scalar, Vec3, along, apart
 from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.shading import Lighting, Sample, classification
 from .march import Cell, March
@@ -42,7 +42,7 @@ class Progress(eqx.Module):
     index: Int[Array, ""]
     offset: Scalar
     opacity: Scalar
-    color: Triple | None
+    color: Vec3 | None
     moment: Scalar | None
     met: "Met | None"
     finished: Bool[Array, ""]
@@ -106,7 +106,7 @@ def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured:
 
 def color(
     march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured, transmittance: Scalar
-) -> Triple:
+) -> Vec3:
     """Colour of a piece, of which so much reaches the camera; as lit, where there is a light."""
     color, extinction = seen.classify(measured)
     if seen.light is None:
@@ -124,7 +124,7 @@ def blend(
     march: March,
     ray: Ray,
     at: Progress,
-    cell: tuple[tuple[Cell, Triple, Scalar], ...],
+    cell: tuple[tuple[Cell, Vec3, Scalar], ...],
 ) -> Progress:
     """What has been accumulated behind a cell. Of its pieces are known colour and opacity."""
     total, color, moment, met = at.opacity, at.color, at.moment, at.met
@@ -244,7 +244,7 @@ def render_ray_reference(
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(march, ray, volume, seen, at), None
 
-    at, _ = jax.lax.scan(one, varying(begin(march, ray), ray), None, length=samples_across(volume, march))
+    at, _ = jax.lax.scan(one, varying(begin(march, ray), ray), None, length=steps_across(volume, march))
     rendering = end(ray, at)
     assert isinstance(rendering, Rendering)
     if isinstance(lighting, Deferred):
@@ -261,7 +261,7 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
     return finite_array(name, value, (3,))
 
 
-def samples_across(volume: Volume, march: March) -> int:
+def steps_across(volume: Volume, march: March) -> int:
     """Steps that suffice for any ray through the volume: its diagonal, and a few that transforms may add."""
     if is_traced(volume.spacing, march):
         if march.max_samples is not None:

@@ -18,16 +18,16 @@ from ._util.checks import Arrayable, finite_array, is_traced, require
 from ._util.sharding import shard_number, varying
 from ._util.xla import compiled, forward_only, recomputed, transformations
 from .camera import Camera
-from .engine.acceleration import Known, Scene, survey_of
-from .engine.gradients import pulled
+from .engine.acceleration import Scene, VolumeAcceleration, survey_of
+from .engine.gradients import render_vjp
 from .engine.packing import with_words
-from .engine.replay import Watch
-from .engine.tiles import OwnRays, Waves, each_ray, line
-from .engine.wavefront import Beams, Span, march_beams
+from .engine.replay import VisibleRangeRecorder
+from .engine.tiles import OwnRays, RayTiles, line, vmap_rays
+from .engine.wavefront import Beams, CellRange, march_rays
 from .lighting.deferred import Deferred, lit_picture
 from .lighting.shading import Lighting, classification
 from .march import March
-from .reference import begin, end, has_fault, samples_across, step
+from .reference import begin, end, has_fault, step, steps_across
 from .rendering import Found, Outputs, Picture, Rendering
 from .scene import check_scene
 from .space import invalid
@@ -122,7 +122,7 @@ def render(
     order = "render(volume, transfer, camera, march)"
     check_scene(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
     how, lighting = _How.of(outputs, adjoint, volume, march), _prepared(lighting, volume, transfer, march)
-    return _render((volume, transfer, camera, march, lighting), how, Known.of(volume, march))
+    return _render((volume, transfer, camera, march, lighting), how, VolumeAcceleration.of(volume, march))
 
 
 @overload
@@ -195,7 +195,7 @@ def render_rays(
     how, lighting = _How.of(outputs, adjoint, volume, march), _prepared(lighting, volume, transfer, march)
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     source = OwnRays(origins, directions, _pixels(pixels, origins), shard_number(origins, directions) * count)
-    return _render((volume, transfer, source, march, lighting), how, Known.of(volume, march))
+    return _render((volume, transfer, source, march, lighting), how, VolumeAcceleration.of(volume, march))
 
 
 class _How(eqx.Module):
@@ -213,12 +213,12 @@ class _How(eqx.Module):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
         if adjoint != "direct":
             return cls(outputs, adjoint, 0)
-        length = samples_across(volume, march)
+        length = steps_across(volume, march)
         # to the next of few lengths, so that a change of step rarely compiles the program again
         return cls(outputs, adjoint, min(-(-length // 64) * 64, march.most_samples))
 
 
-def _render(scene: Scene, how: _How, known: Known) -> Any:
+def _render(scene: Scene, how: _How, known: VolumeAcceleration) -> Any:
     scene, known = varying((scene, known))
     if isinstance(scene[-1], Deferred):
         return _deferred(scene, how, known)
@@ -228,7 +228,7 @@ def _render(scene: Scene, how: _How, known: Known) -> Any:
     return forward_only(picture, WRONG_WAY["forward"]) if how.adjoint == "forward" else picture
 
 
-def _deferred(scene: Scene, how: _How, known: Known) -> Picture:
+def _deferred(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
     """An image that is rendered without light, and lit as a whole."""
     found = "all" if how.outputs == "all" else "depth"
     rendering = _render((*scene[:-1], None), replace(how, outputs=found), known)
@@ -238,7 +238,7 @@ def _deferred(scene: Scene, how: _How, known: Known) -> Picture:
 
 
 def _light(
-    scene: Scene, known: Known, rgba: Float[Array, "*rays 4"], depth: Float[Array, "*rays"]
+    scene: Scene, known: VolumeAcceleration, rgba: Float[Array, "*rays 4"], depth: Float[Array, "*rays"]
 ) -> Float[Array, "*rays 4"]:
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
@@ -248,7 +248,7 @@ def _light(
     return lit * jnp.where(has_fault(volume, transfer, march, lighting), jnp.nan, 1).astype(lit.dtype)
 
 
-def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
+def _replayed(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
     """The image; in reverse mode, its derivative by a second march."""
     if not is_traced(scene):  # a rule for derivatives takes milliseconds
         return _image_in_turn(scene, how, known)
@@ -261,58 +261,66 @@ def _replayed(scene: Scene, how: _How, known: Known) -> Picture:
 
 
 @eqx.filter_custom_vjp
-def _image_by_replay(scene: Scene, how: _How, known: Known) -> Picture:
+def _image_by_replay(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
     return _image_in_turn(scene, how, known)
 
 
 @_image_by_replay.def_fwd
-def _(perturbed: Any, scene: Scene, how: _How, known: Known) -> tuple[Picture, Any]:
+def _(perturbed: Any, scene: Scene, how: _How, known: VolumeAcceleration) -> tuple[Picture, Any]:
     rendering, spans = _watched(scene, how, known)
     return rendering, (rendering, spans)
 
 
 @_image_by_replay.def_bwd
-def _(left: Any, gradient: Picture, perturbed: Any, scene: Scene, how: _How, known: Known) -> Any:
+def _(
+    left: Any, gradient: Picture, perturbed: Any, scene: Scene, how: _How, known: VolumeAcceleration
+) -> Any:
     return _pulled(scene, perturbed, known, left, gradient)
 
 
 _image_by_shard = eqx.filter_jit(_image_by_replay)
 
 
-def _marched(scene: Scene, how: _How, known: Known, *, watch: bool = False) -> tuple[Picture, Span | None]:
+def _marched(
+    scene: Scene, how: _How, known: VolumeAcceleration, *, watch: bool = False
+) -> tuple[Picture, CellRange | None]:
     """The image; and where rays leap, if it is to be watched, the spans of each wave's rays."""
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
     direct = how.adjoint == "direct"
-    waves, space = Waves.of(source, DIRECT_WAVE if direct else None), march.locate(volume)
+    waves, space = RayTiles.of(source, DIRECT_WAVE if direct else None), march.locate(volume)
     survey = None if direct else survey_of((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
     fault = has_fault(volume, transfer, march, lighting)
 
-    def wave(number: Int[Array, ""]) -> tuple[Picture, Span | None]:
+    def wave(number: Int[Array, ""]) -> tuple[Picture, CellRange | None]:
         rays, spans = invalid(waves.rays(source, space, number), fault), None
         if direct:
-            one = each_ray(lambda ray, at: step(march, ray, volume, seen, at))
-            start = each_ray(lambda ray: begin(march, ray, how.outputs))(rays)
+            one = vmap_rays(lambda ray, at: step(march, ray, volume, seen, at))
+            start = vmap_rays(lambda ray: begin(march, ray, how.outputs))(rays)
             at, _ = jax.lax.scan(
                 lambda at, _: (one(rays, at), None), varying(start, rays), None, length=how.length
             )
         else:
             beams = Beams(rays, waves.beams, waves.box(source, rays, number))
-            watcher = Watch(rays.length.shape) if watch and survey is not None else None
-            at, (spans, *_) = march_beams(march, volume, seen, survey, beams, how.outputs, watcher)
-        return each_ray(end)(rays, at), spans
+            watcher = VisibleRangeRecorder(rays.length.shape) if watch and survey is not None else None
+            at, (spans, *_) = march_rays(march, volume, seen, survey, beams, how.outputs, watcher)
+        return vmap_rays(end)(rays, at), spans
 
     pictures, spans = jax.lax.map(wave, jnp.arange(waves.number))
     return jax.tree.map(waves.assemble, pictures), spans
 
 
-def _only_marched(scene: Scene, how: _How, known: Known) -> Picture:
+def _only_marched(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
     return _marched(scene, how, known)[0]
 
 
 def _pull(
-    scene: Scene, perturbed: Any, known: Known, left: tuple[Picture, Span | None], gradient: Any
+    scene: Scene,
+    perturbed: Any,
+    known: VolumeAcceleration,
+    left: tuple[Picture, CellRange | None],
+    gradient: Any,
 ) -> Any:
     rendering, spans = left
     # None stands for what the loss does not use
@@ -321,7 +329,7 @@ def _pull(
         *(rendering, gradient),
         is_leaf=lambda leaf: leaf is None,
     )
-    found = eqx.filter(pulled(scene, perturbed, known, rendering, spans, whole), perturbed)
+    found = eqx.filter(render_vjp(scene, perturbed, known, rendering, spans, whole), perturbed)
     # a loss that looks at what is NaN has no gradient: that of a ray that is not marched would be 0
     floats = (jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)) for tree in (rendering, whole))
     lost = [jnp.any(jnp.isnan(leaf) & (part != 0)) for leaf, part in zip(*floats, strict=True)]

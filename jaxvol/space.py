@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ._util.vec3 import Scalar, Triple, along, apart
+from ._util.vec3 import Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
 from .volume import Volume
 
@@ -25,10 +25,10 @@ class Path(eqx.Module):
     """Whether a ray may leave the grid between its entry and its exit."""
 
     @abstractmethod
-    def __call__(self, s: Scalar) -> Triple:
+    def __call__(self, s: Scalar) -> Vec3:
         """The grid coordinate at depth `s`, the world length past the entry."""
 
-    def contains(self, coordinate: Triple) -> Bool[Array, ""]:
+    def contains(self, coordinate: Vec3) -> Bool[Array, ""]:
         """Whether there is anything at a coordinate of this path. False in gaps alone."""
         return jnp.ones((), bool)
 
@@ -43,19 +43,19 @@ class Space(eqx.Module):
 
     @property
     @abstractmethod
-    def middle(self) -> Triple:
+    def middle(self) -> Vec3:
         """The world point from which no point of the grid is farther than half of `diagonal`."""
 
     @abstractmethod
-    def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         """Distances at which the line enters and leaves the grid; the first exceeds the second on a miss."""
 
     @abstractmethod
-    def coordinate(self, point: Triple) -> Triple:
+    def coordinate(self, point: Vec3) -> Vec3:
         """The grid coordinate of a world point."""
 
     @abstractmethod
-    def point(self, coordinate: Triple) -> Triple:
+    def point(self, coordinate: Vec3) -> Vec3:
         """The world point of a grid coordinate."""
 
     @abstractmethod
@@ -63,7 +63,7 @@ class Space(eqx.Module):
         """The blocks of the grid in which anything may be seen, as cells of the world."""
 
     @abstractmethod
-    def path(self, entry: Triple, direction: Triple) -> Path:
+    def path(self, entry: Vec3, direction: Vec3) -> Path:
         """The straight world ray from `entry`, as seen in the grid."""
 
 
@@ -78,17 +78,15 @@ class Ray(eqx.Module):
     - `pixel`: (column, row), the key of everything random along this ray.
     """
 
-    entry: Triple
-    direction: Triple
+    entry: Vec3
+    direction: Vec3
     t_in: Scalar
     length: Scalar
     path: Path
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
 
 
-def enter(
-    space: Space, origin: Triple, direction: Triple, pixel: tuple[Int[Array, ""], Int[Array, ""]]
-) -> Ray:
+def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
     """The part of a ray inside the volume and not behind its origin, which may lie inside. Where NaN or
     infinity are among the numbers of ray or space, the ray is `invalid`."""
     # Float32 rounds the distance of a far camera by more than the volume can stand. So the ray begins
@@ -117,19 +115,19 @@ def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
 class Straight(Path):
     """A path straight in the grid: `start + s rate`."""
 
-    start: Triple
-    rate: Triple
+    start: Vec3
+    rate: Vec3
 
-    def __call__(self, s: Scalar) -> Triple:
+    def __call__(self, s: Scalar) -> Vec3:
         return along(self.start, self.rate, s)
 
 
 class Affine(Space):
     """A grid whose axes are those of the world: spacing and origin."""
 
-    low: Triple
-    high: Triple
-    spacing: Triple
+    low: Vec3
+    high: Vec3
+    spacing: Vec3
 
     def __init__(self, volume: Volume):
         low, high = volume.corners
@@ -141,18 +139,18 @@ class Affine(Space):
         return jnp.sqrt(sum((high - low) ** 2 for low, high in zip(self.low, self.high, strict=True)))
 
     @property
-    def middle(self) -> Triple:
+    def middle(self) -> Vec3:
         x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
         return x, y, z
 
-    def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         return slab_interval(origin, direction, self.low, self.high)
 
-    def coordinate(self, point: Triple) -> Triple:
+    def coordinate(self, point: Vec3) -> Vec3:
         x, y, z = ((p - low) / step for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
 
-    def point(self, coordinate: Triple) -> Triple:
+    def point(self, coordinate: Vec3) -> Vec3:
         x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
         return x, y, z
 
@@ -160,12 +158,12 @@ class Affine(Space):
         x, y, z = (BLOCK * step for step in self.spacing)
         return Occupancy(visible, self.low, (x, y, z))
 
-    def path(self, entry: Triple, direction: Triple) -> Straight:
+    def path(self, entry: Vec3, direction: Vec3) -> Straight:
         dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
         return Straight(self.coordinate(entry), (dx, dy, dz))
 
 
-def slab_interval(origin: Triple, direction: Triple, low: Triple, high: Triple) -> tuple[Scalar, Scalar]:
+def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:
     """Distances at which a line enters and leaves a box; the first exceeds the second on a miss."""
     (near_x, far_x), (near_y, far_y), (near_z, far_z) = (
         _slab(*ends) for ends in zip(origin, direction, low, high, strict=True)
@@ -176,8 +174,8 @@ def slab_interval(origin: Triple, direction: Triple, low: Triple, high: Triple) 
 
 
 def world_gradient(
-    volume: Volume, space: Space, point: Triple, method: Literal["trilinear", "central"] = "central"
-) -> Triple:
+    volume: Volume, space: Space, point: Vec3, method: Literal["trilinear", "central"] = "central"
+) -> Vec3:
     """Gradient of the value at a world point, value units per world length, wherever the grid lies.
 
     As `Volume.gradient`, turned and scaled by the transposed derivative of `space.coordinate`.

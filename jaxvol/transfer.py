@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import Arrayable, finite_array, number, require, unit_interval
-from ._util.vec3 import Scalar, Triple
+from ._util.vec3 import Scalar, Vec3
 from .occupancy import Blocks
 from .volume import Volume
 
@@ -25,7 +25,7 @@ Row: TypeAlias = tuple[Scalar, ...]
 Measured: TypeAlias = tuple[Array, ...]
 """What a transfer function wants to know of a place: the value, and whatever else it goes by."""
 
-Classify: TypeAlias = Callable[[Measured], tuple[Triple, Scalar]]
+Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 """From what was measured to colour (r, g, b) and extinction (1/length)."""
 
 
@@ -36,11 +36,11 @@ class Classification(NamedTuple):
     many times over.
     """
 
-    measure: Callable[[Triple], Measured]
+    measure: Callable[[Vec3], Measured]
     classify: Classify
     search: Callable[[Measured], Measured] | None = None
     """What is worth finding once, for all that `classify` makes of it. It comes after what was measured."""
-    light: Callable[[Any], Triple] | None = None
+    light: Callable[[Any], Vec3] | None = None
     """From a sample (`lighting.seam.Sample`) to its colour as lit. None where colours are as classified."""
 
     def searched(self, measured: Measured) -> Measured:
@@ -51,7 +51,7 @@ class Classification(NamedTuple):
 class Transfer(eqx.Module):
     """What a renderer asks of a transfer function, of whatever kind."""
 
-    def measured(self, volume: Volume, coordinate: Triple) -> Measured:
+    def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
         """What is read from the volume at a grid coordinate, of which the value comes first: by default, it
         alone."""
         return (volume.value(coordinate),)
@@ -71,12 +71,12 @@ class Transfer(eqx.Module):
             lambda coordinate: self.measured(volume, coordinate), self.classifier(), self.search()
         )
 
-    def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
+    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
         """The transposed derivative of classifying many samples, arrays of any one shape: what the transfer
         function, and what was measured, get of these cotangents of colour and extinction. None where there
         is no derivative. `measured` ends in what `search` has found."""
 
-        def classified(given: tuple[Transfer, Measured]) -> tuple[Triple, Scalar]:
+        def classified(given: tuple[Transfer, Measured]) -> tuple[Vec3, Scalar]:
             transfer, measured = given
             classify = transfer.classifier()
             for _ in range(extinction.ndim):
@@ -158,7 +158,7 @@ class TransferFunction(Transfer):
             ) from fault
         return cls(values, colors, extinction_of(opacities, unit_distance))
 
-    def __call__(self, value: Scalar) -> tuple[Triple, Scalar]:
+    def __call__(self, value: Scalar) -> tuple[Vec3, Scalar]:
         """Colour (r, g, b) and extinction of a value."""
         search, measured = self.search(), (value,)
         return self.classifier()(measured if search is None else (*measured, *search(measured)))
@@ -187,11 +187,11 @@ class TransferFunction(Transfer):
         """Look-up of colour and extinction."""
         rows, values = self.rows(), jax.lax.stop_gradient(self.values)
 
-        def looked_up(measured: Measured) -> tuple[Triple, Scalar]:
+        def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
             return interpolated(row_of(rows, interval), past)
 
-        def chosen(measured: Measured) -> tuple[Triple, Scalar]:
+        def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
             row = tuple(rows[0])
             for start, following in zip(values[1:], rows[1:], strict=True):
@@ -200,7 +200,7 @@ class TransferFunction(Transfer):
 
         return chosen if values.shape[0] <= FEW else looked_up
 
-    def pull(self, measured: Measured, color: Triple, extinction: Scalar) -> tuple["Transfer", Measured]:
+    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
         own = (TransferFunction.classifier, TransferFunction.rows)
         if any(getattr(type(self), method.__name__) is not method for method in own):
             transfer, (of_value, *found) = super().pull(measured, color, extinction)
@@ -287,7 +287,7 @@ def row_of(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
     )
 
 
-def interpolated(row: Row, past: Scalar) -> tuple[Triple, Scalar]:
+def interpolated(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:
     """Colour and extinction of a value so far past a point, from its row."""
     r, g, b, extinction = (at + past * slope for at, slope in zip(row[1:5], row[5:9], strict=True))
     # where it falls to 0 it may be rounded to less; NaN stays NaN

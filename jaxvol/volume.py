@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from ._util.checks import Arrayable, described, finite, finite_array, is_traced, require
-from ._util.vec3 import Scalar, Triple
+from ._util.vec3 import Scalar, Vec3
 
 
 DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
@@ -103,7 +103,7 @@ class Volume(eqx.Module):
         low, high = self.corners
         return (low + high) / 2
 
-    def value(self, coordinate: Triple) -> Scalar:
+    def value(self, coordinate: Vec3) -> Scalar:
         """Trilinear value at a grid coordinate, in the coordinate's float type."""
         (((c000, c001), (c010, c011)), ((c100, c101), (c110, c111))), (fx, fy, fz) = self._cube(coordinate)
         return _mix(
@@ -112,7 +112,7 @@ class Volume(eqx.Module):
             _mix(fy, _mix(fz, c100, c101), _mix(fz, c110, c111)),
         )
 
-    def gradient(self, coordinate: Triple, method: Literal["trilinear", "central"] = "central") -> Triple:
+    def gradient(self, coordinate: Vec3, method: Literal["trilinear", "central"] = "central") -> Vec3:
         """Gradient of the value in the grid's own axes, in value units per world length.
 
         - `"trilinear"`: derivative of the trilinear value inside the cell; exact for what is
@@ -130,7 +130,7 @@ class Volume(eqx.Module):
         sx, sy, sz = slopes
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
 
-    def label(self, coordinate: Triple) -> Int[Array, ""]:
+    def label(self, coordinate: Vec3) -> Int[Array, ""]:
         """Label of the node nearest to a grid coordinate (the upper one half-way between two)."""
         if self.labels is None:
             raise ValueError("labels are needed here and this volume has none; give Volume(..., labels=...).")
@@ -141,7 +141,7 @@ class Volume(eqx.Module):
         _, ny, nz = self.shape
         return _fetch(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
 
-    def label_share(self, coordinate: Triple, label: int) -> Scalar:
+    def label_share(self, coordinate: Vec3, label: int) -> Scalar:
         """The trilinear share of a label at a grid coordinate: 1 among nodes that have it, 0 among others."""
         if self.labels is None:
             raise ValueError("labels are needed here and this volume has none; give Volume(..., labels=...).")
@@ -154,7 +154,7 @@ class Volume(eqx.Module):
             share = share + math.prod(sides) * (node == label).astype(share.dtype)
         return share
 
-    def _cube(self, coordinate: Triple) -> tuple[Cube, Triple]:
+    def _cube(self, coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a coordinate, [x][y][z], and the fractions between them."""
         dtype = coordinate[0].dtype
         (i, j, k), fraction = split(coordinate, self.shape)
@@ -169,7 +169,7 @@ class Volume(eqx.Module):
     def _voxel(self, flat: Int[Array, ""]) -> Shaped[Array, ""]:
         return _fetch(self.data, flat)
 
-    def _trilinear_slopes(self, coordinate: Triple) -> Triple:
+    def _trilinear_slopes(self, coordinate: Vec3) -> Vec3:
         (((c000, c001), (c010, c011)), ((c100, c101), (c110, c111))), (fx, fy, fz) = self._cube(coordinate)
         return (
             _mix(fy, _mix(fz, c100 - c000, c101 - c001), _mix(fz, c110 - c010, c111 - c011)),
@@ -177,7 +177,7 @@ class Volume(eqx.Module):
             _mix(fx, _mix(fy, c001 - c000, c011 - c010), _mix(fy, c101 - c100, c111 - c110)),
         )
 
-    def _central_slopes(self, coordinate: Triple) -> Triple:
+    def _central_slopes(self, coordinate: Vec3) -> Vec3:
         def slope(axis: int) -> Scalar:
             last = self.shape[axis] - 1
             before, after = (jnp.clip(coordinate[axis] + side, 0, last) for side in (-1, 1))
@@ -278,8 +278,8 @@ def _array(name: str, value: Arrayable) -> Array | np.ndarray:
 
 
 def split(
-    coordinate: Triple, shape: tuple[int, int, int]
-) -> tuple[tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]], Triple]:
+    coordinate: Vec3, shape: tuple[int, int, int]
+) -> tuple[tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]], Vec3]:
     """The node below a coordinate and the fractions past it; the last node belongs to the cell below."""
     x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
     # the second limit also keeps NaN inside the array
@@ -287,7 +287,7 @@ def split(
     return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
 
 
-def _with(coordinate: Triple, axis: int, component: Scalar) -> Triple:
+def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
     x, y, z = (component if i == axis else c for i, c in enumerate(coordinate))
     return x, y, z
 

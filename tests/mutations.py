@@ -56,9 +56,13 @@ class Mutation(NamedTuple):
         return text.replace(self.old, self.new)
 
 
-LEAPT_GRADIENT = "engine/test_gradient_matrix.py::test_replay_does_not_see_the_leaps[jittered-hierarchy-uint8]"
+LEAPT_GRADIENT = (
+    "engine/test_gradient_matrix.py::test_replay_does_not_see_the_leaps[jittered-hierarchy-uint8]"
+)
 FORWARD_GRADIENT = "engine/test_gradient_matrix.py::test_forward_is_replay[jittered-hierarchy-uint8]"
-DIFFERENCES = "engine/test_gradient_matrix.py::test_gradients_are_central_differences[moving-hierarchy-float64]"
+DIFFERENCES = (
+    "engine/test_gradient_matrix.py::test_gradients_are_central_differences[moving-hierarchy-float64]"
+)
 FAULTS = "engine/test_faults.py::test_what_is_no_number_reaches_image_and_gradient[leaping]"
 IN_TURN = "engine/test_vmap.py::test_over_one_part[cameras-uint8]"
 PACKED = "transforms/test_space_leaping.py::test_packed_voxels_are_the_same_values"
@@ -71,7 +75,9 @@ MUTATIONS = [
         "transforms/toroidal_map.py",
         "return half + _atan2(y, z), half + _atan2(x, off)",
         "return half - _atan2(y, z), half + _atan2(x, off)",
-        ("transforms/test_toroidal_map.py::test_map_and_inverse_agree_with_each_other_and_with_the_printed_formula",),
+        (
+            "transforms/test_toroidal_map.py::test_map_and_inverse_agree_with_each_other_and_with_the_printed_formula",
+        ),
     ),
     Mutation(
         "locate: distances of a far camera counted from its base, not from its origin",
@@ -83,8 +89,8 @@ MUTATIONS = [
     Mutation(
         "camera: rays are rounded anew by every program that differentiates them",
         "engine/tiles.py",
-        "return in_memory(all_finite(camera), each_ray(partial(_of_pixel, camera)), columns, rows)",
-        "return each_ray(partial(_of_pixel, camera))(columns, rows)",
+        "return in_memory(all_finite(camera), vmap_rays(partial(_of_pixel, camera)), columns, rows)",
+        "return vmap_rays(partial(_of_pixel, camera))(columns, rows)",
         ("test_camera.py::test_rays_round_alike_whether_or_not_they_are_differentiated",),
     ),
     Mutation(
@@ -149,7 +155,9 @@ MUTATIONS = [
         "transforms/jitter.py",
         "jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)",
         "jnp.where(transparent, steps - 1 + memory, steps), memory",
-        ("transforms/test_jitter.py::test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample",),
+        (
+            "transforms/test_jitter.py::test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample",
+        ),
     ),
     Mutation(
         "leap: one cell too far",
@@ -175,8 +183,8 @@ MUTATIONS = [
     Mutation(
         "leap: a ray's visible cells begin one too late",
         "engine/replay.py",
-        "return Span(jnp.minimum(kept.first, first), until), None, None",
-        "return Span(jnp.minimum(kept.first, first) + 1, until), None, None",
+        "return CellRange(jnp.minimum(kept.first, first), until), None, None",
+        "return CellRange(jnp.minimum(kept.first, first) + 1, until), None, None",
         (LEAPT_GRADIENT,),
     ),
     Mutation(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from .checks import described, integer, is_traced
-from .vec3 import Triple
+from .vec3 import Vec3
 
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:
@@ -40,7 +40,7 @@ def is_key(seed: Any) -> bool:
     return seed.dtype == jnp.uint32 and seed.shape == (2,)
 
 
-def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""], dtype: Any) -> Triple:
+def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""], dtype: Any) -> Vec3:
     """Three numbers in [0, 1), independent of each other and from key to key.
 
     A hash rather than `jax.random`, whose every number costs some hundred operations where this takes

@@ -14,15 +14,15 @@ from jaxtyping import Array, Float
 Scalar: TypeAlias = Float[Array, "..."]
 """A number: one ray's, or each one's of a batch, for all that is done to it is done to each apart."""
 
-Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]
+Vec3: TypeAlias = tuple[Scalar, Scalar, Scalar]
 
 
-def apart(vector: Float[Array, "3"]) -> Triple:
+def apart(vector: Float[Array, "3"]) -> Vec3:
     """The components of a stacked vector."""
     return vector[0], vector[1], vector[2]
 
 
-def along(start: Triple, rate: Triple, s: Scalar) -> Triple:
+def along(start: Vec3, rate: Vec3, s: Scalar) -> Vec3:
     """The point `start + s rate`."""
     (x, y, z), (dx, dy, dz) = start, rate
     return x + s * dx, y + s * dy, z + s * dz

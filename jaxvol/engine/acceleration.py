@@ -9,7 +9,7 @@ from jaxtyping import Array, Int, UInt32
 
 from ..camera import Camera
 from ..lighting.shading import Lighting
-from ..march import March, Survey, View
+from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import end
 from ..rendering import Rendering
@@ -17,25 +17,25 @@ from ..transfer import Transfer
 from ..transforms.space_leaping import FirstHit
 from ..volume import Volume
 from .packing import words_of
-from .tiles import OwnRays, Waves, each_ray, lines
-from .wavefront import Beams, march_beams
+from .tiles import OwnRays, RayTiles, lines, vmap_rays
+from .wavefront import Beams, march_rays
 
 
 Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
 
 
-class Known(eqx.Module):
+class VolumeAcceleration(eqx.Module):
     """What was found out about a volume before, and is found out anew for other voxels."""
 
     words: UInt32[Array, " voxels"] | None
     blocks: Blocks | None
 
     @classmethod
-    def of(cls, volume: Volume, march: March) -> "Known":
+    def of(cls, volume: Volume, march: March) -> "VolumeAcceleration":
         return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
 
 
-def survey_of(scene: Scene, known: Known) -> Survey | None:
+def survey_of(scene: Scene, known: VolumeAcceleration) -> EmptySpaceIndex | None:
     """What is known of empty space. Nothing of it has a gradient."""
     volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
     if known.blocks is None:
@@ -45,16 +45,16 @@ def survey_of(scene: Scene, known: Known) -> Survey | None:
     if isinstance(source, OwnRays):
         return march.survey(occupancy, None)
 
-    def first_hit(survey: Survey, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
+    def first_hit(survey: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
         first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
         through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
         ends = (jnp.stack(end, axis=-1) for end in (through.origin, through.direction))
         own, none = OwnRays(*ends), jnp.zeros((), jnp.int32)
-        waves = Waves.of(own, columns.size)
+        waves = RayTiles.of(own, columns.size)
         rays = waves.rays(own, space, none)
         beams = Beams(rays, waves.beams, waves.box(own, rays, none))
-        at, _ = march_beams(first, volume, transfer.over(volume), survey, beams)
-        seen = each_ray(end)(rays, at)
+        at, _ = march_rays(first, volume, transfer.over(volume), survey, beams)
+        seen = vmap_rays(end)(rays, at)
         assert isinstance(seen, Rendering)
         return waves.assemble(seen.depth[None]).reshape(columns.shape)
 

@@ -18,23 +18,28 @@ from ..reference import has_fault
 from ..rendering import DepthPicture, Picture
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
-from .acceleration import Known, Scene, survey_of
+from .acceleration import Scene, VolumeAcceleration, survey_of
 from .packing import with_words
 from .replay import Cotangents, Replay, Total
 from .shading_gradient import Lit
-from .tiles import Waves
-from .wavefront import Beams, Span, march_beams
+from .tiles import RayTiles
+from .wavefront import Beams, CellRange, march_rays
 
 
-def pulled(
-    scene: Scene, perturbed: Any, known: Known, rendering: Picture, spans: Span | None, gradient: Picture
+def render_vjp(
+    scene: Scene,
+    perturbed: Any,
+    known: VolumeAcceleration,
+    rendering: Picture,
+    spans: CellRange | None,
+    gradient: Picture,
 ) -> Any:
-    """What every leaf of the scene gets of an image's gradient."""
+    """Vector–Jacobian product of `render`: a cotangent for each perturbed leaf of the scene."""
     volume, transfer, source, march, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
     places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
     packed = with_words(volume, known.words)
-    waves, survey = Waves.of(source), survey_of(scene, known)
+    waves, survey = RayTiles.of(source), survey_of(scene, known)
     if survey is not None and spans is not None:
         survey = survey.within_spans()
     seen, fault = transfer.over(packed), has_fault(volume, transfer, march, lighting)
@@ -42,7 +47,7 @@ def pulled(
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
 
-    def wave(sums: tuple[Total, PyTree], given: tuple[Array, Span | None, Picture, Picture]) -> Any:
+    def wave(sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, Picture, Picture]) -> Any:
         (total, of_source), (number, span, rendering, gradient) = sums, given
 
         def made(moving: PyTree) -> Ray:
@@ -59,7 +64,7 @@ def pulled(
             places=places,
         )
         beams = Beams(rays, waves.beams, waves.box(source, rays, number), span)
-        _, (_, of_rays, total) = march_beams(march, packed, seen, survey, beams, None, replay)
+        _, (_, of_rays, total) = march_rays(march, packed, seen, survey, beams, None, replay)
         if not places:
             return (total, of_source), None
         if isinstance(gradient, DepthPicture):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Int, Shaped, UInt32
 
 from .._util.checks import is_traced
 from .._util.memo import kept
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from ..volume import Cube, Volume, split
 
 
@@ -30,7 +30,7 @@ class PackedVolume(Volume):
         self.spacing, self.origin = volume.spacing, volume.origin
         self.words = words
 
-    def _cube(self, coordinate: Triple) -> tuple[Cube, Triple]:
+    def _cube(self, coordinate: Vec3) -> tuple[Cube, Vec3]:
         dtype = coordinate[0].dtype
         (x, y, z), fraction = split(coordinate, self.shape)
         _, ny, nz = self.shape

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree, UInt32
 
 from .._util.trees import added, floats
-from .._util.vec3 import Scalar, Triple, along
+from .._util.vec3 import Scalar, Vec3, along
 from ..march import March
 from ..reference import Progress, contained, front, pieces
 from ..rendering import DepthPicture, Picture
@@ -35,35 +35,37 @@ from ..transfer import Classification, Transfer
 from ..volume import Volume, with_voxels, without_voxels
 from .packing import with_words
 from .shading import Weighed, weighed
-from .shading_gradient import LightTotal, Lit, Relit, relit
-from .voxel_gradient import Tapped, scattered
-from .wavefront import CELLS, Follower, Samples, Span, over_cells
+from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
+from .voxel_gradient import RecordingVolume, scattered
+from .wavefront import CELLS, CellRange, Samples, SampleVisitor, vmap_cells
 
 
-class Watch(Follower):
+class VisibleRangeRecorder(SampleVisitor):
     """Records the first and the last visible cell of each ray of a march, over rays of this shape. A ray
     without any has `until` = 0, and a `first` that is none of its cells."""
 
     given = sums = total = None
 
     def __init__(self, shape: tuple[int, ...]):
-        self.kept = Span(jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32))
+        self.kept = CellRange(
+            jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32)
+        )
 
     def follow(
-        self, ray: Ray, at: Progress, samples: Samples, given: None, kept: Span, total: None
-    ) -> tuple[Span, None, None]:
+        self, ray: Ray, at: Progress, samples: Samples, given: None, kept: CellRange, total: None
+    ) -> tuple[CellRange, None, None]:
         cells = at.index[None] + jnp.arange(CELLS, dtype=at.index.dtype)[:, None]
         seen = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
         first = jnp.min(jnp.where(seen, cells, kept.first[None]), axis=0)
         until = jnp.max(jnp.where(seen, cells + 1, kept.until[None]), axis=0)
-        return Span(jnp.minimum(kept.first, first), until), None, None
+        return CellRange(jnp.minimum(kept.first, first), until), None, None
 
 
 class Cotangents(NamedTuple):
     """What the loss makes of each ray: how it changes with colour, opacity, and a unit of weight at a depth
     from `middle` on, where depth was asked for; and what all the ray's samples are worth."""
 
-    color: Triple
+    color: Vec3
     opacity: Scalar
     worth: Scalar
     depth: Scalar | None = None
@@ -109,7 +111,7 @@ class Total(eqx.Module):
         return cls(transfer, march, volume_, sums, lit)
 
 
-class Replay(Follower):
+class Replay(SampleVisitor):
     """The second march over rays (groups, rays in a group).
 
     **Arguments:**
@@ -142,16 +144,16 @@ class Replay(Follower):
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # for all cells of a ray
         red, green, blue = each.color
-        classify = over_cells(self.seen.classify)
+        classify = vmap_cells(self.seen.classify)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.march.sample(cell) for cell in samples.cells]
         known = weighed(self.march, at, samples.opacity)
         wanted = [(weight * red, weight * green, weight * blue) for weight in known.weight]
-        lit: list[Relit] | None = None
+        lit: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
         if self.light is not None:
             sums = LightTotal(total.light, total.transfer, total.voxels)
-            lit, sums = relit(self.light, self.seen, self.march, ray, samples, known, wanted, sums)
+            lit, sums = shading_vjp(self.light, self.seen, self.march, ray, samples, known, wanted, sums)
             total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
             colors, wanted = [part.color for part in lit], [part.of_color for part in lit]
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
@@ -159,7 +161,7 @@ class Replay(Follower):
             worth = [
                 value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
             ]
-        inside = over_cells(contained, of_cells=(False, True))
+        inside = vmap_cells(contained, of_cells=(False, True))
         kept, slopes = _slopes(known, worth, given.worth, kept)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
@@ -195,7 +197,7 @@ class Replay(Follower):
         ):
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
-            here = Tapped.of(placed, taps) if voxels else with_words(placed, self.words)
+            here = RecordingVolume.of(placed, taps) if voxels else with_words(placed, self.words)
             found = []
             for piece in pieces(march, ray, here, front(march, at, k)):
                 depth = march.sample(piece)
@@ -203,7 +205,7 @@ class Replay(Follower):
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
                 asked = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, asked, point))
-            return found, here.asked if isinstance(here, Tapped) else []
+            return found, here.asked if isinstance(here, RecordingVolume) else []
 
         ahead = jnp.arange(CELLS, dtype=at.index.dtype)
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.compaction import Chosen
-from .._util.vec3 import Scalar, Triple, along
+from .._util.vec3 import Scalar, Vec3, along
 from ..lighting.shading import Sample
 from ..march import Cell, March
 from ..reference import Progress
@@ -68,7 +68,7 @@ def samples_of(
     return Sample(along(entry, direction, depth), direction, read, color, extinction, 1 - front, pixel)
 
 
-def lit_colors(
+def shaded_colors(
     seen: Classification,
     march: March,
     ray: Ray,
@@ -76,13 +76,13 @@ def lit_colors(
     cells: list[Cell],
     measured: list[Measured],
     alphas: list[Scalar],
-) -> list[Triple]:
+) -> list[Vec3]:
     """Colours of a segment's samples as lit; 0 for those that are not seen."""
     known, light = weighed(march, at, alphas), seen.light
     chosen = visible(known)
     assert light is not None
 
-    def one(places: Int[Array, " chunk"], colors: Triple) -> Triple:
+    def one(places: Int[Array, " chunk"], colors: Vec3) -> Vec3:
         samples = samples_of(chosen, places, seen, march, ray, cells, measured, known)
         return chosen.put(colors, places, jax.vmap(light)(samples))
 

@@ -1,6 +1,6 @@
 """What does a loss see of the light? Each visible sample is lit again, with the derivatives of that.
 
-The counterpart of `visible.lit_colors` in the second march.
+The counterpart of `visible.shaded_colors` in the second march.
 """
 
 from typing import Any, NamedTuple
@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._util.trees import added, floats
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Shading, Surroundings, lit
 from ..march import March
 from ..space import Ray
 from ..transfer import Classification
 from .shading import Weighed, samples_of, visible
-from .voxel_gradient import Tapped, scattered
+from .voxel_gradient import RecordingVolume, scattered
 from .wavefront import Samples
 
 
@@ -41,39 +41,41 @@ class LightTotal(NamedTuple):
     voxels: Float[Array, " voxels"] | None
 
 
-class Relit(NamedTuple):
+class ShadingVjp(NamedTuple):
     """Samples as lit, arrays (cells, rays); and what their colour, extinction, measured values and world
     points get of what is wanted of them. 0 for those that are not seen."""
 
-    color: Triple
-    of_color: Triple
+    color: Vec3
+    of_color: Vec3
     of_extinction: Scalar
     of_measured: PyTree
-    of_point: Triple
+    of_point: Vec3
 
 
-def relit(
+def shading_vjp(
     light: Lit,
     seen: Classification,
     march: March,
     ray: Ray,
     samples: Samples,
     known: Weighed,
-    wanted: list[Triple],
+    wanted: list[Vec3],
     total: LightTotal,
-) -> tuple[list[Relit], LightTotal]:
+) -> tuple[list[ShadingVjp], LightTotal]:
     """A segment's samples, and the total with what they add to it. `wanted`: of each piece's colour."""
     chosen, around = visible(known), light.around
     size = sum(weight.size for weight in known.weight)
     moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
-    volume = around.volume if total.voxels is None else Tapped.of(around.volume, None)
+    volume = around.volume if total.voxels is None else RecordingVolume.of(around.volume, None)
 
-    def one(places: Int[Array, " chunk"], carry: tuple[Relit, LightTotal]) -> tuple[Relit, LightTotal]:
+    def one(
+        places: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
+    ) -> tuple[ShadingVjp, LightTotal]:
         found, total = carry
         some = samples_of(chosen, places, seen, march, ray, samples.cells, samples.measured, known)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
-        def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Triple, Any]:
+        def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Vec3, Any]:
             (shading, space), transfer = eqx.combine(moving, fixed)
             here = Surroundings(volume, transfer, space)
             each = eqx.combine(moving_sample, fixed_sample)
@@ -89,12 +91,12 @@ def relit(
         (of_light, of_transfer), of_sample, of_taps = pull(cotangent)
         voxels = None if total.voxels is None else scattered(total.voxels, asked, of_taps)
         total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
-        part = Relit(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
+        part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
         return chosen.put(found, places, part), total
 
     zero = jnp.zeros(size, known.weight[0].dtype)
     measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))
     zeros = zero, zero, zero
-    start = Relit(zeros, zeros, zero, measured, zeros)
+    start = ShadingVjp(zeros, zeros, zero, measured, zeros)
     found, total = chosen.over(one, (start, total))
     return chosen.apart(found, len(known.weight)), total

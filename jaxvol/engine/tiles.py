@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
-from .._util.vec3 import Triple
+from .._util.vec3 import Vec3
 from .._util.xla import in_memory
 from ..beams import Box
 from ..camera import Camera
@@ -57,7 +57,7 @@ class OwnRays(eqx.Module):
         return flat[place, 0], flat[place, 1]
 
 
-class Waves(eqx.Module):
+class RayTiles(eqx.Module):
     """The order of an image's rays.
 
     - `number`: of waves. `beams`: in each wave.
@@ -67,18 +67,18 @@ class Waves(eqx.Module):
     beams: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, source: Camera | OwnRays, most_beams: int | None = None) -> "Waves":
+    def of(cls, source: Camera | OwnRays, most_beams: int | None = None) -> "RayTiles":
         """Those of a camera's pixels, or of one's own rays, with at most so many beams in a wave."""
         most_beams = WAVE if most_beams is None else most_beams
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // BEAM), -(-height // BEAM)
             beams = min(most_beams, across * down)
-            return _OfPixels(-(-across * down // beams), beams, source.size, across, down)
+            return _PixelTiles(-(-across * down // beams), beams, source.size, across, down)
         shape = source.origins.shape[:-1]
         needed = -(-math.prod(shape) // BEAM**2)
         beams = max(min(most_beams, needed), 1)
-        return _OfRays(-(-needed // beams), beams, shape)
+        return _OwnRayTiles(-(-needed // beams), beams, shape)
 
     @abstractmethod
     def rays(self, source: Any, space: Space, wave: Int[Array, ""]) -> Ray:
@@ -97,7 +97,7 @@ class Waves(eqx.Module):
         """The other way round; 0 for rays that only fill up groups."""
 
 
-class _OfPixels(Waves):
+class _PixelTiles(RayTiles):
     """A camera's pixels: beams row by row, and each group by group."""
 
     size: tuple[int, int] = eqx.field(static=True)
@@ -114,7 +114,7 @@ class _OfPixels(Waves):
     def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
         column, row = self._pixels(wave, y * (BEAM - 1), x * (BEAM - 1))
-        return lambda occupancy: Box.within(occupancy, *each_ray(source.ray)(column, row))
+        return lambda occupancy: Box.within(occupancy, *vmap_rays(source.ray)(column, row))
 
     def _pixels(self, wave: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of these places in each of a wave's beams."""
@@ -139,7 +139,7 @@ class _OfPixels(Waves):
         return beams.reshape(self.number, -1, GROUP, *rest)
 
 
-class _OfRays(Waves):
+class _OwnRayTiles(RayTiles):
     """Rays of one's own, in the order in which they were given."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -190,32 +190,32 @@ def lines(camera: Camera, columns: Lanes, rows: Lanes) -> Line:
     A program that also differentiates them would round them by other roundings, 1e-4 of a voxel away; and a
     sample that comes to lie beyond a face of voxels has the slope of the other side. So they are a branch of
     their own, of which a derivative is no part."""
-    return in_memory(all_finite(camera), each_ray(partial(_of_pixel, camera)), columns, rows)
+    return in_memory(all_finite(camera), vmap_rays(partial(_of_pixel, camera)), columns, rows)
 
 
 @lines.defjvp
 def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -> tuple[Line, Line]:
     camera, columns, rows = primals
     _, change = jax.jvp(
-        lambda camera: each_ray(partial(_of_pixel, camera))(columns, rows), (camera,), tangents[:1]
+        lambda camera: vmap_rays(partial(_of_pixel, camera))(columns, rows), (camera,), tangents[:1]
     )
     return lines(*primals), change
 
 
-def each_ray(f: Callable[..., Any]) -> Callable[..., Any]:
+def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:
     """A function of one ray, of arrays (groups, rays in a group)."""
     return jax.vmap(jax.vmap(f))
 
 
 def entering(
     space: Space,
-    origin: Triple,
-    direction: Triple,
+    origin: Vec3,
+    direction: Vec3,
     pixel: tuple[Lanes, Lanes],
     wanted: Bool[Array, "groups rays"],
 ) -> Ray:
     """Rays cut to the volume; those that are not wanted miss it."""
-    ray = each_ray(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(
+    ray = vmap_rays(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(
         origin, direction, pixel
     )
     return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))

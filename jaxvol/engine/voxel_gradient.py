@@ -13,17 +13,17 @@ from jaxtyping import Array, Float, Int, Shaped
 from ..volume import Volume
 
 
-class Tapped(Volume):
+class RecordingVolume(Volume):
     """A volume, of whatever kind, that writes down which voxels it is asked for, and adds something to each.
 
-    `Tapped.of` makes one: of a class of its own for each kind of volume, so that a kind that measures in its
-    own way still does."""
+    `RecordingVolume.of` makes one: of a class of its own for each kind of volume, so that a kind that
+    measures in its own way still does."""
 
     taps: list | None
     asked: list = eqx.field(static=True)
 
     @classmethod
-    def of(cls, volume: Volume, taps: list | None) -> "Tapped":
+    def of(cls, volume: Volume, taps: list | None) -> "RecordingVolume":
         """The volume, tapped."""
         if isinstance(volume, cls):
             kind = type(volume)
@@ -35,9 +35,9 @@ class Tapped(Volume):
             object.__setattr__(tapped, name, value)
         return tapped
 
-    def tapped(self, taps: list) -> "Tapped":
+    def tapped(self, taps: list) -> "RecordingVolume":
         """The same volume, with a list of its own."""
-        return Tapped.of(self, taps)
+        return RecordingVolume.of(self, taps)
 
     def _voxel(self, flat: Int[Array, ""]) -> Shaped[Array, ""]:
         self.asked.append(flat)
@@ -46,8 +46,8 @@ class Tapped(Volume):
 
 
 @cache
-def _kind(kind: type[Volume]) -> type[Tapped]:
-    return type(f"Tapped{kind.__name__}", (Tapped, kind), {})
+def _kind(kind: type[Volume]) -> type[RecordingVolume]:
+    return type(f"RecordingVolume{kind.__name__}", (RecordingVolume, kind), {})
 
 
 def scattered(

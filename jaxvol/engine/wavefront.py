@@ -12,7 +12,8 @@ What makes this fast was measured (on CPU, by XLA's rules), and is what this fil
 - Rays that a transform may still move take a segment in part. Groups with such rays are marched first, by
   themselves, until none is left; what follows does not ask for them. But where most groups have them, all
   are marched so: apart from their neighbours, rays would find little of what they fetch in the cache.
-- Where empty space is known (`Survey`), rays leap over it between two segments, each as far as it can.
+- Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments, each as far as it
+  can.
 
 None of it shows in the result: cells, transforms and the blending are those of `reference`.
 """
@@ -32,14 +33,14 @@ from .._util.sharding import varying
 from .._util.vec3 import Scalar
 from .._util.xla import in_memory
 from ..beams import Box
-from ..march import Cell, March, Survey
+from ..march import Cell, EmptySpaceIndex, March
 from ..occupancy import Occupancy
 from ..reference import Progress, begin, blend, counts, front, measure, move, opacity, pieces
 from ..rendering import Found
 from ..space import Ray
 from ..transfer import Classification, Measured
 from ..volume import Volume
-from .shading import lit_colors
+from .shading import shaded_colors
 
 
 CELLS = 8
@@ -60,7 +61,7 @@ _State: TypeAlias = tuple[Progress, Any]
 """Where all rays are, and what a follower remembers of them, adds up for them, and over all of them."""
 
 
-class Span(NamedTuple):
+class CellRange(NamedTuple):
     """Between which of its cells a ray sees anything: from `first` on, and before `until`."""
 
     first: Int[Array, "*rays"]
@@ -79,7 +80,7 @@ class Beams(eqx.Module):
     rays: Ray
     count: int = eqx.field(static=True)
     box: Callable[[Occupancy], Box] = eqx.field(static=True)
-    span: Span | None = None
+    span: CellRange | None = None
 
 
 class Samples(NamedTuple):
@@ -91,7 +92,7 @@ class Samples(NamedTuple):
     opacity: list[Scalar]
 
 
-class Follower(ABC):
+class SampleVisitor(ABC):
     """Something that goes along with a march, and looks at all samples.
 
     - `given`, `kept`, `sums`: what it knows of each ray, remembers, and adds up from 0: (groups, GROUP).
@@ -111,14 +112,14 @@ class Follower(ABC):
         with them."""
 
 
-def march_beams(
+def march_rays(
     march: March,
     volume: Volume,
     seen: Classification,
-    survey: Survey | None,
+    survey: EmptySpaceIndex | None,
     beams: Beams,
     outputs: Found | None = "all",
-    follower: Follower | None = None,
+    follower: SampleVisitor | None = None,
 ) -> tuple[Progress, tuple[Any, Any, Any]]:
     """Where the marches of all rays end, of shape (groups, GROUP), with these outputs or nothing but opacity;
     and what a follower who went along remembers of each ray, has added up for it, and over all of them."""
@@ -230,7 +231,7 @@ def _alive(march: March, at: Progress) -> Bool[Array, "*rays"]:
     return ~at.finished & (at.index < march.most_samples)
 
 
-def over_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
+def vmap_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     """A function of one ray, of arrays (rays,) and, where `of_cells`, (CELLS, rays)."""
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
 
@@ -271,11 +272,11 @@ def _segment(
         return given if divided else every(at)
 
     def measured(at: Progress, given: Any) -> list[Measured]:
-        each = over_cells(lambda ray, piece: seen.measure(ray.path(march.sample(piece))), (False, True))
+        each = vmap_cells(lambda ray, piece: seen.measure(ray.path(march.sample(piece))), (False, True))
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
-        each = over_cells(
+        each = vmap_cells(
             lambda ray, piece, read: opacity(march, ray, seen, piece, read), (False, True, True)
         )
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
@@ -286,7 +287,7 @@ def _segment(
     live = at.index[0] >= 0
     values = in_memory(live, measured, at, given)
     if seen.search is not None:
-        found = in_memory(live, lambda values: [over_cells(seen.search)(v) for v in values], values)
+        found = in_memory(live, lambda values: [vmap_cells(seen.search)(v) for v in values], values)
         values = [(*read, *more) for read, more in zip(values, found, strict=True)]
     alphas = in_memory(live, opacities, at, given, values)
     samples = Samples(list(cells(at, given)), values, alphas)
@@ -301,9 +302,9 @@ def _segment(
         ]
         samples = Samples(left_out, values, [jnp.where(takes, alpha, 0) for alpha in alphas])
     if seen.light is None:
-        colors = [over_cells(seen.classify)(read)[0] for read in values]
+        colors = [vmap_cells(seen.classify)(read)[0] for read in values]
     else:
-        colors = lit_colors(seen, march, ray, at, *samples)
+        colors = shaded_colors(seen, march, ray, at, *samples)
     blended = jax.vmap(lambda ray, at, cell: blend(march, ray, at, cell))
     taken_cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
     # unrolled, so that nothing between two cells is put in memory
@@ -349,7 +350,7 @@ def _probe(march: March, volume: Volume, seen: Classification, ray: Ray, at: Pro
 
 
 def _leap(
-    march: March, survey: Survey, notes: PyTree, beam: Int[Array, " rays"], rays: Ray, at: Progress
+    march: March, survey: EmptySpaceIndex, notes: PyTree, beam: Int[Array, " rays"], rays: Ray, at: Progress
 ) -> Progress:
     """On to the first cell that reaches into what is not known to be empty. A ray that has nothing ahead of
     it is finished."""
@@ -369,6 +370,6 @@ def _over(march: March, ray: Ray, at: Progress, cells: Int[Array, ""]) -> Progre
     return jax.tree.map(lambda a, b: jnp.where((cells > 0) & ~at.finished, a, b), gone, at)
 
 
-def _until(span: Span | None, at: Progress) -> Progress:
+def _until(span: CellRange | None, at: Progress) -> Progress:
     """Finished where nothing more is seen."""
     return at if span is None else _with(at, finished=at.finished | (at.index >= span.until))

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from .._util.checks import Arrayable
-from ..volume import Volume
 from .._util.files import Header
-from .medical import read_medical
 from .._util.npy import read_npy, read_npz
+from ..volume import Volume
+from .medical import read_medical
 from .raw import read_raw
 
 

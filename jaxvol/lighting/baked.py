@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.compaction import Chosen
 from .._util.memory import require_room
-from .._util.vec3 import Triple
+from .._util.vec3 import Vec3
 from ..volume import Volume, split
 from .shading import Lighting, Sample, Shading, Surroundings, lit
 
@@ -63,7 +63,7 @@ class BakedShading(Shading):
 
     light: BakedLighting
 
-    def about(self, around: Surroundings, sample: Sample) -> Triple:
+    def about(self, around: Surroundings, sample: Sample) -> Vec3:
         """The ratios at the sample, trilinear."""
         coordinate = around.space.coordinate(sample.point)
         ends = zip(coordinate, self.light.shape, around.volume.shape, strict=True)
@@ -86,7 +86,7 @@ class BakedShading(Shading):
         red, green, blue = (c * high / LEVELS for c, high in zip((r, g, b), self.light.highest, strict=True))
         return red, green, blue
 
-    def color(self, sample: Sample, notes: Triple, sums: Any) -> Triple:
+    def color(self, sample: Sample, notes: Vec3, sums: Any) -> Vec3:
         r, g, b = (c * ratio for c, ratio in zip(sample.color, notes, strict=True))
         return r, g, b
 
@@ -123,7 +123,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
         point = around.space.point((x, y, z))
         return Sample(point, (still, still, still), measured, color, extinction, one, (none, none))
 
-    def ratio(number: Int[Array, ""]) -> Triple:
+    def ratio(number: Int[Array, ""]) -> Vec3:
         sample = node(number)
         r, g, b = (
             new / jnp.maximum(old, DARKEST)
@@ -136,7 +136,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     chosen = Chosen.of([seen.reshape(1, -1)])
     none = jnp.zeros(count, around.volume.spacing.dtype)
 
-    def chunk(places: Int[Array, " chunk"], found: Triple) -> Triple:
+    def chunk(places: Int[Array, " chunk"], found: Vec3) -> Vec3:
         return chosen.put(found, places, jax.vmap(ratio)(jnp.minimum(places, count - 1)))
 
     ratios = jnp.stack(chosen.over(chunk, (none, none, none)), axis=-1).reshape(nx, ny, nz, 3)

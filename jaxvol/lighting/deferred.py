@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._util.compaction import CHUNK, in_front
-from .._util.vec3 import Scalar, Triple, along
+from .._util.vec3 import Scalar, Vec3, along
 from ..march import March
 from ..space import Space
 from ..transfer import Classification, Transfer
@@ -61,8 +61,8 @@ class Deferred(Lighting):
 class Line(NamedTuple):
     """A ray as it was made: origin and unit direction in the world, and (column, row) of the pixel."""
 
-    origin: Triple
-    direction: Triple
+    origin: Vec3
+    direction: Vec3
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, require
-from .._util.vec3 import Scalar, Triple, apart
+from .._util.vec3 import Scalar, Vec3, apart
 
 
 class Arriving(NamedTuple):
@@ -22,9 +22,9 @@ class Arriving(NamedTuple):
     - `irradiance`: (r, g, b) on a plane that faces the light, were nothing in between.
     """
 
-    toward: Triple
+    toward: Vec3
     distance: Scalar
-    irradiance: Triple
+    irradiance: Vec3
 
 
 class Light(eqx.Module):
@@ -35,7 +35,7 @@ class LocatedLight(Light):
     """Light that comes from a single direction at each point."""
 
     @abstractmethod
-    def at(self, point: Triple) -> Arriving:
+    def at(self, point: Vec3) -> Arriving:
         """What arrives at a world point."""
 
 
@@ -61,7 +61,7 @@ class DirectionalLight(LocatedLight):
         )
         self.irradiance = _power("irradiance", irradiance)
 
-    def at(self, point: Triple) -> Arriving:
+    def at(self, point: Vec3) -> Arriving:
         x, y, z = apart(-self.direction / jnp.linalg.norm(self.direction))
         like = jnp.zeros_like(point[0])
         r, g, b = apart(self.irradiance)
@@ -87,7 +87,7 @@ class PointLight(LocatedLight):
         self.position = finite_array("position", position, (3,))
         self.intensity = _power("intensity", intensity)
 
-    def at(self, point: Triple) -> Arriving:
+    def at(self, point: Vec3) -> Arriving:
         dx, dy, dz = (p - x for p, x in zip(apart(self.position), point, strict=True))
         # never 0, and neither is its derivative infinite, at the light itself
         squared = jnp.maximum(dx * dx + dy * dy + dz * dz, jnp.finfo(dx.dtype).tiny ** 0.5)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, integer, number, require, unit_interval
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from ..volume import Volume
 
 
@@ -151,7 +151,7 @@ def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
 
 
 def shares(
-    materials: tuple[Material, ...], volume: Volume, coordinate: Triple, value: Scalar, *, edge: float = 0.0
+    materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
 ) -> tuple[Scalar, ...]:
     """How much of a place each material has: 1 for the first that is there and 0 for all others; or, where
     they meet, shares that sum to at most 1.

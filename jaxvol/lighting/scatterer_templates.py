@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from .._util.checks import integer, is_traced, number
 from .._util.memo import kept
 from .._util.noise import hashed_uniforms
-from .._util.vec3 import Scalar, Triple, along
+from .._util.vec3 import Scalar, Vec3, along
 from ..march import March, Transform
 from ..transfer import Transfer
 from ..volume import Volume, without_voxels
@@ -286,7 +286,7 @@ class _Notes(NamedTuple):
     """The shares, made to sum to 1 if there are any."""
     optics: Optics
     template: Int[Array, ""]
-    lights: tuple[tuple[Triple | None, Scalar, Triple], ...]
+    lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
     """Of each: the direction to it and the distance, and the irradiance. No direction: from all sides."""
 
 
@@ -306,7 +306,7 @@ class TemplateShading(Shading):
     def _soft(self) -> bool:
         return self.how.occlusion == "soft"
 
-    def _shares(self, around: Surroundings, coordinate: Triple, value: Scalar) -> tuple[Scalar, ...]:
+    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
         edge = EDGE if self._soft else 0.0
         return shares(self.how.materials, around.volume, coordinate, value, edge=edge)
 
@@ -355,7 +355,7 @@ class TemplateShading(Shading):
         brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in notes.lights)
         return brightness, (r, g, b)
 
-    def color(self, sample: Sample, notes: _Notes, sums: Any) -> Triple:
+    def color(self, sample: Sample, notes: _Notes, sums: Any) -> Vec3:
         brightness, inner = sums
         matter = sum(notes.shares)
         scale = matter * WHITE * notes.optics.reflectance
@@ -368,7 +368,7 @@ class TemplateShading(Shading):
         )
         return red, green, blue
 
-    def _photon(self, notes: _Notes, number: Int[Array, ""]) -> tuple[Triple, Scalar]:
+    def _photon(self, notes: _Notes, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
         """Offset and intensity of a photon, of the sample's material; or between those of several."""
         x = y = z = intensity = jnp.zeros_like(notes.parts[0])
         for m, part in enumerate(notes.parts):
@@ -377,7 +377,7 @@ class TemplateShading(Shading):
             x, y, z = x + part * offset[0], y + part * offset[1], z + part * offset[2]
         return (x, y, z), intensity
 
-    def _visible(self, around: Surroundings, sample: Sample, offset: Triple, first: Scalar) -> Scalar:
+    def _visible(self, around: Surroundings, sample: Sample, offset: Vec3, first: Scalar) -> Scalar:
         """How much of a photon is seen from the sample, of which extinction it has itself being known."""
         further = [around.extinction(_beside(sample, offset, k)) for k in self.how.reach]
         places = [first, *further]
@@ -388,7 +388,7 @@ class TemplateShading(Shading):
         depth = sum(piece * extinction for piece, extinction in zip(pieces, places, strict=True))
         return jnp.exp(-depth * _norm(offset))
 
-    def _lit_side(self, offset: Triple, toward: Triple | None, distance: Scalar) -> Scalar:
+    def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
         """Whether a photon is nearer to the light than the sample is."""
         if toward is None:
             return jnp.ones_like(offset[0])
@@ -401,11 +401,11 @@ class TemplateShading(Shading):
         return smoothstep(0.5 + near / length / (2 * TWILIGHT))
 
 
-def _beside(sample: Sample, offset: Triple, times: float = 1.0) -> Triple:
+def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
     return along(sample.point, offset, jnp.full_like(offset[0], times))
 
 
-def _norm(offset: Triple) -> Scalar:
+def _norm(offset: Vec3) -> Scalar:
     x, y, z = offset
     return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, jnp.finfo(x.dtype).tiny ** 0.5))
 

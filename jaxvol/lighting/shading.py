@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Space
@@ -30,10 +30,10 @@ class Sample(NamedTuple):
     - `pixel`: (column, row), the key of everything random.
     """
 
-    point: Triple
-    direction: Triple
+    point: Vec3
+    direction: Vec3
     measured: Measured
-    color: Triple
+    color: Vec3
     extinction: Scalar
     transmittance: Scalar
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
@@ -47,9 +47,9 @@ class Place(NamedTuple):
     """
 
     inside: Scalar
-    coordinate: Triple
+    coordinate: Vec3
     value: Scalar
-    color: Triple
+    color: Vec3
     extinction: Scalar
 
 
@@ -63,29 +63,29 @@ class Surroundings(eqx.Module):
     """True, which XLA must not know: see `compiled.in_memory`. None: no branches, out of which a volume could
     not tell what it was asked for."""
 
-    def at(self, point: Triple) -> Place:
+    def at(self, point: Vec3) -> Place:
         """What is at a point."""
         inside, coordinate, measured = self._measured(point)
 
-        def found(measured: Measured) -> tuple[Triple, Scalar]:
+        def found(measured: Measured) -> tuple[Vec3, Scalar]:
             return self.transfer.over(self.volume).classify(measured)
 
         color, extinction = self._in_memory(found, measured)
         return Place(inside, coordinate, measured[0], color, inside * extinction)
 
-    def extinction(self, point: Triple) -> Scalar:
+    def extinction(self, point: Vec3) -> Scalar:
         """The extinction at a point, and no more."""
         inside, _, measured = self._measured(point)
         return inside * self.transfer.over(self.volume).classify(measured)[1]
 
-    def _measured(self, point: Triple) -> tuple[Scalar, Triple, Measured]:
+    def _measured(self, point: Vec3) -> tuple[Scalar, Vec3, Measured]:
         coordinate, seen = self.space.coordinate(point), self.transfer.over(self.volume)
         x, y, z = (
             jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
 
-        def measured(coordinate: Triple) -> Measured:
+        def measured(coordinate: Vec3) -> Measured:
             return seen.searched(seen.measure(coordinate))
 
         return x * y * z, coordinate, self._in_memory(measured, coordinate)
@@ -114,7 +114,7 @@ class Shading(eqx.Module):
         return ()
 
     @abstractmethod
-    def color(self, sample: Sample, notes: PyTree, sums: PyTree) -> Triple:
+    def color(self, sample: Sample, notes: PyTree, sums: PyTree) -> Vec3:
         """The colour as lit."""
 
 
@@ -142,7 +142,7 @@ def classification(
     return seen._replace(light=lambda sample: lit(shading, around, sample)[0])
 
 
-def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None) -> tuple[Triple, Any]:
+def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None) -> tuple[Vec3, Any]:
     """The colour of a sample as lit.
 
     `taps`: for a gradient of the voxels, what `replay` adds to each voxel that a term asks for: arrays with a

@@ -21,8 +21,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._util.checks import integer, is_traced, number
 from .._util.memory import require_room
-from .._util.vec3 import Scalar
 from .._util.npy import read_arrays
+from .._util.vec3 import Scalar
 from .materials import Material, Optics, materials_of, smoothstep
 
 

@@ -24,7 +24,7 @@ FEWER = 8
 Number: TypeAlias = Int[Array, " lanes"]
 
 
-class Brought(NamedTuple):
+class PathResults(NamedTuple):
     """What the walks of a queue have brought, one entry for each."""
 
     red: Float[Array, " walks"]
@@ -35,13 +35,13 @@ class Brought(NamedTuple):
     exhausted: Bool[Array, " walks"]
 
     @classmethod
-    def nothing(cls, count: int) -> "Brought":
+    def nothing(cls, count: int) -> "PathResults":
         dark, no = jnp.zeros(count, jnp.float32), jnp.zeros(count, bool)
         return cls(dark, dark, dark, no, jnp.zeros(count, jnp.int32), no)
 
-    def putting(self, number: Number, walks: Walk) -> "Brought":
+    def putting(self, number: Number, walks: Walk) -> "PathResults":
         """With what these walks have brought; a number past the last one stands for none."""
-        new = Brought(*walks.radiance, walks.met, walks.scatterings, walks.exhausted)
+        new = PathResults(*walks.radiance, walks.met, walks.scatterings, walks.exhausted)
         return jax.tree.map(lambda all_, some: all_.at[number].set(some, mode="drop"), self, new)
 
 
@@ -51,12 +51,12 @@ class _Crowd(NamedTuple):
     walks: Walk
     number: Number
     begun: Int[Array, ""]
-    brought: Brought
+    brought: PathResults
 
 
 def walk_all(
     begin: Callable[[Number], Walk], step: Callable[[Walk], Walk], count: int, lanes: int
-) -> Brought:
+) -> PathResults:
     """What all walks of a queue bring.
 
     - `begin`: the walks of these numbers, from 0 to `count`. Those past the last must not be alive.
@@ -66,7 +66,7 @@ def walk_all(
     fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)
     idle = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(begin, none))
-    crowd = _Crowd(idle, none, jnp.zeros((), jnp.int32), Brought.nothing(count))
+    crowd = _Crowd(idle, none, jnp.zeros((), jnp.int32), PathResults.nothing(count))
 
     def refilled(crowd: _Crowd) -> _Crowd:
         free = ~crowd.walks.alive

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from ..labels import LabelTransferFunction
 from ..lighting.materials import Material
 from ..occupancy import BLOCK, Blocks
@@ -39,7 +39,7 @@ class Majorants(eqx.Module):
     """
 
     table: Float[Array, " entries"]
-    last: Triple
+    last: Vec3
     shape: tuple[int, int, int] = eqx.field(static=True)
 
     @classmethod
@@ -72,7 +72,7 @@ class Majorants(eqx.Module):
         _, by, bz = (_bits(n) for n in self.shape)
         return block >> (by + bz), (block >> bz) & (2**by - 1), block & (2**bz - 1)
 
-    def holding(self, coordinate: Triple) -> Block:
+    def holding(self, coordinate: Vec3) -> Block:
         """The block that holds a grid coordinate, or the nearest one."""
         return self.block(
             *(
@@ -81,7 +81,7 @@ class Majorants(eqx.Module):
             )
         )
 
-    def within(self, coordinate: Triple, block: Block) -> Triple:
+    def within(self, coordinate: Vec3, block: Block) -> Vec3:
         """The coordinate, put back into a block that rounding may have moved it out of."""
         x, y, z = (
             jnp.clip(c, BLOCK * i.astype(c.dtype), jnp.minimum(BLOCK * (i + 1).astype(c.dtype), last))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from ..lighting.materials import Material, shares
 from ..transfer import Measured, Transfer
 from ..volume import Volume
@@ -18,8 +18,8 @@ class Medium(NamedTuple):
     - `meet`: from that to extinction (1/length) and single-scattering albedo (r, g, b) in [0, 1].
     """
 
-    measure: Callable[[Triple], Measured]
-    meet: Callable[[Measured], tuple[Scalar, Triple]]
+    measure: Callable[[Vec3], Measured]
+    meet: Callable[[Measured], tuple[Scalar, Vec3]]
 
     @classmethod
     def of(cls, volume: Volume, transfer: Transfer, materials: tuple[Material, ...] = ()) -> "Medium":
@@ -30,13 +30,13 @@ class Medium(NamedTuple):
         """
         seen = transfer.over(volume)
 
-        def measure(coordinate: Triple) -> Measured:
+        def measure(coordinate: Vec3) -> Measured:
             measured = seen.measure(coordinate)
             if not materials:
                 return measured
             return (*shares(materials, volume, coordinate, measured[0]), *measured)
 
-        def meet(measured: Measured) -> tuple[Scalar, Triple]:
+        def meet(measured: Measured) -> tuple[Scalar, Vec3]:
             share, measured = measured[: len(materials)], measured[len(materials) :]
             color, extinction = seen.classify(seen.searched(measured))
             kept = jnp.ones_like(extinction)

@@ -27,7 +27,7 @@ from ..scene import check_scene
 from ..space import Affine, enter
 from ..transfer import Transfer
 from ..volume import Volume, without_voxels
-from .lanes import Brought, walk_all
+from .lanes import PathResults, walk_all
 from .majorants import Majorants
 from .medium import Medium
 from .result import PathTraced
@@ -286,7 +286,7 @@ def _begin(scene: Scene, camera: Camera, how: _How, words: Words, wanted: Bool[A
     return Walk.begin(words, flight, direction, wanted & (ray.length > 0))
 
 
-def _summed(brought: Brought) -> tuple[Array, ...]:
+def _summed(brought: PathResults) -> tuple[Array, ...]:
     """Of (pixels, paths): mean and squared deviations of radiance, and the rest as `PathTraced` has it."""
     radiance = jnp.stack([brought.red, brought.green, brought.blue], axis=-1)
     mean = radiance.mean(axis=1)

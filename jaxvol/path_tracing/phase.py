@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 
 
 def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
@@ -32,7 +32,7 @@ def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
     return jnp.clip(numerator / jnp.square(1 + g * x), -1, 1)
 
 
-def scattered(anisotropy: Scalar, first: Scalar, second: Scalar) -> Triple:
+def scattered(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
     """A unit direction drawn from `phase` around the z axis, from two numbers in [0, 1)."""
     cosine = scattered_cosine(anisotropy, first)
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0))
@@ -40,14 +40,14 @@ def scattered(anisotropy: Scalar, first: Scalar, second: Scalar) -> Triple:
     return sine * jnp.cos(angle), sine * jnp.sin(angle), cosine
 
 
-def turned(around_z: Triple, direction: Triple) -> Triple:
+def turned(around_z: Vec3, direction: Vec3) -> Vec3:
     """A unit direction that lies around another one as `around_z` does around the z axis."""
     (x, y, cosine), (dx, dy, dz) = around_z, direction
     (a, b, c), (d, e, f) = _beside(direction)
     return _unit((x * a + y * d + cosine * dx, x * b + y * e + cosine * dy, x * c + y * f + cosine * dz))
 
 
-def _beside(direction: Triple) -> tuple[Triple, Triple]:
+def _beside(direction: Vec3) -> tuple[Vec3, Vec3]:
     """Two unit directions at right angles to a unit direction, and to each other.
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
@@ -59,7 +59,7 @@ def _beside(direction: Triple) -> tuple[Triple, Triple]:
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
-def _unit(direction: Triple) -> Triple:
+def _unit(direction: Vec3) -> Vec3:
     """A direction that is of unit length but for rounding, which would add up over many scatterings."""
     x, y, z = direction
     scale = (3 - (x * x + y * y + z * z)) / 2  # 1 / sqrt(n), to first order around 1

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._util.vec3 import Scalar, Triple, along
+from .._util.vec3 import Scalar, Vec3, along
 from ..occupancy import BLOCK
 from .majorants import Block, Majorants
 
@@ -37,8 +37,8 @@ class Flight(eqx.Module):
     - `block`: where it is. `entry`: that block's in the table of majorants.
     """
 
-    start: Triple
-    rate: Triple
+    start: Vec3
+    rate: Vec3
     depth: Scalar
     end: Scalar
     block: Block
@@ -46,7 +46,7 @@ class Flight(eqx.Module):
 
     @classmethod
     def to(
-        cls, majorants: Majorants, start: Triple, direction: Triple, spacing: Triple, distance: Scalar
+        cls, majorants: Majorants, start: Vec3, direction: Vec3, spacing: Vec3, distance: Scalar
     ) -> "Flight":
         """From a grid coordinate in a world direction, over this distance, or to the border of the grid."""
         x, y, z = (_not_0(d / step) for d, step in zip(direction, spacing, strict=True))
@@ -66,7 +66,7 @@ class Candidate(eqx.Module):
 
     found: Bool[Array, "..."]
     over: Bool[Array, "..."]
-    place: Triple
+    place: Vec3
     majorant: Scalar
 
 

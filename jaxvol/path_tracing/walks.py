@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.noise import hashed_uniforms_4
-from .._util.vec3 import Scalar, Triple, apart
+from .._util.vec3 import Scalar, Vec3, apart
 from .._util.xla import in_memory
 from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
 from ..volume import Volume
@@ -54,11 +54,11 @@ class Walk(eqx.Module):
     steps: Int[Array, ""]
     flight: Flight
     to_light: Bool[Array, ""]
-    direction: Triple
-    throughput: Triple
-    promised: Triple
+    direction: Vec3
+    throughput: Vec3
+    promised: Vec3
     clear: Scalar
-    radiance: Triple
+    radiance: Vec3
     met: Bool[Array, ""]
     scatterings: Int[Array, ""]
     alive: Bool[Array, ""]
@@ -69,7 +69,7 @@ class Walk(eqx.Module):
         cls,
         words: Words,
         flight: Flight,
-        direction: Triple,
+        direction: Vec3,
         alive: Bool[Array, ""],
     ) -> "Walk":
         """From the camera's side of the volume."""
@@ -110,20 +110,20 @@ class Scene(NamedTuple):
         return tuple(light for light in self.lights if isinstance(light, LocatedLight))
 
     @property
-    def surroundings(self) -> Triple:
+    def surroundings(self) -> Vec3:
         """Radiance from all around."""
         constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
         return apart(sum(constant, jnp.zeros(3, jnp.float32)))
 
     @property
-    def spacing(self) -> Triple:
+    def spacing(self) -> Vec3:
         return apart(self.volume.spacing)
 
-    def flight(self, start: Triple, direction: Triple, end: Scalar) -> Flight:
+    def flight(self, start: Vec3, direction: Vec3, end: Scalar) -> Flight:
         """From a grid coordinate in a world direction."""
         return Flight.to(self.majorants, start, direction, self.spacing, end)
 
-    def light(self, place: Triple, uniform: Scalar) -> Arriving:
+    def light(self, place: Vec3, uniform: Scalar) -> Arriving:
         """What arrives at a grid coordinate from one of the located lights, chosen at random, on average
         from all of them."""
         x, y, z = (o + c * s for o, c, s in zip(apart(self.volume.origin), place, self.spacing, strict=True))
@@ -141,11 +141,11 @@ class Scattering(NamedTuple):
     - `toward`, `end`: world direction, and length, of its next flight.
     """
 
-    direction: Triple
-    throughput: Triple
-    promised: Triple
+    direction: Vec3
+    throughput: Vec3
+    promised: Vec3
     to_light: Bool[Array, ""]
-    toward: Triple
+    toward: Vec3
     end: Scalar
 
 
@@ -199,7 +199,7 @@ def _onward(
 
 
 def _scattering(
-    scene: Scene, walk: Walk, place: Triple, albedo: Triple, turn: Triple, choose: Scalar, survive: Scalar
+    scene: Scene, walk: Walk, place: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
 ) -> Scattering:
     """What comes of a walk if it is scattered here, by this turn."""
     before = _times(walk.throughput, albedo)
@@ -266,7 +266,7 @@ def _looked(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survi
     )
 
 
-def _after_roulette(throughput: Triple, uniform: Scalar) -> Triple:
+def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:
     """The throughput, where it is small either 0 or as much larger as this is rare."""
     greatest = _greatest(throughput)
     small = greatest < ROULETTE
@@ -281,26 +281,26 @@ def _uniforms(walk: Walk, stage: int) -> Uniforms:
     return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
 
 
-def _where(condition: Bool[Array, ""], a: Triple, b: Triple) -> Triple:
+def _where(condition: Bool[Array, ""], a: Vec3, b: Vec3) -> Vec3:
     x, y, z = (jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
     return x, y, z
 
 
-def _times(a: Triple, b: Triple) -> Triple:
+def _times(a: Vec3, b: Vec3) -> Vec3:
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
-def _plus(a: Triple, b: Triple) -> Triple:
+def _plus(a: Vec3, b: Vec3) -> Vec3:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-def _scaled(a: Triple, factor: Scalar) -> Triple:
+def _scaled(a: Vec3, factor: Scalar) -> Vec3:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-def _dot(a: Triple, b: Triple) -> Scalar:
+def _dot(a: Vec3, b: Vec3) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _greatest(a: Triple) -> Scalar:
+def _greatest(a: Vec3) -> Scalar:
     return jnp.maximum(jnp.maximum(a[0], a[1]), a[2])

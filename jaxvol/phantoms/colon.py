@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._util.checks import integer
 from .canvas import FAR, Canvas
 from .shapes import ball, box, capsule, lengths, to_segment
-from .waves import Waves
+from .waves import RayTiles
 
 
 def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
@@ -36,7 +36,7 @@ def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
 def make(n: int, rng: np.random.Generator) -> np.ndarray:
     wall, deepest, bend = 0.035, 0.2, colon_path(161)
     length = float(lengths(bend)[-1])
-    tissue, uneven = Waves(rng, 0.15, 0.6), Waves(rng, 0.25, 0.5)
+    tissue, uneven = RayTiles(rng, 0.15, 0.6), RayTiles(rng, 0.25, 0.5)
     polyps = []
     for place in np.linspace(0.08, 0.94, 7) + rng.uniform(-0.04, 0.04, 7):
         along, out, i = rng.normal(size=3), 0.155, int(place * 160)

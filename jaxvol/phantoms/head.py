@@ -8,7 +8,7 @@ import numpy as np
 
 from .canvas import FAR, Canvas
 from .shapes import Shape, ball, box, capsule, ellipsoid, lengths, pair, tube
-from .waves import Waves
+from .waves import RayTiles
 
 
 _BRAIN = (
@@ -36,8 +36,8 @@ _SEPTUM = box((0, -0.42, -0.06), (0.011, 0.24, 0.13), 0.005)
 
 
 def make(n: int, rng: np.random.Generator) -> np.ndarray:
-    tissue = Waves(rng, 0.12, 0.5)
-    folds = Waves(rng, 0.13, 0.2)
+    tissue = RayTiles(rng, 0.12, 0.5)
+    folds = RayTiles(rng, 0.13, 0.2)
     canvas = Canvas(n)
     canvas.paint(lambda x, y, z, d: 78 + (22 + 4 * tissue(x, y, z)) * np.clip(-1 - d / 0.02, 0, 1), _skin(n))
     canvas.paint(lambda x, y, z, d: 205 + 8 * tissue(x, y, z), _bones(n))

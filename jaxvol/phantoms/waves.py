@@ -5,7 +5,7 @@ import numpy as np
 from .shapes import Block
 
 
-class Waves:
+class RayTiles:
     """A smooth random texture: a sum of plane waves with wavelengths of a given range, variance 1."""
 
     def __init__(self, rng: np.random.Generator, shortest: float, longest: float, count: int = 32):

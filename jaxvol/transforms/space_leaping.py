@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from .._util.checks import integer
-from .._util.vec3 import Scalar, Triple
+from .._util.vec3 import Scalar, Vec3
 from ..beams import Box, Stretches, stretches
-from ..march import Survey, Transform, View
+from ..march import EmptySpaceIndex, Transform, View
 from ..occupancy import FARTHEST, Occupancy, Sums
 from ..space import Ray
 
@@ -77,7 +77,7 @@ class SpaceLeaping(Transform):
         self.method = method
         self.cell = integer("cell", cell, 2)
 
-    def survey(self, occupancy: Occupancy, view: View | None) -> Survey:
+    def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
         occupancy = jax.lax.stop_gradient(occupancy)
         if self.method == "hierarchy":
             return _Beams(occupancy, occupancy.sums())
@@ -98,7 +98,7 @@ class SpaceLeaping(Transform):
         columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in (width, height))
         return columns, rows
 
-    def _published(self, distances: Survey, view: View) -> Float[Array, "rows cols"]:
+    def _published(self, distances: EmptySpaceIndex, view: View) -> Float[Array, "rows cols"]:
         """The nearest first hit of each cell's four corner rays."""
         columns, rows = self._corners(view)
         hits = view.first_hit(distances, *jnp.meshgrid(columns, rows))
@@ -132,7 +132,7 @@ class FirstHit(Transform):
         return stopped | (transmittance < 1)
 
 
-class _Beams(Survey):
+class _Beams(EmptySpaceIndex):
     """Whether a stretch of a beam is empty, from the box around it."""
 
     occupancy: Occupancy
@@ -159,7 +159,7 @@ class _Beams(Survey):
         return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
 
-class _Distances(Survey):
+class _Distances(EmptySpaceIndex):
     """How far each ray may go, from the distance of its cell to the nearest occupied one."""
 
     occupancy: Occupancy
@@ -176,7 +176,7 @@ class _Distances(Survey):
     def seen(self, notes: None) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
-    def within_spans(self) -> Survey:
+    def within_spans(self) -> EmptySpaceIndex:
         # Found out once more, by other rounding, a start may lie behind what was seen.
         return replace(self, starts=None, corner=None)
 
@@ -198,7 +198,7 @@ class _Distances(Survey):
             depth = self._leap(start, rate, rays.length, depth)
         return depth
 
-    def _leap(self, start: Triple, rate: Any, length: Scalar, depth: Scalar) -> Scalar:
+    def _leap(self, start: Vec3, rate: Any, length: Scalar, depth: Scalar) -> Scalar:
         _, ny, nz = shape = self.occupancy.occupied.shape
         point = [s + depth * r for s, r in zip(start, rate, strict=True)]
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))

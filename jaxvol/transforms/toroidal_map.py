@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import Arrayable, finite_array, number, require
-from .._util.vec3 import Scalar, Triple, along, apart
+from .._util.vec3 import Scalar, Vec3, along, apart
 from ..march import Transform
 from ..occupancy import BLOCK, Occupancy, Sums
 from ..space import Path, Space, slab_interval
@@ -131,7 +131,7 @@ class ToroidalMap(Transform):
     def locate(self, space: Space, volume: Volume) -> Space:
         return _Sector(self, volume.shape)
 
-    def _forward(self, point: Triple) -> Triple:
+    def _forward(self, point: Vec3) -> Vec3:
         x, y, z = point
         off = _hypot(y, z) - self.a
         half = math.pi / 2
@@ -150,10 +150,10 @@ class _Sector(Space):
         return jnp.linalg.norm(high - low)
 
     @property
-    def middle(self) -> Triple:
+    def middle(self) -> Vec3:
         return apart(self.probe.center)
 
-    def coordinate(self, point: Triple) -> Triple:
+    def coordinate(self, point: Vec3) -> Vec3:
         ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
         beta, sigma, gamma = (
             (value - ends[0]) / (ends[1] - ends[0]) * (n - 1)
@@ -161,7 +161,7 @@ class _Sector(Space):
         )
         return beta, sigma, gamma
 
-    def point(self, coordinate: Triple) -> Triple:
+    def point(self, coordinate: Vec3) -> Vec3:
         ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
         toroidal = [
             ends[0] + c / (n - 1) * (ends[1] - ends[0])
@@ -199,10 +199,10 @@ class _Sector(Space):
         seen = Sums.of(visible).any_between((first[0], first[1], first[2]), (last[0], last[1], last[2]))
         return Occupancy(reached & seen, low, (x, y, z))
 
-    def path(self, entry: Triple, direction: Triple) -> "_Curved":
+    def path(self, entry: Vec3, direction: Vec3) -> "_Curved":
         return _Curved(self, entry, direction)
 
-    def interval(self, origin: Triple, direction: Triple) -> tuple[Scalar, Scalar]:
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         """First entry, not behind the origin by more than `BACK`, and last exit: between them the ray may be
         outside.
 
@@ -220,13 +220,11 @@ class _Sector(Space):
         hit &= last > first
         return jnp.where(hit, first, jnp.inf), jnp.where(hit, last, -jnp.inf)
 
-    def _face(self, origin: Triple, direction: Triple, begin: Scalar, length: Scalar, sign: int) -> Scalar:
+    def _face(self, origin: Vec3, direction: Vec3, begin: Scalar, length: Scalar, sign: int) -> Scalar:
         """Where the sector begins, coming from `begin` and going at most `length` along `sign` × the ray."""
         tolerance = 8 * jnp.finfo(begin.dtype).eps * self._size
 
-        def outside_at(
-            sector: _Sector, origin: Triple, direction: Triple, t: Scalar
-        ) -> tuple[Scalar, Scalar]:
+        def outside_at(sector: _Sector, origin: Vec3, direction: Vec3, t: Scalar) -> tuple[Scalar, Scalar]:
             """How far outside the sector is, and the slope of that along the ray."""
             one = jnp.ones_like(t)
             return jax.jvp(lambda t: sector._outside(along(origin, direction, t)), (t,), (one,))
@@ -259,7 +257,7 @@ class _Sector(Space):
         probe = self.probe
         return jax.lax.stop_gradient(jnp.abs(probe.a) + probe.b + probe.gamma_range[1])
 
-    def _clear(self, point: Triple, outside: Scalar, slope: Scalar) -> Scalar:
+    def _clear(self, point: Vec3, outside: Scalar, slope: Scalar) -> Scalar:
         """How far on the face that is `outside` away, and comes nearer by `slope` < 0, is not reached yet.
 
         The distance f to each face has |f'| ≤ 1, so f is clear. Its second derivative along a line is at
@@ -274,7 +272,7 @@ class _Sector(Space):
         root = jnp.sqrt(slope * slope + 8 * outside / jnp.maximum(near, outside))
         return jnp.maximum(outside, jnp.minimum(2 * outside / (root - slope), near / 2))
 
-    def _outside(self, point: Triple) -> Scalar:
+    def _outside(self, point: Vec3) -> Scalar:
         """How far outside the sector a point is at least; negative inside."""
         x, y, z = point
         probe, half = self.probe, math.pi / 2
@@ -297,13 +295,13 @@ class _Curved(Path):
     gaps: ClassVar[bool] = True
 
     sector: _Sector
-    entry: Triple
-    direction: Triple
+    entry: Vec3
+    direction: Vec3
 
-    def __call__(self, s: Scalar) -> Triple:
+    def __call__(self, s: Scalar) -> Vec3:
         return self.sector.coordinate(along(self.entry, self.direction, s))
 
-    def contains(self, coordinate: Triple) -> Bool[Array, ""]:
+    def contains(self, coordinate: Vec3) -> Bool[Array, ""]:
         probe, inside = self.sector.probe, jnp.ones((), bool)
         rounding = 16 * float(jnp.finfo(coordinate[0].dtype).eps)
         axes = (

@@ -1,4 +1,4 @@
-"""Waves and batches do not show; nothing is compiled twice; memory does not grow with the image."""
+"""RayTiles and batches do not show; nothing is compiled twice; memory does not grow with the image."""
 
 from functools import partial
 

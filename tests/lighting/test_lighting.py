@@ -1080,7 +1080,7 @@ def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     """All of it goes through one of these, which the programs of images and gradients with a light call."""
     called = []
     for module in (seam, reference, visible):
-        for name in ("lit", "lit_colors", "Chosen", "Sample"):
+        for name in ("lit", "shaded_colors", "Chosen", "Sample"):
             if hasattr(module, name):
                 original = getattr(module, name)
 
