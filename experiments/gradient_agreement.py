@@ -8,10 +8,9 @@ that without leaps; "min_distance", which is another image, does not count there
 its nature, extinctions of 0, counts nowhere.
 
 The loss is a weighted sum of all pixels' colour and opacity. The weights vary smoothly and at random, and for
-each direction have the sign of what the pixel makes of it, so that nothing cancels. For each program rounds
-the places of samples in its own way, by 1e-4 of a voxel, and one that comes to lie beyond a face of voxels or
-a control point has the slope of the other side. A gradient that is a small difference of large sums, as that
-of an even sum of pixels by the direction of view is (of 2700 comes 5), shows that as 1e-3 and more.
+each direction have the sign of what the pixel makes of it, so that nothing cancels: a gradient that is a
+small difference of large sums, as that of an even sum of pixels by the direction of view is (of 2700 comes
+5), shows the rounding of these sums hundreds of times as large.
 
 Everything is at its default and in float32, with early termination, both proposed methods of Kye 2013, and
 volumes in the types of their files. Float voxels are a leaf of a second scene, the same volume in float32.
