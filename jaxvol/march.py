@@ -9,7 +9,7 @@ others as they are; every seam passes through all transforms in turn, so that an
 |---|---|---|
 | `locate` | which grid coordinate is this world point? | spacing and origin |
 | `start` | how many steps past the entry is the first cell? | 0 |
-| `advance` | how many steps is it to the next cell? | 1 |
+| `shift` | by how much of a step is what lies behind the first empty space moved? | 0 |
 | `cut` | which part of its cell does a sample stand for? | all of it |
 | `stop` | is this ray finished? | not before the exit |
 """
@@ -85,8 +85,7 @@ class EmptySpaceIndex(eqx.Module):
 class Transform(eqx.Module):
     """One change to a march. Override the seam that the idea is about; each default changes nothing.
 
-    All methods see one ray; the engine batches them. `memory` is what a transform remembers from
-    sample to sample along a ray: `remember` makes it, `advance` sees and replaces it.
+    All methods see one ray; the engine batches them.
     """
 
     def locate(self, space: Space, volume: Volume) -> Space:
@@ -97,25 +96,13 @@ class Transform(eqx.Module):
         """Steps from the entry to the front of the first cell; negative if `cut` trims what lies before."""
         return steps
 
-    def remember(self, ray: Ray) -> Any:
-        """The memory with which a ray begins."""
-        return None
+    def shift(self, ray: Ray) -> Scalar:
+        """By how many steps the samples behind the ray's first transparent one are moved, in [-1, 0].
 
-    def advance(
-        self, steps: Scalar, memory: Any, ray: Ray, transparent: Bool[Array, ""]
-    ) -> tuple[Scalar, Any]:
-        """Steps from this cell's front to the next one's, and the memory from there on.
-
-        `transparent` tells that the cell's opacity was 0. Only then may the answer be another than a whole
-        step, or the memory change.
-        """
-        return steps, memory
-
-    def settled(self, memory: Any) -> Bool[Array, ""]:
-        """Whether `advance` answers with whole steps from here on, whatever the samples are like. Where
-        marches leap, the first transparent sample must settle a ray: over empty space `advance` is asked
-        once, and what follows is whole steps. Asked where there is an `advance` of its own."""
-        return jnp.zeros((), bool)
+        A march applies it once on each ray, after the first cell of opacity 0, so that no more than that cell
+        is sampled again; everywhere else rays advance by whole steps. The shifts of several transforms add
+        up, and count as -1 below that."""
+        return jnp.zeros_like(ray.length)
 
     def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """What is known about empty space ahead of rays; None if nothing is. Asked once for each image.
@@ -192,24 +179,15 @@ class March(eqx.Module):
         surveys = [transform.survey(occupancy, view) for transform in self.transforms]
         return next((survey for survey in surveys if survey is not None), None)
 
-    def settled(self, memory: tuple[Any, ...]) -> Bool[Array, ""]:
-        """Whether a ray will take whole steps from here on."""
-        settled = jnp.ones((), bool)
-        for transform, remembered in zip(self.transforms, memory, strict=True):
-            # the others are, and XLA would take its time to find that out
-            if type(transform).advance is not Transform.advance:
-                settled &= transform.settled(remembered)
-        return settled
-
     @property
     def leaps(self) -> bool:
         """Whether any transform knows of empty space."""
         return any(type(transform).survey is not Transform.survey for transform in self.transforms)
 
     @property
-    def moves(self) -> bool:
-        """Whether any transform may answer with other than whole steps."""
-        return any(type(transform).advance is not Transform.advance for transform in self.transforms)
+    def may_shift(self) -> bool:
+        """Whether any transform may move samples."""
+        return any(type(transform).shift is not Transform.shift for transform in self.transforms)
 
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""
@@ -225,19 +203,13 @@ class March(eqx.Module):
             steps = transform.start(steps, ray)
         return steps
 
-    def remember(self, ray: Ray) -> tuple[Any, ...]:
-        """What the transforms remember when a ray begins."""
-        return tuple(transform.remember(ray) for transform in self.transforms)
-
-    def advance(
-        self, memory: tuple[Any, ...], ray: Ray, transparent: Bool[Array, ""]
-    ) -> tuple[Scalar, tuple[Any, ...]]:
-        """Steps to the next cell, and what is remembered there."""
-        steps, after = jnp.ones_like(ray.length), []
-        for transform, remembered in zip(self.transforms, memory, strict=True):
-            steps, remembered = transform.advance(steps, remembered, ray, transparent)
-            after.append(remembered)
-        return steps, tuple(after)
+    def shift(self, ray: Ray) -> Scalar:
+        """By how many steps what lies behind a ray's first transparent cell is moved, in [-1, 0]."""
+        shift = jnp.zeros_like(ray.length)
+        for transform in self.transforms:
+            shift = shift + transform.shift(ray)
+        # beyond that a sample would leave the cell that is known to be empty
+        return jnp.clip(shift, -1, 0)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""

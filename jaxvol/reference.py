@@ -36,7 +36,8 @@ class Progress(eqx.Module):
 
     The front of the next cell lies at `(offset + index) d`. Counting steps, rather than adding them up,
     keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps.
-    `moment` is Σ weight × depth past the entry. What is not asked for is None.
+    `moment` is Σ weight × depth past the entry. `shift`, in steps, is added to `offset` behind the first
+    transparent cell, and is 0 from then on. What is not asked for is None.
     """
 
     index: Int[Array, ""]
@@ -46,7 +47,7 @@ class Progress(eqx.Module):
     moment: Scalar | None
     met: "Met | None"
     finished: Bool[Array, ""]
-    memory: tuple[Any, ...]
+    shift: Scalar | None
 
 
 class Met(eqx.Module):
@@ -75,7 +76,7 @@ def begin(march: March, ray: Ray, outputs: Found | None = "all") -> Progress:
         moment=zero if outputs in ("all", "depth") else None,
         met=Met(count, no) if outputs == "all" else None,
         finished=no,
-        memory=march.remember(ray),
+        shift=march.shift(ray) if march.may_shift else None,
     )
 
 
@@ -155,12 +156,12 @@ def blend(
 def move(
     march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, cells: Any = 1
 ) -> Progress:
-    """On over this many cells, of which the last one, or all, may have been transparent; None for a ray that
-    is settled. The ray is finished where the next one begins past the exit."""
+    """On over this many cells, of which the last one, or all, may have been transparent; None for a ray
+    without a shift ahead. The ray is finished where the next one begins past the exit."""
     at = replace(at, index=at.index + cells)
-    if march.moves and transparent is not None:
-        steps, memory = march.advance(at.memory, ray, transparent)
-        at = replace(at, offset=at.offset + steps - 1, memory=memory)
+    if at.shift is not None and transparent is not None:
+        shift = jnp.where(transparent, at.shift, 0)
+        at = replace(at, offset=at.offset + shift, shift=jnp.where(transparent, 0, at.shift))
     return replace(at, finished=at.finished | (front(march, at) >= ray.length))
 
 

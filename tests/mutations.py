@@ -151,10 +151,10 @@ MUTATIONS = [
     ),
     # how they move on
     Mutation(
-        "advance: empty-space jitter shortens every transparent step",
-        "transforms/jitter.py",
-        "jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)",
-        "jnp.where(transparent, steps - 1 + memory, steps), memory",
+        "shift: made at every transparent cell",
+        "reference.py",
+        "at = replace(at, offset=at.offset + shift, shift=jnp.where(transparent, 0, at.shift))",
+        "at = replace(at, offset=at.offset + shift)",
         (
             "transforms/test_jitter.py::test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample",
         ),

@@ -1,5 +1,6 @@
 """The seams: what a march asks its transforms, and how transforms of one's own join in."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,15 +19,16 @@ class Shift(jv.Transform):
         return steps + 0.5
 
 
-class Stride(jv.Transform):
-    """After the first transparent sample takes half steps."""
+class Late(jv.Transform):
+    """Moves what lies behind empty space forth by part of a step."""
 
-    def remember(self, ray):
-        return jnp.zeros_like(ray.length, bool)
+    by: jax.Array
 
-    def advance(self, steps, memory, ray, transparent):
-        memory = memory | transparent
-        return jnp.where(memory, steps / 2, steps), memory
+    def __init__(self, by):
+        self.by = jnp.asarray(by, jnp.float32)  # an array, so that one program serves all
+
+    def shift(self, ray):
+        return jnp.broadcast_to(self.by, ray.length.shape)
 
 
 class Halves(jv.Transform):
@@ -86,11 +88,13 @@ def test_cut_may_divide_a_cell():
         assert aligned
 
 
-def test_advance_remembers_along_the_ray():
+@pytest.mark.parametrize(("by", "samples"), [(0.0, 7), (-0.5, 8), (-3.0, 8), (0.5, 7)])
+def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, samples):
     clear = jv.TransferFunction(np.linspace(0, 1, 8), np.ones((8, 3)), np.zeros(8))
-    rendering = jv.render_rays(BOX, clear, *RAY, jv.March(0.3, (Stride(),)))
-    assert int(rendering.samples[0]) == 14  # half steps from the first sample on
-    assert opacity((Stride(),))[1] == 7
+    rendering = jv.render_rays(BOX, clear, *RAY, jv.March(0.3, (Late(by),)))
+    # at 0, and on from 0.3 (1 + by), limited to between 0 and 0.3
+    assert int(rendering.samples[0]) == samples
+    assert opacity((Late(by),))[1] == 7, "where nothing is transparent"
 
 
 def test_locate_replaces_the_space():

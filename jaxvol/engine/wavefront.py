@@ -135,18 +135,18 @@ def march_rays(
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
     at = _with(at, finished=finished)
     together = jnp.zeros((), bool)
-    if march.moves and survey is None and follower is None:
+    if march.may_shift and survey is None and follower is None:
         at = _probe(march, volume, seen, rays, at)
-        together = _mostly(_alive(march, at) & ~_settled(march, at), of=_alive(march, at))
+        together = _mostly(_alive(march, at) & ~_regular(at), of=_alive(march, at))
     if beams.span is not None:
         over = jax.vmap(jax.vmap(partial(_over, march)))
         # those that see nothing are finished first, and so stay where they are: `first` is no index of theirs
         at = over(rays, _until(beams.span, at), beams.span.first)
 
     def wanted(at: Progress, whole: bool) -> Bool[Array, "*rays"]:
-        """Which rays a pass is for: all, or first those that are not settled, unless they are most."""
+        """Which rays a pass is for: all, or first those that may still shift, unless they are most."""
         alive = _alive(march, at)
-        return alive if whole or capped else alive & (together | ~_settled(march, at))
+        return alive if whole or capped else alive & (together | ~_regular(at))
 
     def run(
         rows: Int[Array, " batch"], state: _State, keep: Int[Array, ""], whole: bool
@@ -215,7 +215,7 @@ def march_rays(
 
     along = (None, None, None) if follower is None else (follower.kept, follower.sums, follower.total)
     state: _State = varying((at, along), rays)
-    if march.moves or capped:
+    if march.may_shift or capped:
         state = march_all(state, whole=False)
     if not capped:
         state = march_all(state, whole=True)
@@ -241,20 +241,16 @@ def _mostly(some: Bool[Array, "groups rays"], of: Bool[Array, "groups rays"]) ->
     return 2 * jnp.sum(jnp.any(some, axis=-1)) > jnp.sum(jnp.any(of, axis=-1))
 
 
-def _settled(march: March, at: Progress) -> Bool[Array, "*rays"]:
-    def of_ray(at: Progress) -> Bool[Array, "*rays"]:
-        return march.settled(at.memory)
-
-    for _ in at.finished.shape:
-        of_ray = jax.vmap(of_ray)
-    return of_ray(at)
+def _regular(at: Progress) -> Bool[Array, "*rays"]:
+    """Which rays advance by whole steps from here on."""
+    return jnp.ones(at.finished.shape, bool) if at.shift is None else at.shift == 0
 
 
 def _segment(
     march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress, *, whole: bool
 ) -> tuple[Progress, Samples]:
-    """The next cells of each ray, on to where it is finished, or has moved off the places sampled here.
-    `whole` tells that all rays are settled, and may take all the cells."""
+    """The next cells of each ray, on to where it is finished, or has shifted off the places sampled here.
+    `whole` tells that no ray shifts any more, so that each may take all the cells."""
     ahead = jnp.arange(CELLS, dtype=at.index.dtype)
 
     def every(at: Progress) -> tuple[Cell, ...]:
@@ -319,15 +315,14 @@ def _segment(
 def _taken(
     march: March, at: Progress, alphas: list[Scalar]
 ) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
-    """How many of a segment's cells a ray takes, and whether the last of them moves it. A ray that is not
-    settled goes no farther than its next transparent cell, where its samples move to other places than
-    these."""
+    """How many of a segment's cells a ray takes, and whether the last of them shifts it. A ray that may still
+    shift goes no farther than its next transparent cell, behind which its samples lie elsewhere than here."""
     left = march.most_samples - at.index
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     # not by argmax, which XLA compares pair by pair
     upto = jnp.arange(1, CELLS + 1, dtype=left.dtype)[:, None]
     first = jnp.min(jnp.where(transparent, upto, CELLS + 1), axis=0)
-    moved = ~_settled(march, at) & (first <= jnp.minimum(left, CELLS))
+    moved = ~_regular(at) & (first <= jnp.minimum(left, CELLS))
     return jnp.minimum(jnp.where(moved, first, CELLS), left), moved
 
 

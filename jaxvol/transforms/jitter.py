@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 from .._util.noise import blue_tile, hashed_uniforms, seed_word
 from .._util.vec3 import Scalar
@@ -113,14 +113,5 @@ class EmptySpaceJitter(Transform):
     def __init__(self, seed: int | Any = 0, pattern: Pattern | Any = "white"):
         self.noise = Noise(seed, pattern, stream=1)
 
-    def remember(self, ray: Ray) -> Scalar:
-        """The part of a step to take at the next transparent sample: ξ, and from then on all of it."""
-        return self.noise(ray.pixel, ray.length.dtype)
-
-    def advance(
-        self, steps: Scalar, memory: Scalar, ray: Ray, transparent: Bool[Array, ""]
-    ) -> tuple[Scalar, Scalar]:
-        return jnp.where(transparent, steps - 1 + memory, steps), jnp.where(transparent, 1, memory)
-
-    def settled(self, memory: Scalar) -> Bool[Array, ""]:
-        return memory == 1
+    def shift(self, ray: Ray) -> Scalar:
+        return self.noise(ray.pixel, ray.length.dtype) - 1
