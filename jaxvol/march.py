@@ -61,23 +61,23 @@ class EmptySpaceIndex(eqx.Module):
     """What is known about empty space. Rays come in beams: arrays of shape (beams, rays in a beam)."""
 
     @abstractmethod
-    def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
+    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
         """What is worth finding out once about these beams, from the boxes around them.
 
         `stretch`: the length over which samples are taken at once. It is of no use to know of less."""
 
     @abstractmethod
-    def seen(self, notes: Any) -> Bool[Array, "*beams"]:
+    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
         """Whether anything may be seen along each beam."""
 
     @abstractmethod
-    def clear(
-        self, notes: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    def skip_to(
+        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
         """For some of the rays, from these beams: a depth, no less than `depth`, up to which nothing is
         seen."""
 
-    def within_spans(self) -> "EmptySpaceIndex":
+    def within_ranges(self) -> "EmptySpaceIndex":
         """What of it is of use where it is known at which cells each ray begins and ends to see."""
         return self
 
@@ -104,7 +104,7 @@ class Transform(eqx.Module):
         up, and count as -1 below that."""
         return jnp.zeros_like(ray.length)
 
-    def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
+    def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """What is known about empty space ahead of rays; None if nothing is. Asked once for each image.
         `view` tells of the image that the rays belong to; None for rays of one's own."""
         return None
@@ -174,15 +174,15 @@ class March(eqx.Module):
         """`max_samples`, or its default."""
         return 2**17 if self.max_samples is None else self.max_samples
 
-    def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
+    def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """What is known about empty space, by the one transform that knows."""
-        surveys = [transform.survey(occupancy, view) for transform in self.transforms]
-        return next((survey for survey in surveys if survey is not None), None)
+        indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
+        return next((index for index in indices if index is not None), None)
 
     @property
     def leaps(self) -> bool:
         """Whether any transform knows of empty space."""
-        return any(type(transform).survey is not Transform.survey for transform in self.transforms)
+        return any(type(transform).empty_space is not Transform.empty_space for transform in self.transforms)
 
     @property
     def may_shift(self) -> bool:

@@ -18,7 +18,7 @@ from ._util.checks import Arrayable, finite_array, is_traced, require
 from ._util.sharding import shard_number, varying
 from ._util.xla import compiled, forward_only, recomputed, transformations
 from .camera import Camera
-from .engine.acceleration import Scene, VolumeAcceleration, survey_of
+from .engine.acceleration import Scene, VolumeAcceleration, empty_space_of
 from .engine.gradients import render_vjp
 from .engine.packing import with_words
 from .engine.replay import VisibleRangeRecorder
@@ -289,7 +289,7 @@ def _marched(
     volume = with_words(volume, known.words)
     direct = how.adjoint == "direct"
     waves, space = RayTiles.of(source, DIRECT_WAVE if direct else None), march.locate(volume)
-    survey = None if direct else survey_of((volume, transfer, source, march, None), known)
+    index = None if direct else empty_space_of((volume, transfer, source, march, None), known)
     seen = classification(volume, transfer, space, lighting)
     fault = has_fault(volume, transfer, march, lighting)
 
@@ -303,8 +303,8 @@ def _marched(
             )
         else:
             beams = Beams(rays, waves.beams, waves.box(source, rays, number))
-            watcher = VisibleRangeRecorder(rays.length.shape) if watch and survey is not None else None
-            at, (spans, *_) = march_rays(march, volume, seen, survey, beams, how.outputs, watcher)
+            watcher = VisibleRangeRecorder(rays.length.shape) if watch and index is not None else None
+            at, (spans, *_) = march_rays(march, volume, seen, index, beams, how.outputs, watcher)
         return vmap_rays(end)(rays, at), spans
 
     pictures, spans = jax.lax.map(wave, jnp.arange(waves.number))

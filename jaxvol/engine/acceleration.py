@@ -35,7 +35,7 @@ class VolumeAcceleration(eqx.Module):
         return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
 
 
-def survey_of(scene: Scene, known: VolumeAcceleration) -> EmptySpaceIndex | None:
+def empty_space_of(scene: Scene, known: VolumeAcceleration) -> EmptySpaceIndex | None:
     """What is known of empty space. Nothing of it has a gradient."""
     volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
     if known.blocks is None:
@@ -43,9 +43,9 @@ def survey_of(scene: Scene, known: VolumeAcceleration) -> EmptySpaceIndex | None
     space = march.locate(volume)
     occupancy = space.occupancy(transfer.visible(known.blocks) | known.blocks.unordered)
     if isinstance(source, OwnRays):
-        return march.survey(occupancy, None)
+        return march.empty_space(occupancy, None)
 
-    def first_hit(survey: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
+    def first_hit(index: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
         first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
         through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
         ends = (jnp.stack(end, axis=-1) for end in (through.origin, through.direction))
@@ -53,9 +53,9 @@ def survey_of(scene: Scene, known: VolumeAcceleration) -> EmptySpaceIndex | None
         waves = RayTiles.of(own, columns.size)
         rays = waves.rays(own, space, none)
         beams = Beams(rays, waves.beams, waves.box(own, rays, none))
-        at, _ = march_rays(first, volume, transfer.over(volume), survey, beams)
+        at, _ = march_rays(first, volume, transfer.over(volume), index, beams)
         seen = vmap_rays(end)(rays, at)
         assert isinstance(seen, Rendering)
         return waves.assemble(seen.depth[None]).reshape(columns.shape)
 
-    return march.survey(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))
+    return march.empty_space(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))

@@ -18,7 +18,7 @@ from ..reference import has_fault
 from ..rendering import DepthPicture, Picture
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
-from .acceleration import Scene, VolumeAcceleration, survey_of
+from .acceleration import Scene, VolumeAcceleration, empty_space_of
 from .packing import with_words
 from .replay import Cotangents, Replay, Total
 from .shading_gradient import Lit
@@ -39,9 +39,9 @@ def render_vjp(
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
     places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
     packed = with_words(volume, known.words)
-    waves, survey = RayTiles.of(source), survey_of(scene, known)
-    if survey is not None and spans is not None:
-        survey = survey.within_spans()
+    waves, index = RayTiles.of(source), empty_space_of(scene, known)
+    if index is not None and spans is not None:
+        index = index.within_ranges()
     seen, fault = transfer.over(packed), has_fault(volume, transfer, march, lighting)
     light, pull_light = None, None
     if lighting is not None:
@@ -64,7 +64,7 @@ def render_vjp(
             places=places,
         )
         beams = Beams(rays, waves.beams, waves.box(source, rays, number), span)
-        _, (_, of_rays, total) = march_rays(march, packed, seen, survey, beams, None, replay)
+        _, (_, of_rays, total) = march_rays(march, packed, seen, index, beams, None, replay)
         if not places:
             return (total, of_source), None
         if isinstance(gradient, DepthPicture):

@@ -36,7 +36,7 @@ from ..volume import Volume, with_voxels, without_voxels
 from .packing import with_words
 from .shading import Weighed, weighed
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
-from .voxel_gradient import RecordingVolume, scattered
+from .voxel_gradient import RecordingVolume, scatter_add
 from .wavefront import CELLS, CellRange, Samples, SampleVisitor, vmap_cells
 
 
@@ -179,7 +179,7 @@ class Replay(SampleVisitor):
         of_march, of_volume, of_rays, asked, of_voxels = self._placed(
             ray, at, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
-        voxels = None if total.voxels is None else scattered(total.voxels, asked, of_voxels)
+        voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return kept, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 

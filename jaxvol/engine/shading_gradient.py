@@ -17,7 +17,7 @@ from ..march import March
 from ..space import Ray
 from ..transfer import Classification
 from .shading import Weighed, samples_of, visible
-from .voxel_gradient import RecordingVolume, scattered
+from .voxel_gradient import RecordingVolume, scatter_add
 from .wavefront import Samples
 
 
@@ -89,7 +89,7 @@ def shading_vjp(
         real = places < size
         cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(wanted, places))
         (of_light, of_transfer), of_sample, of_taps = pull(cotangent)
-        voxels = None if total.voxels is None else scattered(total.voxels, asked, of_taps)
+        voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_taps)
         total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
         return chosen.put(found, places, part), total

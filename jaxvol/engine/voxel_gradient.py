@@ -50,7 +50,7 @@ def _kind(kind: type[Volume]) -> type[RecordingVolume]:
     return type(f"RecordingVolume{kind.__name__}", (RecordingVolume, kind), {})
 
 
-def scattered(
+def scatter_add(
     voxels: Float[Array, " voxels"], asked: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
 ) -> Float[Array, " voxels"]:
     """Parts of a gradient added to the voxels that were asked for."""

@@ -116,7 +116,7 @@ def march_rays(
     march: March,
     volume: Volume,
     seen: Classification,
-    survey: EmptySpaceIndex | None,
+    index: EmptySpaceIndex | None,
     beams: Beams,
     outputs: Found | None = "all",
     follower: SampleVisitor | None = None,
@@ -128,14 +128,14 @@ def march_rays(
     size = min(BATCH, groups)
     at = jax.vmap(jax.vmap(lambda ray: begin(march, ray, outputs)))(rays)
     finished = rays.length <= 0
-    notes = None
-    if survey is not None:
-        notes = survey.notes(beams.box, CELLS * march.step)
-        hopeful = jnp.broadcast_to(survey.seen(notes), (beams.count,))
+    prepared = None
+    if index is not None:
+        prepared = index.prepare(beams.box, CELLS * march.step)
+        hopeful = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
         finished |= ~jnp.repeat(hopeful, groups // beams.count)[:, None]
     at = _with(at, finished=finished)
     together = jnp.zeros((), bool)
-    if march.may_shift and survey is None and follower is None:
+    if march.may_shift and index is None and follower is None:
         at = _probe(march, volume, seen, rays, at)
         together = _mostly(_alive(march, at) & ~_regular(at), of=_alive(march, at))
     if beams.span is not None:
@@ -180,7 +180,7 @@ def march_rays(
 
         def go(state: _State) -> _State:
             here, along = state
-            here = here if survey is None else _leap(march, survey, notes, beam, some, here)
+            here = here if index is None else _leap(march, index, prepared, beam, some, here)
             after, samples = _segment(march, volume, seen, some, here, whole=whole)
             if follower is not None:
                 mine, more, total = along
@@ -345,12 +345,12 @@ def _probe(march: March, volume: Volume, seen: Classification, ray: Ray, at: Pro
 
 
 def _leap(
-    march: March, survey: EmptySpaceIndex, notes: PyTree, beam: Int[Array, " rays"], rays: Ray, at: Progress
+    march: March, index: EmptySpaceIndex, prepared: PyTree, beam: Int[Array, " rays"], rays: Ray, at: Progress
 ) -> Progress:
     """On to the first cell that reaches into what is not known to be empty. A ray that has nothing ahead of
     it is finished."""
     here = front(march, at)
-    there = survey.clear(notes, beam, rays, here)
+    there = index.skip_to(prepared, beam, rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     # limited before it becomes an integer, of which it may exceed the largest
     cells = jnp.minimum(

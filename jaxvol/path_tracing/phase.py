@@ -32,7 +32,7 @@ def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
     return jnp.clip(numerator / jnp.square(1 + g * x), -1, 1)
 
 
-def scattered(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
+def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
     """A unit direction drawn from `phase` around the z axis, from two numbers in [0, 1)."""
     cosine = scattered_cosine(anisotropy, first)
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0))

@@ -19,7 +19,7 @@ from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
 from ..volume import Volume
 from .majorants import Majorants
 from .medium import Medium
-from .phase import phase, scattered, turned
+from .phase import phase, sample_phase, turned
 from .tracking import Candidate, Flight, fly
 
 
@@ -159,7 +159,7 @@ def step(scene: Scene, walks: Walk) -> Walk:
     first, second = (in_memory(live, jax.vmap(lambda w, i=i: _uniforms(w, i)), walks) for i in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
     turn = in_memory(
-        live, jax.vmap(scattered, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
+        live, jax.vmap(sample_phase, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
     )
     flight, candidate = in_memory(
         live, jax.vmap(lambda flight, draw: fly(scene.majorants, flight, draw)), walks.flight, draw

@@ -77,7 +77,7 @@ class SpaceLeaping(Transform):
         self.method = method
         self.cell = integer("cell", cell, 2)
 
-    def survey(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
+    def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
         occupancy = jax.lax.stop_gradient(occupancy)
         if self.method == "hierarchy":
             return _Beams(occupancy, occupancy.sums())
@@ -138,24 +138,26 @@ class _Beams(EmptySpaceIndex):
     occupancy: Occupancy
     sums: Sums
 
-    def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
+    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
         return stretches(self.occupancy, self.sums, box(self.occupancy), stretch)
 
-    def seen(self, notes: Stretches) -> Bool[Array, " beams"]:
-        return notes.following[0] < notes.following.shape[0]
+    def any_visible(self, prepared: Stretches) -> Bool[Array, " beams"]:
+        return prepared.following[0] < prepared.following.shape[0]
 
-    def clear(
-        self, notes: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    def skip_to(
+        self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
-        count, beams = notes.following.shape
-        near = notes.near.at[beam].get(mode="promise_in_bounds")
-        place = (rays.t_in + depth - near) / notes.length
+        count, beams = prepared.following.shape
+        near = prepared.near.at[beam].get(mode="promise_in_bounds")
+        place = (rays.t_in + depth - near) / prepared.length
         stretch = jnp.clip(place.astype(jnp.int32), 0, count - 1)
         entry = stretch * beams + beam
         following = (
-            notes.following.reshape(-1).at[entry].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            prepared.following.reshape(-1)
+            .at[entry]
+            .get(mode="promise_in_bounds", wrap_negative_indices=False)
         )
-        begin = near + following.astype(depth.dtype) * notes.length - rays.t_in
+        begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in
         return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
 
@@ -170,18 +172,18 @@ class _Distances(EmptySpaceIndex):
     """Pixel in the corner of the first cell."""
     cell: int = eqx.field(static=True)
 
-    def notes(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
+    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
         return None
 
-    def seen(self, notes: None) -> Bool[Array, ""]:
+    def any_visible(self, prepared: None) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
-    def within_spans(self) -> EmptySpaceIndex:
+    def within_ranges(self) -> EmptySpaceIndex:
         # Found out once more, by other rounding, a start may lie behind what was seen.
         return replace(self, starts=None, corner=None)
 
-    def clear(
-        self, notes: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    def skip_to(
+        self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
         start = self.occupancy.cell(rays.entry)
         rate = [r / size for r, size in zip(rays.direction, self.occupancy.size, strict=True)]
