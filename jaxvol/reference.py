@@ -1,12 +1,7 @@
 """What does one ray see? The definition: one ray, one cell after the other.
 
-Every combination of transforms means what this file says. There is no acceleration here. Front to
-back, a cell of extinction σ, colour c and width w, behind opacity A, adds its weight:
-
-    α = 1 - exp(-σ w)        C ← C + (1 - A) α c        A ← A + (1 - A) α
-
-so that the weights of a ray and the transmittance T = 1 - A that is left sum to 1. It is A that is kept:
-in float32, taking thousands of small equal weights from a T near 1 would round the same way each time.
+Every combination of transforms means what this file says. There is no acceleration here. A cell of extinction
+σ and width w has the opacity α = 1 - exp(-σ w); how cells become a pixel is `compositing`'s.
 """
 
 import math
@@ -21,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, along, apart
+from .compositing import Over
 from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.shading import Lighting, Sample, classification
 from .march import Cell, March
@@ -36,15 +32,13 @@ class Progress(eqx.Module):
 
     The front of the next cell lies at `(offset + index) d`. Counting steps, rather than adding them up,
     keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps.
-    `moment` is Σ weight × depth past the entry. `shift`, in steps, is added to `offset` behind the first
+    `seen` is what the cells so far have come to. `shift`, in steps, is added to `offset` behind the first
     transparent cell, and is 0 from then on. What is not asked for is None.
     """
 
     index: Int[Array, ""]
     offset: Scalar
-    opacity: Scalar
-    color: Vec3 | None
-    moment: Scalar | None
+    seen: Over
     met: "Met | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
@@ -71,9 +65,7 @@ def begin(march: March, ray: Ray, outputs: Found | None = "all") -> Progress:
     return Progress(
         index=count,
         offset=march.start(ray),
-        opacity=zero,
-        color=None if outputs is None else (zero, zero, zero),
-        moment=zero if outputs in ("all", "depth") else None,
+        seen=Over.begin(zero, color=outputs is not None, moment=outputs in ("all", "depth")),
         met=Met(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
@@ -128,29 +120,17 @@ def blend(
     cell: tuple[tuple[Cell, Vec3, Scalar], ...],
 ) -> Progress:
     """What has been accumulated behind a cell. Of its pieces are known colour and opacity."""
-    total, color, moment, met = at.opacity, at.color, at.moment, at.met
+    seen, met = at.seen, at.met
     for piece, own, alpha in cell:
-        weight = jnp.where(at.finished, 0, (1 - total) * alpha)
-        total = total + weight
-        if color is not None:
-            r, g, b = (sum_ + weight * part for sum_, part in zip(color, own, strict=True))
-            color = r, g, b
-        if moment is not None:
-            moment = moment + weight * march.sample(piece)
+        weight = jnp.where(at.finished, 0, seen.weight(alpha))
+        seen = seen.add(weight, own, march.sample(piece))
         if met is not None:
             taken = ~at.finished & counts(march, ray, piece)
             met = Met(
                 met.samples + taken.astype(met.samples.dtype),
                 met.aligned | (piece.cut & (weight > 0)),
             )
-    return replace(
-        at,
-        opacity=total,
-        color=color,
-        moment=moment,
-        met=met,
-        finished=at.finished | march.stop(1 - total),
-    )
+    return replace(at, seen=seen, met=met, finished=at.finished | march.stop(seen.transmittance))
 
 
 def move(
@@ -176,30 +156,24 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
     measured = [measure(march, ray, seen, piece) for piece in cut]
     alphas = [opacity(march, ray, seen, piece, read) for piece, read in zip(cut, measured, strict=True)]
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    total, colors = at.opacity, []
+    before, colors = at.seen, []
     for piece, read, alpha in zip(cut, measured, alphas, strict=True):
-        colors.append(color(march, ray, seen, piece, read, 1 - total))
-        total = total + (1 - total) * alpha
+        colors.append(color(march, ray, seen, piece, read, before.transmittance))
+        before = before.add(before.weight(alpha))
     after = blend(march, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
     return move(march, ray, after, transparent)
 
 
 def end(ray: Ray, at: Progress) -> Picture:
     """What the ray has seen: with its depth, and with what it met, if it was to find that out."""
-    assert at.color is not None
     valid = ~jnp.isnan(ray.t_in)
     # by a product, since the derivative of a choice would be 0
-    rgba = jnp.stack([*at.color, at.opacity]) * jnp.where(valid, 1, jnp.nan).astype(at.opacity.dtype)
+    rgba = at.seen.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
     exhausted = ~at.finished
-    if at.moment is None:
+    if at.seen.moment is None:
         return Picture(rgba, exhausted)
-    # of NaN neither more nor less than 0 is true, and it is handed on
-    seen = ~(at.opacity <= 0)
-    # Of moment and opacity as parts of the opacity, which is so divided by 1: the derivative of a quotient
-    # divides by the square, and that of the opacity of a veil is 0 in float32.
-    whole = jax.lax.stop_gradient(jnp.where(seen, at.opacity, 1))
-    depth = ray.t_in + (at.moment / whole) / jnp.where(seen, at.opacity / whole, 1)
-    depth = jnp.where(seen | ~valid, depth, jnp.inf)
+    mean = at.seen.mean_depth()
+    depth = jnp.where(valid & jnp.isinf(mean), jnp.inf, ray.t_in + mean)
     if at.met is None:
         return DepthPicture(rgba, exhausted, depth)
     return Rendering(rgba, exhausted, depth, at.met.samples, at.met.aligned)

@@ -274,9 +274,9 @@ MUTATIONS = [
     ),
     Mutation(
         "compositing: samples weighted as if nothing lay before them",
-        "reference.py",
-        "weight = jnp.where(at.finished, 0, (1 - total) * alpha)",
-        "weight = jnp.where(at.finished, 0, alpha)",
+        "compositing.py",
+        "return (1 - self.opacity) * alpha",
+        "return alpha",
         (f"{RENDERED}[plain-left]",),
     ),
     # what is read, and what it looks like
@@ -339,8 +339,8 @@ MUTATIONS = [
     Mutation(
         "faults: an image that is NaN has the derivative 0",
         "reference.py",
-        "rgba = jnp.stack([*at.color, at.opacity]) * jnp.where(valid, 1, jnp.nan).astype(at.opacity.dtype)",
-        "rgba = jnp.where(valid, jnp.stack([*at.color, at.opacity]), jnp.nan)",
+        "rgba = at.seen.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)",
+        "rgba = jnp.where(valid, at.seen.rgba(), jnp.nan)",
         ("engine/test_faults.py::test_other_adjoints_have_no_number_either[direct]",),
     ),
     Mutation(
@@ -405,16 +405,16 @@ MUTATIONS = [
     # what a loss sees of it
     Mutation(
         "replay: the sign of what lies behind a sample",
-        "engine/replay.py",
-        "slope = left * value[k] - (whole - front)",
-        "slope = left * value[k] + (whole - front)",
+        "compositing.py",
+        "transmittance * worth - behind",
+        "transmittance * worth + behind",
         (FORWARD_GRADIENT,),
     ),
     Mutation(
         "replay: samples behind early termination have a gradient",
         "engine/replay.py",
-        "jnp.where(known.finished[i][k] | (left <= nothing), 0, slope)",
-        "jnp.where(left <= nothing, 0, slope)",
+        "slopes[i].append(jnp.where(known.finished[i][k], 0, slope))",
+        "slopes[i].append(slope)",
         (FORWARD_GRADIENT,),
     ),
     Mutation(

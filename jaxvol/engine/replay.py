@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, PyTree, UInt32
 
 from .._util.trees import added, floats
 from .._util.vec3 import Scalar, Vec3, along
+from ..compositing import pull_over
 from ..march import March
 from ..reference import Progress, contained, front, pieces
 from ..rendering import DepthPicture, Picture
@@ -232,13 +233,10 @@ class Replay(SampleVisitor):
 
 def _slopes(known: Weighed, worth: list[Scalar], whole: Scalar, front: Scalar) -> tuple[Scalar, list[Scalar]]:
     """What the samples so far are worth, and how the loss changes with each one's optical depth."""
-    # With no more than this left, what lies behind is lost in the rounding of the sums, which an opaque
-    # sample's extinction would blow up.
-    nothing = 2 * float(jnp.finfo(whole.dtype).eps)
     slopes: list[list[Scalar]] = [[] for _ in worth]
     for k in range(CELLS):
         for i, value in enumerate(worth):
-            front, left = front + known.weight[i][k] * value[k], 1 - known.behind[i][k]
-            slope = left * value[k] - (whole - front)
-            slopes[i].append(jnp.where(known.finished[i][k] | (left <= nothing), 0, slope))
+            front = front + known.weight[i][k] * value[k]
+            slope = pull_over(value[k], known.behind[i][k], whole - front)
+            slopes[i].append(jnp.where(known.finished[i][k], 0, slope))
     return front, [jnp.stack(each) for each in slopes]

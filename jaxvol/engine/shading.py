@@ -20,8 +20,8 @@ from ..transfer import Classification, Measured
 
 
 class Weighed(NamedTuple):
-    """What each of some samples, arrays (cells, rays), adds to its ray's opacity; the opacity in front of it,
-    and behind it; and whether the ray was finished before."""
+    """What each of some samples, arrays (cells, rays), adds to its ray's opacity; the transmittance in front
+    of it, and behind it; and whether the ray was finished before."""
 
     weight: list[Scalar]
     front: list[Scalar]
@@ -31,14 +31,14 @@ class Weighed(NamedTuple):
 
 def weighed(march: March, at: Progress, alphas: list[Scalar]) -> Weighed:
     """The weights of cells that come after each other, from the opacity of each of their pieces."""
-    opacity, finished = at.opacity, at.finished
+    seen, finished = at.seen, at.finished
     found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
-            weight = jnp.where(finished, 0, (1 - opacity) * alpha[k])
-            found[i].append((weight, opacity, opacity + weight, finished))
-            opacity = opacity + weight
-        finished |= jax.vmap(march.stop)(1 - opacity)
+            weight, before = jnp.where(finished, 0, seen.weight(alpha[k])), seen.transmittance
+            seen = seen.add(weight)
+            found[i].append((weight, before, seen.transmittance, finished))
+        finished |= jax.vmap(march.stop)(seen.transmittance)
     each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
     return Weighed(*(list(parts) for parts in zip(*each, strict=True)))
 
@@ -65,7 +65,7 @@ def samples_of(
     depths = [march.sample(cell) for cell in cells]
     depth, read, front = chosen.take(list(zip(depths, measured, known.front, strict=True)), places)
     color, extinction = jax.vmap(seen.classify)(read)
-    return Sample(along(entry, direction, depth), direction, read, color, extinction, 1 - front, pixel)
+    return Sample(along(entry, direction, depth), direction, read, color, extinction, front, pixel)
 
 
 def shaded_colors(
