@@ -20,7 +20,7 @@ from .compositing import Over
 from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.shading import Lighting, Sample, classification
 from .march import Cell, March
-from .rendering import DepthPicture, Found, Picture, Rendering
+from .rendering import AbstractPicture, DepthPicture, Found, Picture, Rendering
 from .scene import check_scene
 from .space import Ray, enter, invalid
 from .transfer import Classification, Measured, Transfer
@@ -164,7 +164,7 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
     return move(march, ray, after, transparent)
 
 
-def end(ray: Ray, at: Progress) -> Picture:
+def end(ray: Ray, at: Progress) -> AbstractPicture:
     """What the ray has seen: with its depth, and with what it met, if it was to find that out."""
     valid = ~jnp.isnan(ray.t_in)
     # by a product, since the derivative of a choice would be 0

@@ -28,7 +28,7 @@ from .lighting.deferred import Deferred, lit_picture
 from .lighting.shading import Lighting, classification
 from .march import March
 from .reference import begin, end, has_fault, step, steps_across
-from .rendering import Found, Outputs, Picture, Rendering
+from .rendering import AbstractPicture, Found, Outputs, Picture, Rendering
 from .scene import check_scene
 from .space import invalid
 from .transfer import Transfer
@@ -228,7 +228,7 @@ def _render(scene: Scene, how: _How, known: VolumeAcceleration) -> Any:
     return forward_only(picture, WRONG_WAY["forward"]) if how.adjoint == "forward" else picture
 
 
-def _deferred(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
+def _deferred(scene: Scene, how: _How, known: VolumeAcceleration) -> AbstractPicture:
     """An image that is rendered without light, and lit as a whole."""
     found = "all" if how.outputs == "all" else "depth"
     rendering = _render((*scene[:-1], None), replace(how, outputs=found), known)
@@ -248,7 +248,7 @@ def _light(
     return lit * jnp.where(has_fault(volume, transfer, march, lighting), jnp.nan, 1).astype(lit.dtype)
 
 
-def _replayed(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
+def _replayed(scene: Scene, how: _How, known: VolumeAcceleration) -> AbstractPicture:
     """The image; in reverse mode, its derivative by a second march."""
     if not is_traced(scene):  # a rule for derivatives takes milliseconds
         return _image_in_turn(scene, how, known)
@@ -261,19 +261,19 @@ def _replayed(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
 
 
 @eqx.filter_custom_vjp
-def _image_by_replay(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
+def _image_by_replay(scene: Scene, how: _How, known: VolumeAcceleration) -> AbstractPicture:
     return _image_in_turn(scene, how, known)
 
 
 @_image_by_replay.def_fwd
-def _(perturbed: Any, scene: Scene, how: _How, known: VolumeAcceleration) -> tuple[Picture, Any]:
+def _(perturbed: Any, scene: Scene, how: _How, known: VolumeAcceleration) -> tuple[AbstractPicture, Any]:
     rendering, spans = _watched(scene, how, known)
     return rendering, (rendering, spans)
 
 
 @_image_by_replay.def_bwd
 def _(
-    left: Any, gradient: Picture, perturbed: Any, scene: Scene, how: _How, known: VolumeAcceleration
+    left: Any, gradient: AbstractPicture, perturbed: Any, scene: Scene, how: _How, known: VolumeAcceleration
 ) -> Any:
     return _pulled(scene, perturbed, known, left, gradient)
 
@@ -283,7 +283,7 @@ _image_by_shard = eqx.filter_jit(_image_by_replay)
 
 def _marched(
     scene: Scene, how: _How, known: VolumeAcceleration, *, watch: bool = False
-) -> tuple[Picture, CellRange | None]:
+) -> tuple[AbstractPicture, CellRange | None]:
     """The image; and where rays leap, if it is to be watched, the spans of each wave's rays."""
     volume, transfer, source, march, lighting = scene
     volume = with_words(volume, known.words)
@@ -293,7 +293,7 @@ def _marched(
     seen = classification(volume, transfer, space, lighting)
     fault = has_fault(volume, transfer, march, lighting)
 
-    def wave(number: Int[Array, ""]) -> tuple[Picture, CellRange | None]:
+    def wave(number: Int[Array, ""]) -> tuple[AbstractPicture, CellRange | None]:
         rays, spans = invalid(waves.rays(source, space, number), fault), None
         if direct:
             one = vmap_rays(lambda ray, at: step(march, ray, volume, seen, at))
@@ -311,7 +311,7 @@ def _marched(
     return jax.tree.map(waves.assemble, pictures), spans
 
 
-def _only_marched(scene: Scene, how: _How, known: VolumeAcceleration) -> Picture:
+def _only_marched(scene: Scene, how: _How, known: VolumeAcceleration) -> AbstractPicture:
     return _marched(scene, how, known)[0]
 
 
@@ -319,7 +319,7 @@ def _pull(
     scene: Scene,
     perturbed: Any,
     known: VolumeAcceleration,
-    left: tuple[Picture, CellRange | None],
+    left: tuple[AbstractPicture, CellRange | None],
     gradient: Any,
 ) -> Any:
     rendering, spans = left

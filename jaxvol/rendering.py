@@ -17,16 +17,11 @@ Found: TypeAlias = Literal["all", "depth", "rgba"]
 """What is found out about rays: what is asked for, or a `DepthPicture`."""
 
 
-class Picture(eqx.Module):
-    """What rays look like. The leading shape is that of the rays: (height, width) from a camera.
+class AbstractPicture(eqx.Module):
+    """What rays look like, at least."""
 
-    - `rgba`: linear colour, premultiplied by opacity, and opacity; not yet over any background.
-    - `exhausted`: whether the ray spent `March.max_samples` before it was finished: it lacks what
-      lies behind.
-    """
-
-    rgba: Float[Array, "*rays 4"]
-    exhausted: Bool[Array, "*rays"]
+    rgba: eqx.AbstractVar[Float[Array, "*rays 4"]]
+    exhausted: eqx.AbstractVar[Bool[Array, "*rays"]]
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
         """Linear RGB over a background: one colour (3,), or an image of the same shape."""
@@ -52,23 +47,44 @@ class Picture(eqx.Module):
         return jnp.asarray(background, self.rgba.dtype)
 
 
-class DepthPicture(Picture):
-    """What rays look like, and how far away that is.
+class AbstractDepthPicture(AbstractPicture):
+    """What rays look like and how far away that is, at least."""
 
-    - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
-      adds to the opacity, world length; infinite where nothing is seen.
+    depth: eqx.AbstractVar[Float[Array, "*rays"]]
+
+
+class Picture(AbstractPicture):
+    """What rays look like. The leading shape is that of the rays: (height, width) from a camera.
+
+    - `rgba`: linear colour, premultiplied by opacity, and opacity; not yet over any background.
+    - `exhausted`: whether the ray spent `March.max_samples` before it was finished: it lacks what
+      lies behind.
     """
 
+    rgba: Float[Array, "*rays 4"]
+    exhausted: Bool[Array, "*rays"]
+
+
+class DepthPicture(AbstractDepthPicture):
+    """What deferred light needs: a `Picture`, and its `depth`, as in `Rendering`."""
+
+    rgba: Float[Array, "*rays 4"]
+    exhausted: Bool[Array, "*rays"]
     depth: Float[Array, "*rays"]
 
 
-class Rendering(DepthPicture):
-    """What rays look like, and what they met.
+class Rendering(AbstractDepthPicture):
+    """What rays look like, and what they met. `rgba` and `exhausted` as in `Picture`.
 
+    - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
+      adds to the opacity, world length; infinite where nothing is seen.
     - `samples`: samples evaluated, one for each piece into which a cell falls.
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
     """
 
+    rgba: Float[Array, "*rays 4"]
+    exhausted: Bool[Array, "*rays"]
+    depth: Float[Array, "*rays"]
     samples: Int[Array, "*rays"]
     aligned: Bool[Array, "*rays"]

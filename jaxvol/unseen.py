@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from ._util.vec3 import apart
 from .camera import Camera
-from .rendering import Picture
+from .rendering import AbstractPicture
 from .space import Affine, Ray, enter
 from .transfer import Transfer, TransferFunction
 from .volume import Volume
@@ -20,7 +20,7 @@ RAYS, POINTS = 4096, 128
 """At how many rays at most, and at how many points of each, a volume's values are looked up."""
 
 
-def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, picture: Picture) -> str | None:
+def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, picture: AbstractPicture) -> str | None:
     """Why nothing shows in an image of this scene, and what to change; None where something shows.
 
     Nothing shows where no pixel's opacity reaches 1/510, half a level of a picture of 8 bits. Values are

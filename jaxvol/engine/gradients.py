@@ -15,7 +15,7 @@ from .._util.sharding import varying
 from .._util.trees import added, floats
 from ..lighting.shading import Surroundings
 from ..reference import has_fault
-from ..rendering import DepthPicture, Picture
+from ..rendering import AbstractDepthPicture, AbstractPicture
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import Scene, VolumeAcceleration, empty_space_of
@@ -30,9 +30,9 @@ def render_vjp(
     scene: Scene,
     perturbed: Any,
     known: VolumeAcceleration,
-    rendering: Picture,
+    rendering: AbstractPicture,
     spans: CellRange | None,
-    gradient: Picture,
+    gradient: AbstractPicture,
 ) -> Any:
     """Vector–Jacobian product of `render`: a cotangent for each perturbed leaf of the scene."""
     volume, transfer, source, march, lighting = scene
@@ -47,7 +47,9 @@ def render_vjp(
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
 
-    def wave(sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, Picture, Picture]) -> Any:
+    def wave(
+        sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, AbstractPicture, AbstractPicture]
+    ) -> Any:
         (total, of_source), (number, span, rendering, gradient) = sums, given
 
         def made(moving: PyTree) -> Ray:
@@ -67,7 +69,7 @@ def render_vjp(
         _, (_, of_rays, total) = march_rays(march, packed, seen, index, beams, None, replay)
         if not places:
             return (total, of_source), None
-        if isinstance(gradient, DepthPicture):
+        if isinstance(gradient, AbstractDepthPicture):
             # a depth counts from the ray's origin, a sample's from the entry
             toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
             of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)

@@ -30,7 +30,7 @@ from .._util.vec3 import Scalar, Vec3, along
 from ..compositing import pull_over
 from ..march import March
 from ..reference import Progress, contained, front, pieces
-from ..rendering import DepthPicture, Picture
+from ..rendering import AbstractDepthPicture, AbstractPicture
 from ..space import Ray
 from ..transfer import Classification, Transfer
 from ..volume import Volume, with_voxels, without_voxels
@@ -73,11 +73,11 @@ class Cotangents(NamedTuple):
     middle: Scalar | None = None
 
     @classmethod
-    def of(cls, ray: Ray, rendering: Picture, gradient: Picture) -> "Cotangents":
+    def of(cls, ray: Ray, rendering: AbstractPicture, gradient: AbstractPicture) -> "Cotangents":
         """For rays (groups, rays in a group) and their part of the image, and of its gradient."""
         red, green, blue, opacity = (gradient.rgba[..., i] for i in range(4))
         worth = jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
-        if not (isinstance(rendering, DepthPicture) and isinstance(gradient, DepthPicture)):
+        if not (isinstance(rendering, AbstractDepthPicture) and isinstance(gradient, AbstractDepthPicture)):
             return cls((red, green, blue), opacity, worth)
         seen = rendering.rgba[..., 3] > 0
         middle = jnp.where(seen, rendering.depth - ray.t_in, 0)
