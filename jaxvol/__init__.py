@@ -53,4 +53,4 @@ from .transforms import (
     SpaceLeaping as SpaceLeaping,
     ToroidalMap as ToroidalMap,
 )
-from .volume import Volume as Volume
+from .volume import Field as Field, Volume as Volume

@@ -45,8 +45,8 @@ class Blocks(eqx.Module):
         """The blocks of a volume, from memory where its voxels and labels have been seen before."""
         labels = None if volume.labels is None else kept(volume.labels, _label_bits)
         low, high = kept(volume.data, _ranges)
-        if type(volume) is not Volume:  # it may measure other values than lie between its voxels
-            low, high, labels = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf), None
+        if volume.field is not None:  # whose values may be other than lie between the voxels
+            low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         return cls(low, high, labels)
 
     @property

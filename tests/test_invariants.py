@@ -117,11 +117,11 @@ def gaussian_opacity(camera, extinction):
     return 1 - np.exp(-depth)
 
 
-class Gaussian(jv.Volume):
+class Gaussian(jv.Field):
     """The blob itself in place of its voxels, so that the step is the only approximation."""
 
-    def value(self, coordinate):
-        x, y, z = (c * self.spacing[i] + self.origin[i] for i, c in enumerate(coordinate))
+    def value(self, volume, coordinate):
+        x, y, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
         return jnp.exp(-(x**2 + y**2 + z**2) / (2 * 0.3**2))
 
 
@@ -129,7 +129,7 @@ class Gaussian(jv.Volume):
 def test_the_error_falls_with_the_order_claimed_for_image_and_gradient(quadrature, order):
     steps = np.array([0.16, 0.08, 0.04, 0.02])
     with in_float64():
-        volume = Gaussian(np.zeros((24, 24, 24), np.float32), [2 / 23] * 3, [-1.0] * 3)
+        volume = jv.Volume(np.zeros((24, 24, 24), np.float32), [2 / 23] * 3, [-1.0] * 3, field=Gaussian())
         # aside of the middle, so that the entry face cuts the blob and the first order shows
         camera = jv.Camera((0.2, -0.35, 0.1), (0.0, 1.0, 0.0), (0, 0, 1), 60.0, size=(12, 10))
         exact = gaussian_opacity(camera, 2.0).reshape(10, 12)

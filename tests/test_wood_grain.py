@@ -45,19 +45,19 @@ def converged(scene, refined):
 SLOPE = 0.35
 
 
-class Plane(jv.Volume):
+class Plane(jv.Field):
     """The field of `jv.phantom("plane")` itself in place of its voxels."""
 
-    def value(self, coordinate):
-        x, _, z = (c * self.spacing[i] + self.origin[i] for i, c in enumerate(coordinate))
+    def value(self, volume, coordinate):
+        x, _, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
         return jax.nn.sigmoid(((z + 1) / 2 - 0.25 - SLOPE * (x + 1) / 2) / 0.004)
 
 
-class Sphere(jv.Volume):
+class Sphere(jv.Field):
     """The field of `jv.phantom("sphere")` itself in place of its voxels."""
 
-    def value(self, coordinate):
-        x, y, z = (c * self.spacing[i] + self.origin[i] for i, c in enumerate(coordinate))
+    def value(self, volume, coordinate):
+        x, y, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
         return jax.nn.sigmoid((0.5 - jnp.sqrt(x * x + y * y + z * z)) / 0.008)
 
 
@@ -69,7 +69,7 @@ def surface_transfer():
 
 
 def seen_along_z(field, scale, size=256):
-    volume = field(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3)
+    volume = jv.Volume(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3, field=field())
     camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
     return volume, surface_transfer(), camera, 2 / 128
 

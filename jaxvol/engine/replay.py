@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree, UInt32
 
+from .._util.fetching import Recording, scatter_add
 from .._util.trees import added, floats
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing import pull_over
@@ -33,11 +34,10 @@ from ..reference import Progress, contained, front, pieces
 from ..rendering import AbstractDepthPicture, AbstractPicture
 from ..space import Ray
 from ..transfer import Classification, Transfer
-from ..volume import Volume, with_voxels, without_voxels
+from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .shading import Weighed, weighed
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
-from .voxel_gradient import RecordingVolume, scatter_add
 from .wavefront import CELLS, CellRange, Samples, SampleVisitor, vmap_cells
 
 
@@ -198,7 +198,8 @@ class Replay(SampleVisitor):
         ):
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
-            here = RecordingVolume.of(placed, taps) if voxels else with_words(placed, self.words)
+            record = Recording(taps or [], [])
+            here = with_fetch(placed, record) if voxels else with_words(placed, self.words)
             found = []
             for piece in pieces(march, ray, here, front(march, at, k)):
                 depth = march.sample(piece)
@@ -206,7 +207,7 @@ class Replay(SampleVisitor):
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
                 asked = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, asked, point))
-            return found, here.asked if isinstance(here, RecordingVolume) else []
+            return found, record.asked
 
         ahead = jnp.arange(CELLS, dtype=at.index.dtype)
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))
@@ -218,12 +219,12 @@ class Replay(SampleVisitor):
         taps = []
         if voxels:
             _, asked = jax.eval_shape(lambda: all_(march, volume, ray_floats, None))
-            if not asked and type(self.volume) is not Volume:
-                kind = type(self.volume).__name__
+            if not asked and self.volume.field is not None:
+                kind = type(self.volume.field).__name__
                 raise ValueError(
-                    f"the gradient to the voxels of a {kind}, whose value asks for none by Volume.value, is"
-                    ' not known to adjoint="replay": pass adjoint="direct"; or, where values do not depend'
-                    " on its voxels, leave volume.data out of what is differentiated."
+                    f"the gradient to the voxels of a volume with the field {kind}, which asks for none by"
+                    ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
+                    " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
             taps = [jnp.zeros(place.shape, self.volume.data.dtype) for place in asked]
         _, pull, asked = jax.vjp(all_, march, volume, ray_floats, taps, has_aux=True)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._util.fetching import scatter_add
 from .._util.trees import added, floats
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Shading, Surroundings, lit
@@ -17,7 +18,6 @@ from ..march import March
 from ..space import Ray
 from ..transfer import Classification
 from .shading import Weighed, samples_of, visible
-from .voxel_gradient import RecordingVolume, scatter_add
 from .wavefront import Samples
 
 
@@ -66,7 +66,6 @@ def shading_vjp(
     chosen, around = visible(known), light.around
     size = sum(weight.size for weight in known.weight)
     moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
-    volume = around.volume if total.voxels is None else RecordingVolume.of(around.volume, None)
 
     def one(
         places: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
@@ -77,7 +76,7 @@ def shading_vjp(
 
         def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Vec3, Any]:
             (shading, space), transfer = eqx.combine(moving, fixed)
-            here = Surroundings(volume, transfer, space)
+            here = Surroundings(around.volume, transfer, space)
             each = eqx.combine(moving_sample, fixed_sample)
             return jax.vmap(lambda sample, taps: lit(shading, here, sample, taps))(each, taps)
 

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
+from .._util.fetching import Recording
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Space
 from ..transfer import Classification, Measured, Transfer
-from ..volume import Volume
+from ..volume import Volume, with_fetch
 
 
 class Sample(NamedTuple):
@@ -156,11 +157,13 @@ def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None
     @jax.checkpoint
     def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
         number, taps = each
-        volume: Any = around.volume if taps is None else around.volume.tapped(taps)  # pyright: ignore
-        live = number >= 0 if taps is None else None
+        volume, live, asked = around.volume, number >= 0, None
+        if taps is not None:
+            asked, live = [], None
+            volume = with_fetch(volume, Recording(taps, asked))
         here = Surroundings(volume, around.transfer, around.space, live)
         added = shading.term(here, sample, notes, number)
-        return jax.tree.map(jnp.add, sums, added), None if taps is None else volume.asked
+        return jax.tree.map(jnp.add, sums, added), asked
 
     if shading.terms == 0:
         return shading.color(sample, notes, None), None if taps is None else []

@@ -235,7 +235,7 @@ def _trace(
     scene, (width, height) = given.scene(), camera.size
     # walks compare, and a comparison with NaN has an answer
     # of a volume that measures in its own way nothing is known, and its ranges are infinite
-    ranges = given.blocks if type(given.volume) is Volume else None
+    ranges = given.blocks if given.volume.field is None else None
     sound = all_finite((without_voxels(given.volume), ranges, scene.majorants, given.transfer))
     sound &= all_finite((given.materials, given.lights, given.anisotropy, camera))
     pixels = how.pixels(camera)

@@ -12,11 +12,11 @@ from jaxvol.occupancy import Blocks
 from ..scenes import around, soft_transfer
 
 
-class Inverted(jv.Volume):
+class Inverted(jv.Field):
     """Dense where its voxels are 0: what is known of the voxels alone is wrong for it."""
 
-    def value(self, coordinate):
-        return 1 - super().value(coordinate) / 255
+    def value(self, volume, coordinate):
+        return 1 - volume.interpolated(coordinate) / 255
 
 
 def inverted(dtype):
@@ -24,7 +24,7 @@ def inverted(dtype):
     data = np.full((14, 14, 14), 255)
     data[3:11, 3:11, 3:11] = np.random.default_rng(0).integers(0, 60, (8, 8, 8))
     data[4:9, 4:9, 4:9] = 0
-    return Inverted(data.astype(dtype), (0.1, 0.12, 0.08))
+    return jv.Volume(data.astype(dtype), (0.1, 0.12, 0.08), field=Inverted())
 
 
 @pytest.mark.parametrize("dtype", ["uint8", pytest.param("float32", marks=pytest.mark.slow)])
@@ -78,35 +78,35 @@ def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype):
     assert error < 2 * float(jnp.finfo(dtype).eps)
 
 
-class Nearest(jv.Volume):
-    """Of its voxels, which it reads by itself."""
+class Nearest(jv.Field):
+    """Of voxels, which it reads by itself."""
 
-    def value(self, coordinate):
+    def value(self, volume, coordinate):
         i, j, k = (jnp.round(c).astype(jnp.int32) for c in coordinate)
-        return self.data[i, j, k]
-
-
-class Relabelled(jv.Volume):
-    """Of one label, whatever its labels are."""
-
-    def label(self, coordinate):
-        return jnp.ones(jnp.shape(coordinate[0]), jnp.int32)
+        return volume.data[i, j, k]
 
 
 def test_voxels_that_a_volume_reads_by_itself_have_no_gradient_by_replay():
     data = jnp.asarray(np.random.default_rng(0).random((5, 5, 5)), jnp.float32)
 
     def loss(data):
-        volume = Nearest(data)
+        volume = jv.Volume(data, field=Nearest())
         return jnp.sum(jv.render(volume, soft_transfer(), around(volume), jv.March(0.3)).rgba)
 
-    with pytest.raises(ValueError, match=r"the voxels of a Nearest, .* pass adjoint=\"direct\""):
+    with pytest.raises(
+        ValueError, match=r"the voxels of a volume with the field Nearest, .* pass adjoint=\"direct\""
+    ):
         jax.eval_shape(jax.grad(loss), data)
 
 
-def test_nothing_is_known_of_the_blocks_of_a_volume_of_another_kind():
-    data, labels = np.full((9, 9, 9), 0.5, np.float32), np.zeros((9, 9, 9), np.uint8)
-    shown = jv.LabelTransferFunction([None, soft_transfer()])
-    for kind, visible in ((jv.Volume, False), (Relabelled, True), (Inverted, True)):
-        blocks = Blocks.of(kind(data, labels=labels))
-        assert np.all(np.asarray(shown.visible(blocks)) == visible), kind
+def test_nothing_is_known_of_the_blocks_of_a_field():
+    data = np.full((9, 9, 9), 0.5, np.float32)
+    clear = jv.TransferFunction([0.0, 0.7, 1.0], np.ones((3, 3)), [0.0, 0.0, 1.0])
+    for field, visible in ((None, False), (Inverted(), True)):
+        blocks = Blocks.of(jv.Volume(data, field=field))
+        assert np.all(np.asarray(clear.visible(blocks)) == visible), field
+
+
+def test_what_is_no_field_is_named():
+    with pytest.raises(ValueError, match="field must be a jaxvol Field, or None; got"):
+        jv.Volume(np.zeros((2, 2, 2)), field=lambda volume, coordinate: 0.0)

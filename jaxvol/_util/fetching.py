@@ -1,0 +1,125 @@
+"""How are the voxels around a coordinate read from memory? One by one, from packed words, or on record."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Shaped, UInt32
+
+from .vec3 import Scalar, Vec3
+
+
+Cube: TypeAlias = list[list[list[Scalar]]]
+"""Eight voxels, [x][y][z]."""
+
+
+class Fetch(eqx.Module):
+    """How voxels are read from memory."""
+
+    @abstractmethod
+    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+        """The eight voxels around a grid coordinate, and the fractions between them."""
+
+
+class OneByOne(Fetch):
+    """Eight voxels, each by itself."""
+
+    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+        return cube_of(lambda flat: fetched(data, flat), data.shape, coordinate)
+
+
+class Packed(Fetch):
+    """From a packed copy: the same voxels, in a half or a quarter of the fetches."""
+
+    words: UInt32[Array, " voxels"]
+
+    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+        dtype = coordinate[0].dtype
+        (x, y, z), fraction = split(coordinate, data.shape)
+        _, ny, nz = data.shape
+        base = (x * ny + y) * nz + z
+        bits = 8 * data.dtype.itemsize
+        signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
+
+        def voxel(word: Int[Array, ""], place: int) -> Scalar:
+            if signed:  # its sign comes with it when it is shifted down from the top
+                return (word << (32 - bits * (place + 1)) >> (32 - bits)).astype(dtype)
+            return (word >> (bits * place) & (2**bits - 1)).astype(dtype)
+
+        def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
+            if bits == 8:
+                word = self._word(flat)
+                return [[voxel(word, 0), voxel(word, 1)], [voxel(word, 2), voxel(word, 3)]]
+            words = self._word(flat), self._word(flat + nz)
+            return [[voxel(word, 0), voxel(word, 1)] for word in words]
+
+        return [row(base), row(base + ny * nz)], fraction
+
+    def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
+        word = self.words.at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        # XLA fetches anew for each of several uses, but not for those of what a fetched value is converted to
+        return word.astype(jnp.int32)
+
+
+class Recording(Fetch):
+    """Writes down which voxels are asked for, and adds something to each: what the VJP returns for that is
+    one cotangent for each fetch.
+
+    - `added`: for each fetch in its order; empty: nothing, to find out how many there are.
+    - `asked`: places in the flattened voxels, filled while a program is traced.
+    """
+
+    added: list
+    asked: list = eqx.field(static=True)
+
+    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+        def voxel(flat: Int[Array, ""]) -> Shaped[Array, ""]:
+            self.asked.append(flat)
+            value = jax.lax.stop_gradient(fetched(data, flat))
+            return value if not self.added else value + self.added[len(self.asked) - 1]
+
+        return cube_of(voxel, data.shape, coordinate)
+
+
+def scatter_add(
+    voxels: Float[Array, " voxels"], asked: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
+) -> Float[Array, " voxels"]:
+    """Parts of a gradient added to the voxels that were asked for."""
+    for place, part in zip(asked, parts, strict=True):
+        voxels = voxels.at[place].add(
+            part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
+        )
+    return voxels
+
+
+def cube_of(
+    voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], coordinate: Vec3
+) -> tuple[Cube, Vec3]:
+    """The eight voxels around a coordinate, each by its place in the flattened array, and the fractions
+    between them."""
+    dtype = coordinate[0].dtype
+    (i, j, k), fraction = split(coordinate, shape)
+    _, ny, nz = shape
+    base = (i * ny + j) * nz + k
+    cube = [
+        [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
+    ]
+    return cube, fraction
+
+
+def split(
+    coordinate: Vec3, shape: tuple[int, ...]
+) -> tuple[tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]], Vec3]:
+    """The node below a coordinate and the fractions past it; the last node belongs to the cell below."""
+    x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
+    # the second limit also keeps NaN inside the array
+    i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
+    return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
+
+
+def fetched(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
+    """The entry at this place of the flattened array."""
+    return array.reshape(-1).at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -1,0 +1,111 @@
+"""Which arrays can be voxels, and which labels?"""
+
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .checks import Arrayable, described, finite, is_traced, require
+
+
+DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
+
+WHOLE = {
+    "uint8": (0, 2**8 - 1),
+    "int8": (-(2**7), 2**7 - 1),
+    "uint16": (0, 2**16 - 1),
+    "int16": (-(2**15), 2**15 - 1),
+    "float32": (-(2**24), 2**24),
+}
+"""The whole numbers that a type holds exactly, from the smallest type on."""
+
+
+def voxel_array(data: Arrayable) -> Array:
+    data = _array("data", data)
+    if data.ndim != 3 or min(data.shape) < 2:
+        raise ValueError(
+            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {data.shape}. "
+            "For a stack of images, stack them along the last axis."
+        )
+    if data.size >= 2**31:
+        raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
+    if data.dtype.kind in "bui" and str(data.dtype) not in DTYPES:
+        return jnp.asarray(_narrow(data))
+    if str(data.dtype) not in (*DTYPES, "float64"):
+        raise ValueError(
+            f"data must be of type {', '.join(DTYPES)}; got {data.dtype}. Convert it, for example with "
+            "data.astype(np.float32), where that keeps the values apart."
+        )
+    if data.dtype.kind in "ui":
+        return jnp.asarray(data)
+    if is_traced(data):
+        message = "data must be finite; got some voxels that are NaN or infinite. Replace them first."
+        return require(jnp.asarray(data), finite, message)
+    kept = np.asarray(data)
+    if kept.dtype == np.float64:
+        with np.errstate(over="ignore"):  # what becomes infinite is refused below
+            kept = kept.astype(jnp.result_type(float))
+    if not np.all(finite(kept)):
+        beyond = f" in {kept.dtype}, as which they are kept" if np.all(finite(np.asarray(data))) else ""
+        raise ValueError(
+            f"data must be finite{beyond}; got {np.sum(~finite(kept))} of {kept.size} voxels that are NaN or "
+            "infinite. Replace them, or rescale all, first."
+        )
+    return jnp.asarray(kept if kept.dtype != data.dtype else data)
+
+
+def _narrow(data: Array | np.ndarray) -> np.ndarray:
+    """The same whole numbers in the smallest type that voxels may have."""
+    if is_traced(data):
+        raise ValueError(
+            f"data must be of type {', '.join(DTYPES)} where they are traced; got {data.dtype}, whose range "
+            "is not known before the program runs. Convert them: data.astype(jnp.float32)."
+        )
+    low, high = int(data.min()), int(data.max())
+    for dtype, (least, most) in WHOLE.items():
+        if least <= low and high <= most:
+            return np.asarray(data).astype(dtype)
+    raise ValueError(
+        f"data must be whole numbers from -2**24 to 2**24, which float32 keeps apart; got {data.dtype} from "
+        f"{low} to {high}. Subtract an offset, or rescale them to data.astype(np.float32)."
+    )
+
+
+def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
+    labels = _array("labels", labels)
+    if labels.dtype.kind not in "bui":
+        raise ValueError(
+            f"labels must be integers; got {labels.dtype}. Convert them: labels.astype(np.int32)."
+        )
+    if labels.shape != shape:
+        raise ValueError(f"labels must stand on the grid of data, shape {shape}; got shape {labels.shape}.")
+    if labels.dtype.kind == "b":
+        return jnp.asarray(labels, jnp.uint8)
+    if labels.dtype.itemsize < 4 or labels.dtype == np.int32 or is_traced(labels):
+        return jnp.asarray(labels)
+    low, high = int(labels.min()), int(labels.max())
+    if low < -(2**31) or high >= 2**31:
+        raise ValueError(
+            f"labels must lie within int32; got {labels.dtype} from {low} to {high}. Number them anew: "
+            "np.unique(labels, return_inverse=True)."
+        )
+    return jnp.asarray(np.asarray(labels).astype(np.int32))
+
+
+def _array(name: str, value: Arrayable) -> Array | np.ndarray:
+    """An array of JAX or, in native byte order, of NumPy."""
+    if isinstance(value, str | os.PathLike):
+        raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
+    if is_traced(value) or isinstance(value, jax.Array):
+        return jnp.asarray(value)
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(
+            f"{name} must be an array without a mask; got a masked one. Fill it: data.filled(0)."
+        )
+    try:
+        array = np.asarray(value)
+    except ValueError as fault:  # sequences of different lengths
+        raise ValueError(f"{name} must be an array; got {described(value)}: {fault}") from fault
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))

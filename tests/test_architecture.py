@@ -1,0 +1,115 @@
+"""Does the house stand as its listing says? Imports go one way, and a class is abstract or final."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+import jaxvol as jv
+from jaxvol.lighting import Light
+from jaxvol.march import Transform
+from jaxvol.space import Path as RayPath
+
+
+ROOT = Path(jv.__file__).parent
+
+ORDER = [
+    "_util",
+    "volume",
+    "occupancy",
+    "space",
+    "transfer",
+    "labels",
+    "display",
+    "presets",
+    "camera",
+    "beams",
+    "march",
+    "transforms",
+    "lighting",
+    "compositing",
+    "rendering",
+    "scene",
+    "reference",
+    "engine",
+    "render",
+    "path_tracing",
+    "metrics",
+    "phantoms",
+    "formats",
+    "fitting",
+    "unseen",
+    "cli",
+    "__main__",
+    "__init__",
+]
+"""The picture, from what is rendered to who asks for it. A file imports what stands before it alone."""
+
+DO_NOTHING = {Transform, RayPath, Light}
+"""Bases without an abstract method: each of their methods has an answer that changes nothing, or they have none
+and tell what counts as one. None of them is used by itself."""
+
+
+def files():
+    return sorted(ROOT.rglob("*.py"))
+
+
+def place(file: Path) -> str:
+    """The entry of the listing that a file belongs to."""
+    return file.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def imported(file: Path) -> set[Path]:
+    """The files of the library that a file imports."""
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = file.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+            for name in [None] if node.module and not base.is_dir() else [each.name for each in node.names]:
+                module = base if name is None else base / name
+                for candidate in (module.with_suffix(".py"), module / "__init__.py", base / "__init__.py"):
+                    if candidate.is_file():
+                        found.add(candidate)
+                        break
+    return found - {file}
+
+
+def test_the_listing_is_that_of_the_picture():
+    assert {place(file) for file in files()} == set(ORDER)
+
+
+@pytest.mark.parametrize("file", files(), ids=lambda file: str(file.relative_to(ROOT)))
+def test_no_file_imports_what_comes_later(file):
+    here = ORDER.index(place(file))
+    for other in imported(file):
+        there = ORDER.index(place(other))
+        assert there <= here, f"{file.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
+        assert there < here or place(other) not in ("__init__",), other
+
+
+def test_no_folder_imports_itself_in_a_circle():
+    ahead = {file: imported(file) for file in files()}
+    while ahead:
+        free = [file for file, others in ahead.items() if not others & ahead.keys()]
+        assert free, sorted(str(file.relative_to(ROOT)) for file in ahead)
+        ahead = {file: others for file, others in ahead.items() if file not in free}
+
+
+def classes():
+    for module in pkgutil.walk_packages([str(ROOT)], "jaxvol."):
+        if module.name.endswith("__main__"):
+            continue
+        for _, kind in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
+            if kind.__module__ == module.name:
+                yield kind
+
+
+def test_a_class_is_abstract_or_final():
+    for kind in classes():
+        for base in kind.__bases__:
+            if base.__module__.startswith("jaxvol") and base not in DO_NOTHING:
+                abstract = inspect.isabstract(base) or bool(getattr(base, "__abstractvars__", ()))
+                assert abstract, f"{kind.__name__} has the base {base.__name__}, which is not abstract"
