@@ -49,8 +49,8 @@ ORDER = [
 """The picture, from what is rendered to who asks for it. A file imports what stands before it alone."""
 
 DO_NOTHING = {Transform, RayPath, Light}
-"""Bases without an abstract method: each of their methods has an answer that changes nothing, or they have none
-and tell what counts as one. None of them is used by itself."""
+"""Bases without an abstract method: each of their methods has an answer that changes nothing, or they have
+none and tell what counts as one. None of them is used by itself."""
 
 
 def files():
