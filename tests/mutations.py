@@ -359,21 +359,21 @@ MUTATIONS = [
     ),
     Mutation(
         "light: what lies behind a photon does not hide it",
-        "lighting/scatterer_templates.py",
+        "lighting/scatterers.py",
         "seen = intensity * self._visible(around, sample, offset, place.extinction)",
         "seen = intensity",
         ("lighting/test_lighting.py::test_step_2_a_wall_behind_a_photon_hides_it_within_reach[soft]",),
     ),
     Mutation(
         "light: photons on the far side from a light are lit",
-        "lighting/scatterer_templates.py",
+        "lighting/scatterers.py",
         "near = closer - length**2 / (2 * distance)",
         "near = -closer - length**2 / (2 * distance)",
         ("lighting/test_lighting.py::test_step_1_photons_toward_the_sun_are_lit[soft]",),
     ),
     Mutation(
         "light: of templates, brighter by what a material absorbs",
-        "lighting/scatterer_templates.py",
+        "lighting/scatterers.py",
         "scale = matter * WHITE * notes.optics.reflectance",
         "scale = matter * WHITE",
         ("lighting/test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
@@ -397,7 +397,7 @@ MUTATIONS = [
     ),
     Mutation(
         "light: what was baked inside a program is kept as its tracers",
-        "lighting/scatterer_templates.py",
+        "lighting/scatterers.py",
         "with jax.ensure_compile_time_eval():  #",
         "if True:  #",
         ("lighting/test_lighting.py::test_light_that_was_baked_inside_a_program_serves_outside",),

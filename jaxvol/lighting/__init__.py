@@ -8,7 +8,7 @@ from .lights import (
     PointLight as PointLight,
 )
 from .materials import Material as Material, material as material
-from .scatterer_templates import ScattererTemplates as ScattererTemplates
+from .scatterers import ScattererTemplates as ScattererTemplates
 from .shading import Lighting as Lighting
 from .template import (
     ScattererTemplate as ScattererTemplate,
