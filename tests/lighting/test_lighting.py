@@ -22,7 +22,7 @@ from jaxvol.lighting import (
     PointLight,
     ScattererTemplate,
     ScattererTemplates,
-    scatterer_templates as scatterers,
+    scatterers,
     shading as seam,
 )
 from jaxvol.lighting.baked import BakedLighting
