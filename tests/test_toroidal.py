@@ -354,7 +354,8 @@ def gap_rays():
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("quadrature", ["left", pytest.param("midpoint", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
 @pytest.mark.parametrize("step", [0.37, 11.0, 70.0])
 def test_a_gap_is_left_out_of_a_constant_volume_exactly(step, quadrature):
     origins, directions = gap_rays()
