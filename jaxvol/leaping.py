@@ -177,7 +177,7 @@ class _Distances(Survey):
         return jnp.ones((), bool)
 
     def within_spans(self) -> Survey:
-        # Found out once more, by other rounding, a start may lie behind what was seen.
+        # A ray's own span says more than a start that it shares with its neighbours.
         return replace(self, starts=None, corner=None)
 
     def clear(

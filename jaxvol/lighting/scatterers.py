@@ -88,8 +88,9 @@ class ScattererTemplates(Lighting):
     radiance of multiple scattering: 0.91 to 1.13 times as bright in constant light, 0.88 to 1.27 in
     parallel light along the normal, and 1.05 to 1.55 at an incidence of 60°, where light from beside the
     face is not yet hidden; of each the lower half where extinction is 1/λ, the upper where it is 10/λ.
-    Faces seen aslant are darker: a white sphere of opacities 0.1 to 0.7, seen whole, in samples an optical
-    depth of 2 apart, had 0.67 to 0.76 of its radiance in constant light, and 0.67 to 0.92 in parallel light.
+    Of a white sphere of opacities 0.1 to 0.7, seen whole, templates had 0.67 to 0.76 of the radiance in
+    constant light, and 0.67 to 0.92 in parallel light (in samples an optical depth of 2 apart; a fifth of
+    the step made 0.74 of 0.72).
     Where colours are darker than white, templates are too bright: in path tracing a colour darkens each of
     many scatterings, and in templates the whole once.
 
