@@ -74,7 +74,8 @@ class ScattererTemplates(Lighting):
        times its intensity, n being refractive indices, α opacities, and those of its material primed.
     6. Photons are left out where the ray's transmittance times their intensity is below `cutoff`.
 
-    What belongs to no material keeps its colour.
+    What belongs to no material keeps its colour. Where a material comes in softly, half of it is there at its
+    edge; all that is within is lit as matter of it, and keeps nothing of its own colour.
 
     **Scale.** The paper's sum is E b (c + s), in no unit. Here the intensities of a template sum to 1 (but
     for `given` ones, and printed energy, which are taken as they are), and k R makes it radiance, on the
@@ -359,7 +360,8 @@ class TemplateShading(Shading):
 
     def color(self, sample: Sample, notes: _Notes, sums: Any) -> Triple:
         brightness, inner = sums
-        matter = sum(notes.shares)
+        # all of what is at a material's edge: were a part left, it would shine by itself
+        matter = jnp.minimum(2 * sum(notes.shares), 1)
         scale = matter * WHITE * notes.optics.reflectance
         red, green, blue = (
             c * (1 - matter)
