@@ -379,6 +379,13 @@ MUTATIONS = [
         ("lighting/test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
     ),
     Mutation(
+        "light: at a material's edge a part of its matter shines by itself",
+        "lighting/scatterers.py",
+        "matter = jnp.minimum(2 * sum(notes.shares), 1)",
+        "matter = sum(notes.shares)",
+        ("test_lighting.py::test_nothing_of_a_material_shines_by_itself[soft]",),
+    ),
+    Mutation(
         "path tracing: a block's majorant without the points within its range",
         "path_tracing/majorants.py",
         "return jnp.maximum(ends, inside) + ROUNDING * extinction.max()",

@@ -188,6 +188,7 @@ def test_values_and_gradients_are_finite_at_the_extremes(extinction):
         assert np.isfinite(leaf).all(), name
 
 
+@pytest.mark.slow
 def test_alpha_correction_makes_the_image_continuous_in_the_camera():
     """Without it the image jumps when a sample crosses the exit: a derivative misses what differences see."""
     volume = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)
@@ -217,6 +218,7 @@ def test_alpha_correction_makes_the_image_continuous_in_the_camera():
     assert difference < -0.1
 
 
+@pytest.mark.slow
 def test_reference_has_second_derivatives():
     volume = scaled_phantom("constant")
     march = jv.March(0.1, (jv.AlphaCorrection(),))

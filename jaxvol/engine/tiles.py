@@ -189,7 +189,7 @@ def lines(camera: Camera, columns: Lanes, rows: Lanes) -> Line:
 
     A program that also differentiates them would round them by other roundings, 1e-4 of a voxel away; and a
     sample that comes to lie beyond a face of voxels has the slope of the other side. So they are a branch of
-    their own, of which a derivative is no part."""
+    their own, of which a derivative is no part. Of a camera that is not finite, all rays are NaN."""
     return in_memory(all_finite(camera), vmap_rays(partial(_of_pixel, camera)), columns, rows)
 
 

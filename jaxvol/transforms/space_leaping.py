@@ -179,7 +179,7 @@ class _Distances(EmptySpaceIndex):
         return jnp.ones((), bool)
 
     def within_ranges(self) -> EmptySpaceIndex:
-        # Found out once more, by other rounding, a start may lie behind what was seen.
+        # A ray's own range says more than a start that it shares with its neighbours.
         return replace(self, starts=None, corner=None)
 
     def skip_to(

@@ -27,6 +27,8 @@ from jaxvol.lighting.template import FADES, _merged, photons_above, template_lev
 from ..scenes import in_float64
 
 
+slow = pytest.mark.slow
+
 OPACITIES = (0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99)
 INDEX = 1.4
 TEMPLATES = 256
@@ -101,7 +103,7 @@ def test_the_capacity_is_that_of_the_paper():
     assert template_capacity(Material(0.5, 1.0), packets=1, threshold=0.01) == 63
 
 
-@pytest.mark.parametrize("opacity", [0.3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize("opacity", [0.5, 0.9, *(pytest.param(a, marks=slow) for a in (0.3, 0.7))])
 def test_the_printed_form_makes_and_loses_energy(opacity):
     """By a narrow cone nearly all light is refracted, so that little of it falls below the threshold."""
     template = grow(

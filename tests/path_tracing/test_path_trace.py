@@ -110,6 +110,7 @@ def middles_of(camera, exits, samples):
     return origins[:, None] + depths[..., None] * directions[:, None], directions, width
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", [around, inside])
 def test_opacity_is_that_of_absorption(view):
     volume = anisotropic_noise()

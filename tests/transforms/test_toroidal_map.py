@@ -288,9 +288,8 @@ def test_a_ray_from_the_hollow_begins_at_the_near_face():
         np.testing.assert_allclose([t_in[i], t_in[i] + length[i]], [ends[0, 0], ends[-1, 1]], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "away", [pytest.param(3e2, marks=pytest.mark.slow), pytest.param(3e4, marks=pytest.mark.slow), 1e6]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("away", [3e2, 3e4, 1e6])
 def test_a_far_camera_finds_the_faces_and_their_gradients(away):
     """Near its entry a ray begins anew, even where rounding brought it past the face."""
     probe = probe_of("across the middle")
@@ -354,7 +353,8 @@ def gap_rays():
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("quadrature", ["left", pytest.param("midpoint", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
 @pytest.mark.parametrize("step", [0.37, 11.0, 70.0])
 def test_a_gap_is_left_out_of_a_constant_volume_exactly(step, quadrature):
     origins, directions = gap_rays()
@@ -372,6 +372,7 @@ def test_a_gap_is_left_out_of_a_constant_volume_exactly(step, quadrature):
     np.testing.assert_allclose(rendering.rgba[sure, 3], -np.expm1(-0.02 * inside[sure]), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_nothing_is_seen_behind_the_axis_and_behind_the_apex():
     volume, transfer = jv.Volume(np.ones(SHAPE, np.float32)), uniform_transfer(1.0)
     for name in ("across the middle", "half a turn"):
@@ -660,6 +661,7 @@ def echo_at(name, points, shape=(65, 81, 129)):
     return np.asarray(at(jnp.asarray(points, jnp.float32)))
 
 
+@pytest.mark.slow
 def test_phantoms_hold_what_their_table_says():
     shells = np.asarray(toroidal_phantom("shells", (9, 9, 401), speckle=False)[0].data, int)
     assert np.ptp(shells, axis=(0, 1)).max() == 0
