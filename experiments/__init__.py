@@ -1,1 +1,1 @@
-"""One question a file: runs, measures, and writes its results with a chart. `python -m experiments.NAME`."""
+"""One question per file. `python -m experiments.NAME` measures it, and writes the result and a chart."""

@@ -1,4 +1,4 @@
-"""What do all experiments share? Options, whole frames with time and error, and how a chart is saved."""
+"""Shared by all experiments: command-line options, timed frames with their errors, and saving of charts."""
 
 import argparse
 import math
@@ -21,37 +21,39 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-FINER = 8  # the converged image's step; in the middle of cells, its error is some hundred times as small
+FINER = 8
+"""How many times finer the converged image's step is. By the midpoint rule, its error is some hundred times
+smaller."""
 
 
 def options(about: str | None, repetitions: int) -> argparse.ArgumentParser:
-    """What every experiment can be told; scripts add what is their own."""
+    """Parser of the options that all experiments have; scripts add their own."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=record.RESULTS, metavar="FOLDER")
     parser.add_argument("--repetitions", type=int, default=repetitions)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that the script runs")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that the script runs")
     return parser
 
 
 def data() -> Path | None:
-    """The folder of real volumes that JAXVOL_DATA names."""
+    """The folder of real volumes that JAXVOL_DATA names, or None."""
     folder = os.environ.get("JAXVOL_DATA")
     return Path(folder) if folder else None
 
 
 def frame(scene: Scene, march: jv.March) -> jv.Rendering:
-    """The image, and what its rays met."""
+    """The image with all its outputs."""
     return jv.render(scene.volume, scene.transfer, scene.camera, march)
 
 
-def image(scene: Scene, march: jv.March) -> jv.Picture:
-    """The image alone, which is what is timed."""
+def image(scene: Scene, march: jv.March) -> jv.Rendering:
+    """The image alone, as it is timed."""
     return jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
 
 
 def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[str, dict[str, Any]]:
-    """Time and error of a scene's frame under every march. Ratios are to the first of them."""
+    """Time and error of a scene's frame under every march. Ratios are relative to the first march."""
     seconds = timing.interleaved({n: lambda m=m: image(scene, m) for n, m in under.items()}, repetitions)
     truth = frame(scene, marches.converged(scene.step, FINER)).rgba
     rows = {}
@@ -64,7 +66,7 @@ def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[
 
 
 def row(seconds: list[float], base: list[float], error: float) -> dict[str, Any]:
-    """A program's time, over that of another one, with the error of its image beside it."""
+    """A program's time, its ratio to that of another program, and the error of its image."""
     return {
         "seconds": round(float(np.median(seconds)), 5),
         "ratio": timing.ratio(seconds, base),
@@ -78,6 +80,6 @@ def geometric_mean(values: Iterable[float]) -> float:
 
 
 def save(figure: Any, path: Path) -> None:
-    """Write a chart that is the same whenever it is drawn from the same results."""
+    """Write a chart. Equal results give equal files."""
     figure.savefig(path, dpi=90, metadata={"Software": None})
     plt.close(figure)

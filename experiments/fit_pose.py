@@ -1,9 +1,9 @@
-"""Is a camera's pose found from one image?
+"""Is a camera's pose recovered from one image?
 
-The camera starts turned by 10° about the volume and shifted by 5 % of its distance, in random directions;
-a fit of its six degrees of freedom by Levenberg–Marquardt leads back to 0.05° and 0.1 %, or does not: the
-share of starts from which it does is told. With images as they are, and from coarse to fine: with their
-difference blurred first, since a derivative tells of no more than what moves by less than its own size.
+The camera starts turned by 10° about the volume and shifted by 5 % of its distance, in random directions. The
+result is the share of starts from which a fit of its six degrees of freedom by Levenberg–Marquardt leads back
+to 0.05° and 0.1 %. Images are compared as they are, and from coarse to fine, with their difference blurred at
+first, since a derivative describes only features that move by less than their own size.
 """
 
 import time
@@ -27,36 +27,36 @@ ANGLE, SHIFT = 10.0, 0.05
 GOALS = {"degrees": 0.05, "shift": 1e-3}
 STEPS = 40
 SIGMAS = {"from coarse to fine": (1 / 16, 1 / 48, 0.0), "as they are": (0.0,)}
-"""Standard deviations of the blurs of a fit's stages, as part of the image's height."""
+"""Standard deviations of the blurs in the stages of a fit, as a part of the image's height."""
 
 
 class Difference(eqx.Module):
-    """The blurred difference of the image from a camera and the one that is wanted."""
+    """The blurred difference between the image from a camera and the target."""
 
     scene: tuple[jv.Volume, jv.TransferFunction, jv.March]
-    wanted: Array
+    target: Array
     kernel: Array
 
     def __call__(self, camera: jv.Camera) -> Array:
         volume, transfer, march = self.scene
         image = jv.render(volume, transfer, camera, march, adjoint="forward").image()
-        rows = jnp.tensordot(self.kernel, image - self.wanted, axes=(1, 0))
+        rows = jnp.tensordot(self.kernel, image - self.target, axes=(1, 0))
         return jnp.tensordot(self.kernel, rows, axes=(1, 1)) / np.sqrt(image.size)
 
 
 def blur(size: int, sigma: float) -> Array:
-    """The matrix that blurs a column of so many pixels by a Gaussian; the unit matrix for a sigma of 0."""
+    """Matrix that blurs a column of `size` pixels by a Gaussian; the identity for a sigma of 0."""
     away = np.subtract.outer(np.arange(size), np.arange(size)) / max(sigma * size, 1e-3)
     weights = np.exp(-(away**2) / 2)
     return jnp.asarray(weights / weights.sum(axis=1, keepdims=True), jnp.float32)
 
 
 def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, list[dict[str, Any]]]:
-    """How far from the truth each start ends, by each sequence of blurs."""
+    """How far from the truth each start ends, for each sequence of blurs."""
     volume, transfer, march = fit_transfer.head(None, resolution)
     truth = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.3)
     pose = jv.Pose(truth)
-    wanted = jv.render(volume, transfer, truth, march).image()
+    target = jv.render(volume, transfer, truth, march).image()
     rows = {}
     for name, sigmas in SIGMAS.items():
         rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, lis
             camera, losses = pose.forward(jax.tree.map(jnp.float32, off)), []
             begun = time.perf_counter()
             for sigma in sigmas:
-                residual = Difference((volume, transfer, march), wanted, blur(size, sigma))
+                residual = Difference((volume, transfer, march), target, blur(size, sigma))
                 found = jv.fit(residual, camera, max_steps=STEPS)
                 camera = found.parameters
                 losses += found.losses.tolist()
@@ -86,7 +86,7 @@ def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, lis
 
 
 def reached(rows: list[dict[str, Any]]) -> float:
-    """The share of starts that lead back."""
+    """The share of starts that lead back to within the goals."""
     return float(np.mean([all(row[key] < goal for key, goal in GOALS.items()) for row in rows]))
 
 

@@ -1,10 +1,11 @@
 """Is a transfer function recovered from four views, and do other views agree?
 
-A hidden transfer function of eight points renders four reference images of a volume. From flat grey, a fit
-finds colours and extinction, by Levenberg–Marquardt: once at the points of the truth, and once at 32 points
-evenly spaced, as one who knows nothing of the truth would. Judged by the PSNR of views that were held out.
+A hidden transfer function of eight points renders four reference images of a volume. Starting from flat grey,
+a fit recovers colours and extinction by Levenberg–Marquardt: once at the points of the truth, and once at 32
+evenly spaced points, as if nothing were known of the truth. The result is judged by the PSNR of held-out
+views.
 
-The head phantom, and the engine where JAXVOL_DATA names the folder of real volumes.
+Scenes are the head phantom and, if JAXVOL_DATA names the folder of real volumes, the engine.
 """
 
 import time
@@ -55,7 +56,7 @@ def head(folder: Path | None, resolution: int) -> Scene:
 
 
 def engine(folder: Path, resolution: int) -> Scene:
-    """Real data, thinned to about this many voxels along the longest axis."""
+    """Real data, subsampled to about `resolution` voxels along the longest axis."""
     whole = jv.load(folder / "engine_256x256x128_uint8.raw.gz")
     every = max(whole.shape) // resolution
     data = np.asarray(whole.data)[::every, ::every, ::every]
@@ -76,7 +77,7 @@ SCENES = {"head phantom": head, "engine": engine}
 
 
 def measure(scene: Scene, size: int) -> dict[str, Any]:
-    """A fit at known and at even points: loss by step, PSNR of views seen and held out."""
+    """Fits at the points of the truth and at even points: losses, PSNR of fitted and of held-out views."""
     volume, truth, march = scene
 
     def camera(direction: tuple[float, float, float]) -> jv.Camera:
@@ -96,7 +97,7 @@ def measure(scene: Scene, size: int) -> dict[str, Any]:
     for name, start in ((KNOWN, known), (EVEN, even)):
         begun = time.perf_counter()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # colours of what is transparent are not determined: recorded
+            warnings.simplefilter("ignore")  # undetermined colours of transparent points: recorded
             found = jv.fit(residual, start, max_steps=STEPS)
         rows[name] = {
             "steps": len(found.losses),

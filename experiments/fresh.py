@@ -1,7 +1,8 @@
-"""How long does the first image of a fresh process take, from its start, import and compilation included?
+"""How long does the first image of a fresh process take, including start, import and compilation?
 
-The head phantom at 256³, 512² pixels, read from a file. A process that has nothing, and one that finds what
-JAX compiled before in the folder JAX_COMPILATION_CACHE_DIR. `experiments.speed` asks.
+The head phantom of 256³ voxels is read from a file and rendered at 512² pixels: in a process without a
+compilation cache, and in one that finds compiled programs in JAX_COMPILATION_CACHE_DIR. Called by
+`experiments.speed`.
 """
 
 import json
@@ -23,7 +24,7 @@ from .scenes import seen_head
 
 
 CACHE = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-"""Small programs are kept as well."""
+"""Small programs are cached as well."""
 
 CHILD = """
 import json, sys, time
@@ -48,7 +49,7 @@ print(json.dumps(dict(zip(("import", "scene", "image"), times))))
 
 
 def measure(size: int, resolution: int, left: float, repetitions: int) -> dict[str, Any]:
-    """Seconds from the start of a process until jaxvol is imported, the scene stands, the image is there."""
+    """Seconds from the start of a process until the import, the scene and the image are done."""
     volume = jv.phantom("head", resolution)
     scene = seen_head(volume, size)
     truth = common.frame(scene, marches.converged(scene.step, common.FINER)).rgba
@@ -59,9 +60,9 @@ def measure(size: int, resolution: int, left: float, repetitions: int) -> dict[s
 
         def child(more: dict[str, str]) -> dict[str, float]:
             settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | more
-            given = [str(time.time()), str(voxels), str(size), str(left), str(image)]
+            arguments = [str(time.time()), str(voxels), str(size), str(left), str(image)]
             ran = subprocess.run(
-                [sys.executable, "-c", CHILD, *given],
+                [sys.executable, "-c", CHILD, *arguments],
                 cwd=Path(__file__).parent.parent,
                 env=settings,
                 capture_output=True,
@@ -71,7 +72,7 @@ def measure(size: int, resolution: int, left: float, repetitions: int) -> dict[s
             return json.loads(ran.stdout.splitlines()[-1])
 
         warm = {**CACHE, "JAX_COMPILATION_CACHE_DIR": str(cache)}
-        child(warm)  # fills the folder
+        child(warm)  # fills the cache
         for name, more in (("nothing kept", {}), ("compiled before", warm)):
             times = [child(more) for _ in range(repetitions)]
             found[name] = {

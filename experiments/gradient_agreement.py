@@ -1,21 +1,21 @@
-"""Is the gradient of the second march that of forward mode, on real volumes, under every way of leaping?
+"""Does the gradient of the second march agree with forward mode, on real volumes, under every leaping method?
 
-For each scene, method of `SpaceLeaping` and leaf: the gradient g by `adjoint="replay"`, and the slopes of
-the same loss along directions d by `adjoint="forward"`, another program with another rule of
-differentiation. Told is the greatest |g·d - slope| / |g| over unit directions d: all axes of a leaf of at
-most 4 numbers; for larger ones that of a gradient, and random ones. Beside it stands how far g is from
-that without leaps; "min_distance", which is another image, does not count there. What leaping leaves out by
-its nature, extinctions of 0, counts nowhere.
+For each scene, method of `SpaceLeaping` and leaf, the gradient g by `adjoint="replay"` is compared with the
+slopes of the same loss along directions d by `adjoint="forward"`, which is another program with another
+differentiation rule. The result is the largest |g·d - slope| / |g| over unit directions d: all axes for a
+leaf of at most 4 numbers; for larger leaves the direction of a gradient, and random ones. A second result is
+the distance of g from the gradient without leaps; it leaves out "min_distance", which renders another image.
+Extinctions of 0, whose gradient leaping leaves out by design, are excluded everywhere.
 
 The loss is a weighted sum of all pixels' colour and opacity. The weights vary smoothly and at random, and for
-each direction have the sign of what the pixel makes of it, so that nothing cancels: a gradient that is a
-small difference of large sums, as that of an even sum of pixels by the direction of view is (of 2700 comes
-5), shows the rounding of these sums hundreds of times as large.
+each direction they have the sign of the pixel's derivative, so that nothing cancels. A gradient that is a
+small difference of large sums, such as that of an unweighted sum of pixels by the direction of view (5 out of
+2700), shows the rounding of these sums hundreds of times as large.
 
 Everything is at its default and in float32, with early termination, both proposed methods of Kye 2013, and
 volumes in the types of their files. Float voxels are a leaf of a second scene, the same volume in float32.
 
-Real volumes are read from the folder that JAXVOL_DATA names; without one, the phantom is measured alone.
+Real volumes are read from the folder that JAXVOL_DATA names; without one, only the phantom is measured.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ from .scenes import PHANTOM, SCENES, Scene
 METHODS = ("none", "hierarchy", "distance", "beam", "min_distance")
 GOAL = 1e-4
 FEW = 4
-"""Up to so many numbers of a leaf, the slope along each is asked for."""
+"""A leaf of at most this size is probed along each of its axes."""
 
 LEAVES: dict[str, Callable[[Any], Any]] = {
     "colors": lambda s: s.transfer.colors,
@@ -65,7 +65,8 @@ class Marched(eqx.Module):
 
 
 def small(name: str) -> Callable[[Path, int], Scene]:
-    """One of the smaller volumes of the Open SciVis collection, seen whole, all but its darkest tenth."""
+    """One of the smaller volumes of the Open SciVis collection; all but the darkest tenth of values is
+    visible."""
 
     def scene(folder: Path, size: int) -> Scene:
         volume = jv.load(next(folder.glob(f"{name}_*")))
@@ -86,7 +87,7 @@ def marched(scene: Scene, method: str, seed: int) -> Marched:
 
 
 class Probe(NamedTuple):
-    """A unit direction in which to change a leaf, and weights of pixels by which nothing cancels there."""
+    """A unit direction in which to change a leaf, and pixel weights with which nothing cancels along it."""
 
     leaf: str
     direction: np.ndarray
@@ -94,15 +95,15 @@ class Probe(NamedTuple):
 
 
 class Measured:
-    """A scene under a method of leaping, some of whose leaves may change: the gradient of an image's weighted
-    sum by replay, as a user takes it, and how the image changes along a direction, by forward mode."""
+    """A scene under a method of leaping, differentiated with respect to some of its leaves: the gradient of a
+    weighted sum of the image by replay, as a user takes it, and the image's tangent by forward mode."""
 
     def __init__(self, scene: Scene, method: str, leaves: dict[str, Callable[[Any], Any]], seed: int):
         whole = marched(scene, method, seed)
-        wanted = jax.tree.map(lambda _: False, whole)
-        wanted = eqx.tree_at(lambda s: [where(s) for where in leaves.values()], wanted, [True] * len(leaves))
+        mask = jax.tree.map(lambda _: False, whole)
+        mask = eqx.tree_at(lambda s: [where(s) for where in leaves.values()], mask, [True] * len(leaves))
         self.leaves = leaves
-        self.moving, fixed = eqx.partition(whole, wanted)
+        self.moving, fixed = eqx.partition(whole, mask)
         self.visible = np.asarray(scene.transfer.extinction) > 0
 
         def image(moving: Any, adjoint: str) -> Any:
@@ -113,7 +114,7 @@ class Measured:
         self._jvp = jax.jit(lambda x, along: jax.jvp(lambda x: image(x, "forward"), (x,), (along,))[1])
 
     def _counted(self, name: str, leaf: Any) -> np.ndarray:
-        """Without what leaping leaves out."""
+        """A leaf, with 0 for what leaping leaves out."""
         return np.asarray(leaf, np.float64) * (self.visible if name == "extinction" else 1)
 
     def gradient(self, name: str, weights: np.ndarray) -> np.ndarray:
@@ -127,7 +128,7 @@ class Measured:
 
 
 def directions(gradient: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Unit directions of a leaf with this gradient; none in which the gradient of a larger leaf is 0."""
+    """Unit directions for a leaf with this gradient; in a larger leaf, 0 where its gradient is 0."""
     if gradient.size <= FEW:
         return list(np.eye(gradient.size).reshape(-1, *gradient.shape))
     random = np.random.default_rng(seed).normal(size=(2, *gradient.shape)) * (gradient != 0)
@@ -142,7 +143,7 @@ def probes(plain: Measured, size: int, seed: int) -> list[Probe]:
     for name in plain.leaves:
         for direction in directions(plain.gradient(name, uneven), seed):
             tangent = plain.tangent(name, direction)
-            if np.any(tangent):  # none of an extinction of 0
+            if np.any(tangent):  # it is 0 for an extinction of 0
                 found.append(Probe(name, direction, uneven * np.sign(tangent)))
     return found
 
@@ -162,10 +163,10 @@ def measure(scene: Scene, methods: Sequence[str], size: int, seed: int) -> dict[
                 g = here.gradient(probe.leaf, probe.weights)
                 slope = np.vdot(probe.weights, here.tangent(probe.leaf, probe.direction))
                 norm = np.linalg.norm(g)
-                told = {"from forward": abs(np.vdot(g, probe.direction) - slope) / norm}
+                errors = {"from forward": abs(np.vdot(g, probe.direction) - slope) / norm}
                 if method not in ("none", "min_distance"):
-                    told["from no leaps"] = np.linalg.norm(g - without) / norm
-                for name, error in told.items():
+                    errors["from no leaps"] = np.linalg.norm(g - without) / norm
+                for name, error in errors.items():
                     row = rows[method][name]
                     row[probe.leaf] = max(float(error), row.get(probe.leaf, 0.0))
             jax.clear_caches()

@@ -1,15 +1,16 @@
 """Which gradients are wrong, under which transform, with cells cut at the exit and without?
 
-A derivative tells how an image changes as long as no sample crosses a face. Where one does, the image of a
-march that does not cut its cells there jumps, and no derivative sees it. So each march's gradient (float64,
-`adjoint="replay"`) is summed up along a way, and compared with the change of the image from one end to the
-other (central differences of the reference engine): by the fundamental theorem both agree, unless something
-jumped on the way. The shortest way is the usual finite difference, which rarely meets a jump and so finds
-nothing wrong; the longest moves samples by about a step, as a step of a fit does.
+A derivative describes how an image changes as long as no sample crosses a face. Where one does, the image of
+a march that does not cut its cells there jumps, and no derivative sees it. So the gradient of each march
+(float64, `adjoint="replay"`) is integrated along a move of a leaf, and compared with the change of the image
+between the ends of the move (central differences of the reference engine). By the fundamental theorem of
+calculus both agree, unless something jumped in between. The shortest move is the usual finite difference,
+which rarely meets a jump and so finds nothing wrong; the longest moves samples by about a step, as a step of
+a fit does.
 
-The scene has material at all faces of the volume, empty space in its middle, and, in the marches that tell of
-labels, a segmentation with a function for each label. Error: |sum of the gradients - change| over the larger
-of the two, of several weightings of the image and directions of each leaf.
+The scene has material at all faces of the volume, empty space in its middle and, in the marches named
+"labels", a segmentation with a transfer function for each label. Error: |sum of the gradients - change| over
+the larger of the two, over several weightings of the image and directions of each leaf.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,10 +32,10 @@ from .common import plt
 
 STEP = 0.11
 WIDTHS = {1e-5: 1, 0.1: 8, 1.0: 48}
-"""Half the lengths of ways, in the units of `Leaf`: moves of about a step. And at how many of its points the
-gradient is taken."""
+"""Half the lengths of moves, in the units of `Leaf` (which move samples by about a step), and the number of
+points of a move at which the gradient is taken."""
 WRONG = 0.1
-"""An error from which on a gradient counts as wrong: what is right has kinks, and errs by less."""
+"""Error from which a gradient counts as wrong. Correct gradients have kinks, and err by less."""
 WEIGHTINGS, DIRECTIONS = 6, 2
 LEFT = 0.3
 NOTE = f"EarlyTermination leaves {LEFT:g} here, by default 1/255: its jumps are as large as what it leaves."
@@ -64,7 +65,7 @@ LEAVES = {
     "origin": Leaf(lambda s: s[0].origin, lambda x: STEP),
     "step": Leaf(lambda s: s[3].step, lambda x: STEP / 24),
     "colours": Leaf(lambda s: functions(s).colors, lambda x: 0.1),
-    # what is hidden stays so: that an extinction of 0 may grow is a matter of leaps, not of jumps
+    # an extinction of 0 stays 0: that it may grow is a matter of leaps, not of jumps
     "extinction": Leaf(lambda s: functions(s).extinction, lambda x: 0.1 * x),
     "voxels": Leaf(lambda s: s[0].data, lambda x: 0.02),
 }
@@ -89,7 +90,7 @@ def marches() -> dict[str, tuple[jv.Transform, ...]]:
 
 
 def scene_of(name: str, quadrature: str, size: int) -> Scene:
-    """A smooth field whose rim is seen and whose middle is not."""
+    """A smooth field that is visible at its rim and invisible in its middle."""
     shape, spacing, origin = (9, 8, 10), (0.3, 0.35, 0.25), (-0.5, 0.2, 0.1)
     x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     data = 0.15 + 0.25 * (x**2 + 0.8 * y**2 + 1.1 * z**2) + 0.1 * np.sin(2 * x + 3 * y - z)
@@ -114,52 +115,53 @@ def _doubled(leaf: Any) -> Any:
 def measure(
     name: str, quadrature: str, size: int, seed: int, leaves: Sequence[str], widths: dict[float, int]
 ) -> dict[str, list[float]]:
-    """Relative error of the gradient to each leaf, along ways of each width."""
+    """Relative error of the gradient with respect to each leaf, over moves of each width."""
     scene, rng = scene_of(name, quadrature, size), np.random.default_rng(seed)
     weights = jnp.asarray(rng.normal(size=(WEIGHTINGS, size, size, 4)))
 
     @eqx.filter_jit
     def losses(scene: Scene) -> Array:
-        """Of the image as it is defined."""
+        """Weighted sums of the reference engine's image."""
         return jnp.tensordot(weights, jv.render(*scene, adjoint="direct").rgba, axes=3)
 
     @eqx.filter_jit
     def gradients(scene: Scene) -> Any:
-        """Of the losses of the image as it is rendered."""
+        """Gradients of these sums for the image of the fast engine."""
         _, pull = eqx.filter_vjp(lambda scene: jv.render(*scene).rgba, scene)
         return jax.vmap(lambda weight: pull(weight)[0])(weights)
 
-    def along(where: Callable[[Scene], Array], way: Array, points: int) -> tuple[np.ndarray, np.ndarray]:
-        """How the losses change along a way, to either side of the scene: as gradients tell, and in truth."""
+    def changes(where: Callable[[Scene], Array], move: Array, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """Change of the losses from -`move` to +`move` around the scene: the gradients' integral, and the
+        true one."""
 
         def moved(part: float) -> Scene:
-            return eqx.tree_at(where, scene, where(scene) + part * way)
+            return eqx.tree_at(where, scene, where(scene) + part * move)
 
         parts = (np.arange(points) + 0.5) / points * 2 - 1
-        slopes = [where(gradients(moved(part))).reshape(WEIGHTINGS, -1) @ way.reshape(-1) for part in parts]
+        slopes = [where(gradients(moved(part))).reshape(WEIGHTINGS, -1) @ move.reshape(-1) for part in parts]
         return 2 * np.mean(slopes, axis=0), np.asarray(losses(moved(1.0)) - losses(moved(-1.0)))
 
     found: dict[str, list[float]] = {}
     for leaf in leaves:
         where, unit = LEAVES[leaf]
-        ways = [
+        moves = [
             jnp.asarray(rng.normal(size=where(scene).shape)) * unit(where(scene)) for _ in range(DIRECTIONS)
         ]
         found[leaf] = [
-            _relative(*zip(*(along(where, width * way, points) for way in ways), strict=True))
+            _relative(*zip(*(changes(where, width * move, points) for move in moves), strict=True))
             for width, points in widths.items()
         ]
     return found
 
 
-def _relative(told: Sequence[np.ndarray], true: Sequence[np.ndarray]) -> float:
-    told, true = np.stack(told), np.stack(true)
-    largest = max(np.linalg.norm(told), np.linalg.norm(true))
-    return float(np.linalg.norm(told - true) / largest)
+def _relative(integrals: Sequence[np.ndarray], changes: Sequence[np.ndarray]) -> float:
+    integral, change = np.stack(integrals), np.stack(changes)
+    largest = max(np.linalg.norm(integral), np.linalg.norm(change))
+    return float(np.linalg.norm(integral - change) / largest)
 
 
 def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path) -> None:
-    """Marches by leaves, for each quadrature and width."""
+    """A heat map of marches by leaves, for each quadrature and width."""
     names, leaves = list(next(iter(result.values()))), list(LEAVES)
     figure, axes = plt.subplots(
         len(result),
@@ -206,8 +208,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             for name in names:
                 found = measure(name, quadrature, chosen.size, chosen.seed, leaves, widths)
                 result[quadrature][name] = found
-                told = ", ".join(f"{leaf} {errors[-1]:.2g}" for leaf, errors in found.items())
-                print(f"{quadrature:8} {name:36} {told}", flush=True)
+                summary = ", ".join(f"{leaf} {errors[-1]:.2g}" for leaf, errors in found.items())
+                print(f"{quadrature:8} {name:36} {summary}", flush=True)
     wrong = {
         quadrature: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
         for quadrature, rows in result.items()

@@ -1,9 +1,9 @@
-"""How does the time of a frame grow: with pixels, with voxels, with samples a ray? Leaping on and off.
+"""How does the time of a frame grow with pixels, voxels and samples per ray, with leaping and without?
 
 The head phantom, 8 bit, from 128² to 2048² pixels, 64³ to 512³ voxels, and 64 to 4096 samples across the
-volume; what is not varied stays at 512², 256³ and 256. All frames of a sweep run in turn, and the slope of
-log time over log size is fitted to the upper three sizes, where what every frame costs no longer counts. No
-ray ends early. Beside each time, the image's RMSE against a converged one.
+volume; other sizes stay at 512², 256³ and 256. All frames of a sweep run in turn, and the slope of log time
+over log size is fitted to the upper three sizes, where the fixed cost of a frame no longer counts. No ray
+ends early. Beside each time stands the image's RMSE against a converged one.
 """
 
 from collections.abc import Sequence
@@ -38,15 +38,15 @@ SIDE = 2.0  # of the phantom's cube, world length
 
 
 def scenes(along: str, sizes: Sequence[int], usual: dict[str, int]) -> dict[int, Scene]:
-    """The scene at each size along one axis, the others as usual."""
-    made: dict[int, Scene] = {}
+    """The scene at each size along one axis; the others are as in `usual`."""
+    by_size: dict[int, Scene] = {}
     volume: jv.Volume | None = None
     for size in sizes:
         at = usual | {along: size}
         if volume is None or along == "voxels":
             volume = jv.phantom("head", at["voxels"])
-        made[size] = seen_head(volume, at["pixels"])._replace(step=SIDE / at["samples"])
-    return made
+        by_size[size] = seen_head(volume, at["pixels"])._replace(step=SIDE / at["samples"])
+    return by_size
 
 
 def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions: int) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions
     programs = {str(key): lambda of=of: common.image(*of) for key, of in marches.items()}
     seconds = timing.interleaved(programs, repetitions)
     finest = min(min(scene.step for scene in at.values()) / 2, SIDE / usual["samples"] / common.FINER)
-    # It leaps: over nothing that is seen, or the errors with and without leaping would differ.
+    # It may leap: if leaps skipped anything visible, the errors with and without leaping would differ.
     converged = jv.March(finest, (jv.SpaceLeaping(), jv.AlphaCorrection()), "midpoint")
     found: dict[str, Any] = {method: {} for method in METHODS}
     for size, scene in at.items():
@@ -77,7 +77,7 @@ def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions
 
 
 def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
-    """By which power of a side the time grows, among the three largest."""
+    """The power of a side with which the time grows, over the three largest sizes."""
     times = [rows[str(size)]["seconds"] for size in sizes]
     return round(float(np.polyfit(np.log(sizes[-3:]), np.log(times[-3:]), 1)[0]), 3)
 
@@ -122,15 +122,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     found: dict[str, Any] = {}
     for along in chosen.only:
         found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
-        for method, told in found[along].items():
-            for size, row in told["sizes"].items():
+        for method, sweep in found[along].items():
+            for size, row in sweep["sizes"].items():
                 print(
                     f"{along:8} {size:>5}  {method:10} {row['seconds'] * 1e3:9.1f} ms"
                     f"  {row['ratio']['median']:.3f} x no leaping  {row['samples a ray']:7.1f} samples a ray"
                     f"  RMSE {row['rmse']:.5f}",
                     flush=True,
                 )
-            print(f"{along:8} {method:10} grows as size^{told['slope']:.2f}", flush=True)
+            print(f"{along:8} {method:10} grows as size^{sweep['slope']:.2f}", flush=True)
     path = record.write(
         chosen.output / "growth.json",
         "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",

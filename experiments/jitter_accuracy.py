@@ -1,13 +1,13 @@
-"""What do jitter and alignment do to the error, against step length?
+"""What do jitter and alignment do to the error, at different step lengths?
 
-Five marches on two scenes: a block of which the box's faces cut the left half and whose right half is an
-inclined plane (its comb of rings has a known frequency), and the head phantom, its crown cut off, seen in
-perspective. Measured against a converged image: wood grain, noise on cut faces, the whole error (RMSE), and
-the time of a frame over that of ray casting.
+Five marches on two scenes: a block whose left half is cut by the box's faces and whose right half is an
+inclined plane (its comb of rings has a known frequency), and the head phantom, its crown cut off, in
+perspective. Measured against a converged image are wood grain, noise on cut faces and the whole error (RMSE);
+also, the time of a frame over that of ray casting.
 
-Jitter turns structure into noise, and is no way to a more accurate image: off the cut face its RMSE is about
-that of ray casting. On the face, where ray casting's first sample lies at the entry in all rays alike, plain
-jitter can be nearer to the truth in the mean, or farther; it is noisier in any case.
+Jitter turns structure into noise and does not make an image more accurate: off the cut face its RMSE is about
+that of ray casting. On the face, where the first sample of every ray lies at its entry under ray casting,
+plain jitter can be nearer to the truth in the mean, or farther; it is noisier in any case.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,8 +25,8 @@ from .common import plt
 
 METHODS = (marches.PLAIN, marches.JITTER, marches.EMPTY, marches.ALIGNED, marches.BOTH)
 STEPS = (4.3, 2.3, 1.3, 0.7)
-"""Voxels. Not whole or half ones: in the orthographic view the samples of all rays would then fall on nodes,
-or between them, alike, which has an error of its own that jitter would seem to lower."""
+"""In voxels. Not whole or half ones: in the orthographic view the samples of all rays would then lie alike on
+nodes, or between them, which has an error of its own that jitter would seem to lower."""
 SLOPE = 0.35  # depth that the inclined plane gains per world length to the right
 NOTE = "Jitter turns structure into noise; the size of the error stays about what it was."
 PANELS = {
@@ -72,7 +72,7 @@ def head(resolution: int, size: int) -> Scene:
     camera = jv.Camera.looking_at(volume, (0.5, -1, 0.75), size=(size, size)).zoom(1.7, (0.52, 0.46))
     first = jv.render(volume, transfer, camera, jv.March(volume.spacing[0], max_samples=1))
     face = np.asarray(first.rgba[..., 3] > 0)
-    below = int(np.flatnonzero(face.any(axis=1))[-1]) + 2  # under the face, skin alone
+    below = int(np.flatnonzero(face.any(axis=1))[-1]) + 2  # below the cut face there is only skin
     return Scene(volume, transfer, camera, lambda error, step: wood_grain_energy(error[below:]), face)
 
 
@@ -115,14 +115,14 @@ def measure(scene: Scene, steps: Sequence[float], repetitions: int, seed: int) -
 
 
 def compared(result: dict[str, list[dict[str, Any]]]) -> str:
-    """The RMSE of the jitters over that of ray casting, in words."""
+    """A sentence that compares the RMSE of both jitters with that of ray casting."""
 
     def over(name: str) -> str:
         ratios = []
         for rows in result.values():
-            found = {(row["step"], row["march"]): row["rmse off the face"] for row in rows}
+            errors = {(row["step"], row["march"]): row["rmse off the face"] for row in rows}
             ratios += [
-                error / found[at, marches.PLAIN] for (at, march), error in found.items() if march == name
+                error / errors[at, marches.PLAIN] for (at, march), error in errors.items() if march == name
             ]
         return f"{name} {min(ratios):.2f} to {max(ratios):.2f}"
 

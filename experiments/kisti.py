@@ -1,17 +1,17 @@
 """What do early ray termination and empty-space skipping save, apart and together?
 
-The table of the KISTI report (2005): a head and an engine under two transfer functions, 1: low values
-translucent and high ones opaque, 2: all visible values opaque; speed-up over neither, the median of paired
-ratios, and beside each time the image's RMSE against a converged one. The goal is 4.55 times for both, the
-report's best, everywhere.
+The table of the KISTI report (2005): a head and an engine under two transfer functions (1: low values
+translucent and high ones opaque; 2: all visible values opaque). It gives the speed-up over neither method, as
+the median of paired ratios, and beside each time the image's RMSE against a converged one. The goal is 4.55
+times for both methods everywhere, the report's best.
 
-The two tables compare ratios, each over its own renderer without either, of different work. The report draws
-slices on a graphics card and shades each sample by Phong's model; its empty-space skipping fetches every
-sample and skips the shading of those that the transfer function hides. Here nothing is shaded, and what is
-skipped is not fetched either. A shaded comparison is not measured. The head is another one, and the report
-gives neither its transfer functions nor its views.
+The two tables compare ratios of different work, each relative to its own renderer without either method. The
+report draws slices on a graphics card and shades each sample by Phong's model; its empty-space skipping
+fetches every sample and skips the shading of those that the transfer function hides. Here nothing is shaded,
+and skipped samples are not fetched either. A shaded comparison is not measured. The head is another one, and
+the report gives neither its transfer functions nor its views.
 
-Steps are of one voxel. Rays end at 1 % of transmittance. Volumes are read from the folder that JAXVOL_DATA
+Steps are one voxel long. Rays end at 1 % of transmittance. Volumes are read from the folder that JAXVOL_DATA
 names; without one, the phantoms of a head and an engine stand in.
 """
 
@@ -38,7 +38,7 @@ METHODS: dict[str, tuple[jv.Transform, ...]] = {
 }
 SIZES = (256, 512)
 GOAL = 4.55
-OPAQUE = 0.95  # of a voxel, under the second transfer function
+OPAQUE = 0.95  # opacity of a voxel under the second transfer function
 REPORT = {  # speed-ups at 256², 512²
     "head, tf 1": {ERT: (1.25, 1.28), ESS: (1.90, 2.24), BOTH: (2.60, 3.48)},
     "head, tf 2": {ERT: (1.58, 1.66), ESS: (1.90, 2.24), BOTH: (3.14, 4.55)},
@@ -64,14 +64,14 @@ PHANTOMS: dict[str, Callable[..., Scene]] = {"head": SCENES[PHANTOM], "engine": 
 
 
 def opaque(scene: Scene) -> Scene:
-    """All that is visible, opaque."""
+    """The scene with everything that is visible made opaque."""
     values, colors, extinction = scene.transfer.values, scene.transfer.colors, scene.transfer.extinction
     solid = -jnp.log1p(-OPAQUE) / scene.step
     return scene._replace(transfer=jv.TransferFunction(values, colors, jnp.where(extinction > 0, solid, 0)))
 
 
 def measure(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
-    """Time, speed-up over neither, and error of a scene's frame under every method."""
+    """Time, speed-up over neither method, and error of a scene's frame under every method."""
     under = {name: jv.March(scene.step, transforms) for name, transforms in METHODS.items()}
     rows = common.compare(scene, under, repetitions)
     for row in rows.values():
@@ -80,7 +80,7 @@ def measure(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """Measured speed-ups, and the report's as crosses."""
+    """Measured speed-ups as bars, the report's as crosses."""
     figure, axes = plt.subplots(1, len(result["sizes"]), figsize=(11, 3.6), sharey=True, layout="constrained")
     for at, (panel, size) in enumerate(zip(axes, result["sizes"], strict=True)):
         for shift, (method, color) in enumerate(((ERT, "C3"), (ESS, "C0"), (BOTH, "C2"))):
@@ -89,8 +89,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
                 first = number == 0
                 panel.bar(x, gain["median"], 0.24, color=color, label=method if first else None)
                 panel.plot((x, x), (gain["low"], gain["high"]), "k-", linewidth=1)
-                told = REPORT[scene][method][at]
-                panel.plot(x, told, "kx", label="the report" if first and method == BOTH else None)
+                reported = REPORT[scene][method][at]
+                panel.plot(x, reported, "kx", label="the report" if first and method == BOTH else None)
         panel.axhline(1, color="k", linewidth=0.8)
         panel.axhline(GOAL, color="k", linewidth=0.8, linestyle=":")
         panel.set_xticks(range(len(REPORT)), list(REPORT), fontsize=8)
@@ -105,12 +105,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     given = record.arguments(argv)
     chosen = parser.parse_args(given)
     folder, sizes, more = common.data(), SIZES, {}
-    made = PHANTOMS if folder is None or chosen.quick else REAL
+    makers = PHANTOMS if folder is None or chosen.quick else REAL
     if chosen.quick:
         sizes, chosen.repetitions, more = (32, 48), 2, {"resolution": 32}
 
     scenes: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
-    for name, make in made.items():
+    for name, make in makers.items():
         for size in sizes:
             scene = make(folder, size, **more)
             for tf, look in (("tf 1", scene), ("tf 2", opaque(scene))):
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     mean = common.geometric_mean(gains)
     print(f"both over neither: least {min(gains):.2f}, geometric mean {mean:.2f}; the goal is {GOAL}")
     result = {
-        "volumes": "phantoms" if made is PHANTOMS else "cthead and engine",
+        "volumes": "phantoms" if makers is PHANTOMS else "cthead and engine",
         "sizes": sizes,
         "repetitions": chosen.repetitions,
         "opacity left": LEFT,

@@ -1,15 +1,15 @@
-"""What do photons, templates, occlusion, baking and deferring cost, and what do they buy?
+"""What do photons, templates, occlusion, baking and deferring cost, and what do they gain?
 
-The head phantom under opaque skin, lit from the side, by so many photons of a template, by so many templates
-blended, under either occlusion, by light that was baked before, and by light that falls on each ray once.
-Each frame is rendered in turn with that of the unlit head, and told as the median of their ratios; beside it
+The head phantom under opaque skin, lit from the side: with different numbers of photons per template and of
+blended templates, under hard and soft occlusion, by baked light, and by deferred light, evaluated once per
+ray. Each frame is rendered in turn with the unlit head, and its time is the median of their ratios; beside it
 stands the image's RMSE against one that blends many templates under soft occlusion and lights all samples.
 Lee, Kwon and Shin report 20-24 frames per second lit and 42-56 unlit, which is 2.2 times the time; the goal
 for baked light is 1.2 times.
 
-Beside that: how far off deferred light is under skin that is more and more translucent; the noise of a flat
+Also measured: the error of deferred light under skin that is more and more translucent; the noise of a flat
 face, seen and lit obliquely, against the number of templates blended; and the energy of a template against
-the material's opacity, for the form that conserves it and the printed one.
+the material's opacity, for the conserving form and the printed one.
 """
 
 import time
@@ -43,10 +43,10 @@ from .scenes import Scene, skin_head
 
 
 GOALS = {"templates": 2.2, "baked": 1.2}
-FEW = 8  # photons of each template, where several are blended and deferred
+FEW = 8  # photons per template, where several are blended and deferred
 FLESH = jv.Material(0.5, 0.05, 1.4)
 LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (50.0, 50.0, 50.0)), ConstantLight((1.3, 1.3, 1.3))
-"""Bright, since flesh that absorbs half of each scattering reflects a sixth of white light from all sides."""
+"""Bright, since flesh that absorbs half at each scattering reflects a sixth of white light from all sides."""
 UNLIT = "unlit"
 PHOTONS, BLENDED, BAKED, HARD = "photons", "templates blended", "baked", "hard occlusion"
 ONCE, BLENDED_ONCE, BAKED_ONCE = "photons, deferred", "templates blended, deferred", "baked, deferred"
@@ -58,13 +58,13 @@ ENERGIES: dict[str, dict[str, Any]] = {
 
 
 def march(scene: Scene, seed: int = 0) -> jv.March:
-    """What makes a picture of opaque skin smooth, and takes few samples behind it."""
+    """A march that renders opaque skin smoothly and takes few samples behind it."""
     how = jv.EmptySpaceJitter(seed), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination()
     return jv.March(scene.step, how)
 
 
 def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int]) -> dict[str, list[Any]]:
-    """Lightings by what is varied in them, each with its number."""
+    """Lightings grouped by the setting that is varied, each with its number."""
     of = partial(ScattererTemplates, FLESH, LIGHTS)
     whole = of().photons
     photons = (*(n for n in photons if n < whole), whole)
@@ -79,13 +79,13 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
     }
 
 
-def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Picture:
+def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
     how = march(scene, seed)
     return jv.render(scene.volume, scene.transfer, scene.camera, how, lighting=lighting, outputs="rgba")
 
 
 def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetitions: int, seed: int) -> Any:
-    """Time and error of each lighting, one after the other: a volume keeps the light of one baking alone."""
+    """Time and error of each lighting, one at a time, since a volume keeps the light of one baking only."""
     truth = frame(scene, ScattererTemplates(FLESH, LIGHTS, templates=many, blend=True), seed).rgba
     found: dict[str, list[dict[str, Any]]] = {}
     for kind, each in lightings.items():
@@ -109,7 +109,7 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetition
 
 
 def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
-    """Seconds of a frame whose light must be baked: another one than before, of the same program."""
+    """Seconds of a frame that must bake its light: dimmer than before, so that only the program is reused."""
     dimmed = eqx.tree_at(lambda how: how.lights[0].irradiance, lighting, replace_fn=lambda e: e * 0.99)
     start = time.perf_counter()
     jax.block_until_ready(frame(scene, dimmed, seed).rgba)
@@ -117,8 +117,8 @@ def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
 
 
 def deferring(scene: Scene, thinned: Sequence[float], seed: int) -> list[dict[str, float]]:
-    """How far light that falls on each ray once is from light on all samples, and how far no light is, with
-    the extinction of everything so many times what it is."""
+    """Errors of deferred light, and of no light, against light on all samples, with every extinction
+    multiplied by each of the factors in `thinned`."""
     each = ScattererTemplates(FLESH, LIGHTS, photons=8)
     rows = []
     for times in thinned:
@@ -131,7 +131,7 @@ def deferring(scene: Scene, thinned: Sequence[float], seed: int) -> list[dict[st
 
 
 def noise(counts: Sequence[int], trials: int, seed: int) -> dict[str, Any]:
-    """How brightness varies from one set of templates to another, over its mean, on the face of a cube."""
+    """Standard deviation of brightness between sets of templates, over its mean, on the face of a cube."""
     volume = jv.phantom("constant", 16)
     transfer = jv.TransferFunction([0.0, 1.0], [[0.7, 0.5, 0.4]] * 2, [40.0, 40.0])
     step = 0.01
@@ -147,7 +147,7 @@ def noise(counts: Sequence[int], trials: int, seed: int) -> dict[str, Any]:
     drawn = [scatterer_templates(FLESH, seed + trial, count=most) for trial in range(trials)]
     rows = []
     for count in counts:
-        # the others dark, so that one program does for any number of templates
+        # the others are dark, so that one program serves any number of templates
         some = jnp.where(jnp.arange(most)[None, :, None] < count, most / count, 0.0)
         means = [face(replace(t, intensity=t.intensity * some), True).mean() for t in drawn]
         rows.append({"templates": count, "deviation": float(np.std(means, ddof=1) / np.mean(means))})
@@ -165,7 +165,7 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
 
 
 def pictures(scene: Scene, templates: int, seed: int, path: Path) -> None:
-    """The head without light and with it, side by side."""
+    """Save the head without light and with it, side by side."""
     lit = ScattererTemplates(FLESH, LIGHTS, templates=templates, blend=True)
     both = [frame(scene, lighting, seed).image((1.0, 1.0, 1.0)) for lighting in (None, lit)]
     jv.save_png(path, np.concatenate(both, axis=1))

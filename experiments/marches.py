@@ -1,7 +1,7 @@
-"""Which ways of marching does Kye 2013 compare? The four columns of its Table 1, and alignment alone.
+"""The marches that Kye 2013 compares: the four columns of its Table 1, and alignment alone.
 
-Alignment mends the exit whether or not the samples are jittered; alone, it shows which part of the gain of
-both proposed methods is its own (the paper's Fig. 12 isolates it so).
+Alignment corrects the exit whether or not the samples are jittered. Alone, it shows its own share of the gain
+of both proposed methods, as the paper's Fig. 12 does.
 """
 
 import jaxvol as jv
@@ -17,7 +17,7 @@ PLAIN, JITTER, EMPTY, ALIGNED, BOTH = (
 
 
 def transforms(name: str, seed: int = 0) -> tuple[jv.Transform, ...]:
-    """The transforms of the march of this name."""
+    """The transforms of the named march."""
     return {
         PLAIN: (),
         JITTER: (jv.Jitter(seed),),
@@ -28,6 +28,6 @@ def transforms(name: str, seed: int = 0) -> tuple[jv.Transform, ...]:
 
 
 def converged(step: float, finer: int = 16) -> jv.March:
-    """What every march tends to: a step `finer` times as fine, sampled in the middle of its cells, which are
-    cut at the exit."""
+    """The march that all others converge to: steps `finer` times as fine, the midpoint rule, and cells cut at
+    the exit."""
     return jv.March(step / finer, (jv.AlphaCorrection(),), "midpoint")

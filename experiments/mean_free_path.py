@@ -1,14 +1,14 @@
-"""Are mean free paths found back from images: from those of templates, and from path-traced ones?
+"""Are mean free paths recovered from images, rendered with templates and path-traced?
 
-Three balls of three materials, lit from the side, are rendered with scatterer templates; from three times too
-long, or too short, Levenberg–Marquardt looks for the three mean free paths.
+Three balls of three materials, lit from the side, are rendered with scatterer templates. Starting three times
+too long or too short, Levenberg–Marquardt fits the three mean free paths.
 
-Then one ball at a time, of an optical thickness from far below 1 to far above, rendered with templates and
-by path tracing. Templates are on the scale of path tracing, but only near it, and farther off where objects
-are thin and colours dark: so the brightness of the lights is fitted along with the mean free path, and what
-remains is the bias of the model. Twice: with the extinction that the camera's rays meet known, and with it
-following from the mean free path, as it does in the path tracer. Objects too small for their mean free path
-leave it undetermined.
+Then one ball at a time, with an optical thickness from far below 1 to far above, is rendered with templates
+and by path tracing. Templates are on the scale of path tracing only approximately, and less so where objects
+are thin and colours dark. So the brightness of the lights is fitted along with the mean free path, and the
+error that remains is the bias of the model. This is done twice: with the extinction that the camera's rays
+meet known, and with it following from the mean free path, as in the path tracer. Objects too small for their
+mean free path leave it undetermined.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ KNOWN, TIED = "extinction known", "extinction 1/λ"
 
 
 def balls(resolution: int, parts: Sequence[tuple[float, tuple[float, float, float], float]]) -> jv.Volume:
-    """Balls (value, centre, radius) in [-1, 1]³, their faces a voxel wide."""
+    """Balls (value, centre, radius) in [-1, 1]³, with boundaries one voxel wide."""
     line = np.linspace(-1, 1, resolution)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
     data = np.zeros(grid.shape[:3])
@@ -66,7 +66,7 @@ def marching(volume: jv.Volume) -> jv.March:
 
 
 def three_materials(size: int, resolution: int) -> dict[str, Any]:
-    """Found from the renders of templates themselves."""
+    """Fit the mean free paths of three materials to renders with templates."""
     parts = [(60, (-0.45, 0, -0.1), 0.4), (130, (0.4, 0.1, -0.2), 0.38), (210, (0.0, 0, 0.5), 0.36)]
     volume, truth = balls(resolution, parts), (0.08, 0.12, 0.16)
     march, colors = marching(volume), ((0.8, 0.4, 0.3), (0.5, 0.6, 0.3), (0.8, 0.8, 0.75))
@@ -77,7 +77,7 @@ def three_materials(size: int, resolution: int) -> dict[str, Any]:
     transfer = jv.TransferFunction.from_points(points, unit_distance=0.1)
     ranges = ((15, 90), (90, 170), (170, 256))
 
-    def made(paths: Sequence[float]) -> tuple[jv.Material, ...]:
+    def materials_of(paths: Sequence[float]) -> tuple[jv.Material, ...]:
         each = zip(paths, ranges, strict=True)
         return tuple(jv.Material(0.5, path, 1.4, values=values) for path, values in each)
 
@@ -85,10 +85,10 @@ def three_materials(size: int, resolution: int) -> dict[str, Any]:
         return volume, transfer, camera, march, templates(materials)
 
     views = [
-        (c, jv.render(*scene(made(truth), c)[:4], lighting=templates(made(truth))).rgba)
+        (c, jv.render(*scene(materials_of(truth), c)[:4], lighting=templates(materials_of(truth))).rgba)
         for c in cameras(size)
     ]
-    start = made([path * off for path, off in zip(truth, OFF, strict=True)])
+    start = materials_of([path * off for path, off in zip(truth, OFF, strict=True)])
     found = jv.fit(jv.ImageResidual(scene, views), start, max_steps=STEPS)
     ratios = [float(m.mean_free_path) / path for m, path in zip(found.parameters, truth, strict=True)]
     return {
@@ -103,7 +103,7 @@ def three_materials(size: int, resolution: int) -> dict[str, Any]:
 def one_ball(
     size: int, resolution: int, paths: int, thicknesses: Sequence[float], seed: int
 ) -> list[dict[str, Any]]:
-    """Found from the renders of templates, and from path-traced ones, by optical thickness."""
+    """Fit one mean free path, for each optical thickness, to renders with templates and path-traced ones."""
     volume = balls(resolution, [(200, (0, 0, 0), RADIUS)])
     march, values = marching(volume), np.array([60.0, 140.0, 255.0])
 
@@ -128,8 +128,8 @@ def one_ball(
     rows = []
     for thickness in thicknesses:
         path = 2 * RADIUS / thickness
-        # whoever lights by templates chooses how dense matter is to look: here as it is, down to what can be
-        # seen at all
+        # with templates, the extinction that the camera sees is free to choose: here the true one, but enough
+        # to be visible at all
         extinction = max(1 / path, 2.0)
 
         def start(off: float, tied: float, path: float = path, dense: float = extinction) -> dict[str, Any]:

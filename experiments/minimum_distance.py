@@ -1,15 +1,16 @@
-"""What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil, against its cells?
+"""What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil, by cell size?
 
 Chae and Shin, Figs. 5 and 6: a perspective camera inside a cavity, where rays run along walls and leaps by a
-distance map are short. Times of the distance map alone, of starts that the corners of cells of R x R pixels
-share ("min_distance", as published), of starts proven from the whole cell ("beam"), and of the stretches of
-beams that know no cells ("hierarchy"). As in the paper, all end rays early.
+distance map are short. Measured are the distance map alone, starts taken from the corner rays of cells of
+R x R pixels ("min_distance", as published), starts proven from the whole cell ("beam"), and empty stretches
+of beams, which use no cells ("hierarchy"). As in the paper, all of them end rays early.
 
-The published starts are no bound: beside each time stand the share of pixels that differ from the march
-without leaping by more than 1/255 in any channel, and the RMSE against a converged image. The paper reports
-53 % less time at R = 8 and distortion at R = 32. The goal is 2.1 times the distance map's speed at R = 8.
+The published starts are not a bound, so each time comes with the share of pixels that differ from the march
+without leaping by more than 1/255 in any channel, and with the RMSE against a converged image. The paper
+reports 53 % less time at R = 8 and distortion at R = 32. The goal is 2.1 times the distance map's speed at
+R = 8.
 
-The airway is read from the folder that JAXVOL_DATA names; without one, the colon phantom is measured alone.
+The airway is read from the folder that JAXVOL_DATA names; without one, only the colon phantom is measured.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +30,7 @@ NONE, MAP, HIERARCHY = "no leaping", "distance map", "hierarchy"
 PUBLISHED, PROVEN = "min_distance", "beam"
 CELLS = (4, 8, 16, 32, 64)
 GOAL = 2.1
-LIMIT = 1 / 255  # of a right pixel: one step of an 8-bit image
+LIMIT = 1 / 255  # largest difference of a correct pixel: one step of an 8-bit image
 LEFT = 1 / 255
 WALL = [
     (40, (0.05, 0.01, 0.01), 0.0),
@@ -48,8 +49,8 @@ def colon(folder: Path | None, size: int, resolution: int = 256) -> Scene:
 
 
 def airway(folder: Path, size: int) -> Scene:
-    """The trachea, down to where it parts; steps of a quarter voxel. The preset is moved up, to begin at -724
-    Hounsfield units: it begins at -920, above which the noise of air lies here and there in most blocks."""
+    """The trachea, down to where it divides; steps of a quarter voxel. The preset begins at -920 Hounsfield
+    units, which the noise of air exceeds somewhere in most blocks; here it is moved up to begin at -724."""
     volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(0.78125, 0.78125, 1))
     camera = jv.Camera((96, 76, 144), (90, 89, 112), (0, -1, 0), view_angle=90, size=(size, size))
     return Scene(volume, jv.preset("ct_airway", clim=(-800, 3000)), camera, 0.2)
@@ -60,13 +61,13 @@ SCENES: dict[str, Callable[..., Scene]] = {"airway": airway, PHANTOM: colon}
 
 
 def march(scene: Scene, method: str | None, cell: int = 8) -> jv.March:
-    """The march that leaps by this method; by none."""
+    """The march that leaps by this method, or does not leap if it is None."""
     leaps = () if method is None else (jv.SpaceLeaping(method, cell=cell),)
     return jv.March(scene.step, (*leaps, jv.EarlyTermination(LEFT)))
 
 
 def wrong(rendering: jv.Rendering, reference: jv.Rendering) -> np.ndarray:
-    """Pixels that differ from those of the march without leaping."""
+    """Pixels that differ from the march without leaping by more than `LIMIT`."""
     difference = np.abs(np.asarray(rendering.rgba, float) - np.asarray(reference.rgba))
     return np.max(difference, axis=-1) > LIMIT
 

@@ -1,11 +1,11 @@
 """What do the paper's methods add to the time of a whole frame?
 
 The four columns of Kye 2013, Table 1, on four real volumes and the head phantom, at a step of one voxel: ray
-casting, jittered, empty-space jittered, and both proposed methods. Frames of all four are rendered in
-turn, and told as the median of their ratios to ray casting; beside each time, the image's RMSE against a
-converged one. The goal is a ratio of at most 1.02 for both proposed methods, in the geometric mean.
+casting, jittered, empty-space jittered, and both proposed methods. Frames of all four are rendered in turn,
+and times are given as the median of their ratios to ray casting, with each image's RMSE against a converged
+one. The goal is a ratio of at most 1.02 for both proposed methods, in the geometric mean.
 
-Real volumes are read from the folder that JAXVOL_DATA names; without one, the phantom is measured alone.
+Real volumes are read from the folder that JAXVOL_DATA names; without one, only the phantom is measured.
 """
 
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--sizes", nargs="+", type=int, default=SIZES, help="pixels along a side; the paper's are 1024"
     )
     parser.add_argument(
-        "--early-termination", type=float, metavar="LEFT", help="in all marches, as the paper"
+        "--early-termination", type=float, metavar="LEFT", help="in all marches, as in the paper"
     )
     parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="VOLUME")
     given = record.arguments(argv)

@@ -1,9 +1,10 @@
-"""How near do scatterer templates come to light as it is scattered, and in what time?
+"""How near do scatterer templates come to path-traced light, and in what time?
 
-The head phantom, of skin, muscle and bone, lit from the side: path traced, with standard errors; and rendered
-without light, and with templates, hard and soft, one for each pixel and blended. Each image is compared as
-it is, and multiplied by the number that brings it nearest to the path-traced one: 1 for templates, were they
-on the same scale; the unlit image has none. What noise is in the reference is told beside it.
+The head phantom, of skin, muscle and bone, lit from the side: path traced, with standard errors; rendered
+without light; and rendered with templates under hard and soft occlusion, one for each pixel and blended. Each
+image is compared as it is, and multiplied by the factor that brings it nearest to the path-traced one. The
+factor would be 1 for templates if they were on the same scale; the unlit image has no scale. The noise of the
+reference is recorded, too.
 """
 
 import time
@@ -39,21 +40,21 @@ POINTS = [
 
 def lightings(templates: int) -> dict[str, jv.lighting.Lighting | None]:
     how: dict[str, Any] = {"packets": 8, "threshold": 0.008, "reach": (2.0, 4.0, 8.0), "templates": templates}
-    made = {
+    variants = {
         "hard": {"occlusion": "hard"},
         "hard, blended": {"occlusion": "hard", "blend": True},
         "soft": {},
         "soft, blended": {"blend": True},
         "soft, baked": {"baked": 64},
     }
-    lit = {name: ScattererTemplates(MATERIALS, LIGHTS, **how, **more) for name, more in made.items()}
+    lit = {name: ScattererTemplates(MATERIALS, LIGHTS, **how, **more) for name, more in variants.items()}
     return {UNLIT: None, **lit}
 
 
 def measure(
     size: int, resolution: int, paths: int, templates: int, repetitions: int, seed: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Rows of what was measured, and images over black."""
+    """The rows of the record, and the images over black."""
     volume = jv.phantom("head", resolution)
     transfer = jv.TransferFunction.from_points(POINTS, unit_distance=0.05)
     camera = jv.Camera((1.6, -2.6, 1.0), volume.center, (0, 0, 1), 28, size=(size, size))
@@ -64,7 +65,7 @@ def measure(
 
     begun = time.perf_counter()
     traced = jv.path_trace(volume, transfer, camera, LIGHTS, paths=paths, key=seed, materials=MATERIALS)
-    wanted = np.asarray(traced.radiance)
+    reference = np.asarray(traced.radiance)
     seconds = time.perf_counter() - begun
     noise = float(np.sqrt(np.mean(np.asarray(traced.standard_error) ** 2)))
 
@@ -74,12 +75,12 @@ def measure(
     lit = lightings(templates)
     taken = timing.interleaved({n: lambda each=each: frame(each) for n, each in lit.items()}, repetitions)
     rows: dict[str, Any] = {TRACED: {"seconds": round(seconds, 3), "standard error": noise, "paths": paths}}
-    images = {TRACED: wanted}
+    images = {TRACED: reference}
     for name, each in lit.items():
         image = np.asarray(frame(each))
-        scale = float(np.sum(image * wanted) / np.sum(image**2))
+        scale = float(np.sum(image * reference) / np.sum(image**2))
         images[name] = image * scale
-        as_it_is, error = (float(np.sqrt(np.mean((i - wanted) ** 2))) for i in (image, images[name]))
+        as_it_is, error = (float(np.sqrt(np.mean((i - reference) ** 2))) for i in (image, images[name]))
         rows[name] = {
             **common.row(taken[name], taken[UNLIT], error),
             "scale": scale,
@@ -90,16 +91,16 @@ def measure(
 
 def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
     figure, axes = plt.subplots(1, len(images), figsize=(2 * len(images), 2.7), layout="constrained")
-    white = np.quantile(images[TRACED], 0.995)  # shown as white, in all of them
+    white = np.quantile(images[TRACED], 0.995)  # shown as white in all images
     for axis, (name, image) in zip(axes, images.items(), strict=True):
         axis.imshow(jv.to_srgb(np.clip(image / white, 0, 1)))
         row = rows[name]
-        told = (
+        caption = (
             f"error {row['rmse']:.3f}\n{row['ratio']['median']:.1f} × unlit"
             if "rmse" in row
             else (f"noise {row['standard error']:.3f}\n{row['seconds']:.1f} s, first image")
         )
-        axis.set(title=name, xlabel=told, xticks=[], yticks=[])
+        axis.set(title=name, xlabel=caption, xticks=[], yticks=[])
     common.save(figure, path)
 
 

@@ -1,9 +1,9 @@
-"""How does Dr.Jit march a scene? The same rays and the same samples, compiled by LLVM.
+"""Marches a scene in Dr.Jit: the same rays and the same samples, compiled by LLVM.
 
-A compiler's best without skipping: it visits every sample between a ray's entry and its exit or early
-termination. Its gradient is the replay adjoint of Mitsuba's own integrators (Vicini, Speierer, Jakob 2021):
-once the image is there, a second march computes every sample again and sends the gradient back from where
-it stands, so that memory does not grow with the number of samples.
+This is the best that a compiler does without skipping: every sample between a ray's entry and its exit or
+early termination is visited. The gradient is the replay adjoint of Mitsuba's own integrators (Vicini,
+Speierer, Jakob 2021): after the image, a second march computes every sample again and propagates its gradient
+at once, so that memory does not grow with the number of samples.
 
 Importing this file raises ImportError, with the reason, where Dr.Jit cannot run.
 """
@@ -34,7 +34,7 @@ Drjit: TypeAlias = Any
 
 
 class Marcher:
-    """A scene on Dr.Jit's side. `prepare` makes it."""
+    """A scene in Dr.Jit, made by `prepare`."""
 
     def __init__(
         self,
@@ -62,30 +62,30 @@ class Marcher:
         self.table = mi.TensorXf(np.column_stack([transfer.colors, transfer.extinction]))
         self.transfer = mi.Texture1f(self.table)
 
-        # variables, not constants: no step and no threshold compiles the program again
+        # variables, not constants, so that another step or threshold does not compile the program again
         self.step, self.opacity_left = dr.opaque(mi.Float, step), dr.opaque(mi.Float, opacity_left)
         self.sampled = dr.opaque(mi.Float, step / 2 if quadrature == "midpoint" else 0.0)
         dr.eval(self.rays, self.voxels, self.transfer)
 
     def draw(self) -> None:
-        """Marches all rays, and waits for the image."""
+        """March all rays, and wait for the image."""
         self.color, self.left = self._march()
         dr.eval(self.color, self.left)
         dr.sync_thread()
 
     def rgba(self) -> Float[np.ndarray, "height width 4"]:
-        """The image that was drawn last, premultiplied."""
+        """The last image, premultiplied."""
         width, height = self.size
         channels = [*np.array(self.color), 1 - np.array(self.left)]
         return np.stack(channels, axis=-1).reshape(height, width, 4)
 
     def planes(self, image: Float[np.ndarray, "height width 4"]) -> Drjit:
-        """An image as Dr.Jit keeps it, a target for `gradient`."""
+        """An image in Dr.Jit's layout, as a target for `gradient`."""
         return mi.Vector4f(np.asarray(image, np.float32).reshape(-1, 4).T)
 
     def gradient(self, target: Drjit | float = 0.0) -> Float[np.ndarray, "n 4"]:
-        """Marches all rays, and gives the gradient of `mean((rgba - target)²)` with respect to (r, g, b,
-        extinction) of each of the n points of the transfer function, dense as it is here."""
+        """March all rays, and return the gradient of `mean((rgba - target)²)` with respect to (r, g, b,
+        extinction) of each of the n points of the transfer function, as made dense here."""
         dr.enable_grad(self.table)
         dr.clear_grad(self.table)
         self.transfer.set_tensor(self.table)
@@ -103,7 +103,7 @@ class Marcher:
 
     @dr.syntax
     def _march(self) -> tuple[Drjit, Drjit]:
-        """Colour, and the transmittance left behind it."""
+        """Colour, and the transmittance that is left."""
         with dr.suspend_grad():
             start, rate, length = self._enter()
             index, depth = mi.UInt32(0), mi.Float(self.sampled)
@@ -121,7 +121,7 @@ class Marcher:
 
     @dr.syntax
     def _march_again(self, cotangent: Drjit) -> None:
-        """The same loop, from which every sample sends its gradient to the table."""
+        """The same loop, in which every sample adds its gradient to that of the table."""
         with dr.suspend_grad():
             start, rate, length = self._enter()
             index, depth = mi.UInt32(0), mi.Float(self.sampled)
@@ -134,7 +134,7 @@ class Marcher:
                     passed = dr.exp(-extinction * self.step)
                     added = transmittance * (1 - passed) * emitted
                     behind -= dr.detach(added)
-                    # a cell's extinction also dims all that is behind it, in proportion
+                    # a cell's extinction also attenuates everything behind it, in proportion
                     dimmed = dr.dot(to_color, behind) - to_opacity * self.left
                     dr.backward_from(dr.dot(to_color, added) - dimmed * extinction * self.step)
                 transmittance *= dr.detach(passed)
@@ -143,10 +143,10 @@ class Marcher:
                 live &= (depth < length) & (transmittance > self.opacity_left)
 
     def _enter(self) -> tuple[Drjit, Drjit, Drjit]:
-        """Where a ray enters the volume, its rate per depth, both in texture coordinates, and its length."""
+        """Entry point and rate per depth of each ray, both in texture coordinates, and its length."""
         hit, near, far = self.box.ray_intersect(self.rays)
         near = dr.maximum(near, 0)
-        # a texture's texels are cells, n to a length of 1; our nodes are their middles
+        # n texels span a texture coordinate of 1; our nodes are their centres
         start = ((self.rays(near) - self.origin) / self.spacing + 0.5) / self.shape
         return start, self.rays.d / self.spacing / self.shape, dr.select(hit, far - near, 0)
 
@@ -168,11 +168,11 @@ def prepare(
     opacity_left: float = 0.0,
     threads: int | None = None,
 ) -> Marcher:
-    """The scene on Dr.Jit's side, drawn once.
+    """A scene in Dr.Jit, drawn once.
 
-    - `step`, `quadrature`: as those of `jaxvol.March`.
-    - `opacity_left`: as that of `jaxvol.EarlyTermination`; 0 ends rays at their exit alone.
-    - `threads`: of Dr.Jit in this process; as they are, by default.
+    - `step`, `quadrature`: as for `jaxvol.March`.
+    - `opacity_left`: as for `jaxvol.EarlyTermination`; 0 ends rays only at their exit.
+    - `threads`: number of Dr.Jit's threads in this process; unchanged by default.
     """
     if threads is not None:
         dr.set_thread_count(threads)

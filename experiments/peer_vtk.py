@@ -1,9 +1,9 @@
-"""How does VTK draw a scene? By its fixed-point ray caster, under settings that are fair to time.
+"""Draws a scene by VTK's fixed-point ray caster, under settings that are fair to time.
 
-What differs from a march with the left rule: it rounds an interpolated 8-bit value to a whole number,
-computes with 15 bits, stops a ray at 255/32767 of transmittance, writes 8 bits, and counts its steps from
-the near plane rather than from the entry. Like our skipping of empty space, it passes over blocks of 4³
-voxels in which nothing is visible.
+It differs from a march with the left rule: it rounds an interpolated 8-bit value to a whole number, computes
+with 15 bits, stops a ray at a transmittance of 255/32767, writes 8 bits, and counts its steps from the near
+plane rather than from the entry. Like our space leaping, it skips blocks of 4³ voxels in which nothing is
+visible.
 """
 
 import importlib.util
@@ -20,7 +20,7 @@ from jaxtyping import Float
 import jaxvol as jv
 
 
-# Where there is no screen. VTK reads it when it makes its first window.
+# For machines without a screen. VTK reads it when it makes its first window.
 os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")
 
 PROBE = """
@@ -39,18 +39,19 @@ raise SystemExit(reader.GetOutput().GetPointData().GetScalars().GetTuple3(0) != 
 
 
 def missing() -> str | None:
-    """What VTK lacks here to draw without a screen; None where it can."""
+    """Why VTK cannot draw without a screen here; None if it can."""
     if importlib.util.find_spec("vtk") is None:
         return "vtk is not installed: pip install jaxvol[peers]"
-    # in a process of its own: where a library is missing, VTK may crash
+    # in a process of its own, since VTK may crash if a library is missing
     if subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120).returncode != 0:
         return "VTK cannot draw off screen here: apt-get install libosmesa6"
     return None
 
 
 def dense(transfer: jv.TransferFunction, volume: jv.Volume) -> jv.TransferFunction:
-    """The same at so many equally distant points that it matters little what is interpolated between
-    them, opacity (VTK) or extinction (jaxvol): every value of 8-bit data, 1024 in the range of any other."""
+    """The same transfer function at so many equidistant points that it hardly matters what is interpolated
+    between them, opacity (VTK) or extinction (jaxvol): all values of 8-bit data, 1024 over the range of
+    others."""
     if volume.data.dtype == jnp.uint8:
         values = jnp.arange(256.0)
     else:
@@ -60,22 +61,22 @@ def dense(transfer: jv.TransferFunction, volume: jv.Volume) -> jv.TransferFuncti
 
 
 class Drawn:
-    """A scene in a window of VTK's. `prepare` makes it."""
+    """A scene in a VTK window, made by `prepare`."""
 
     def __init__(self, window: Any, view: Any, mapper: Any):
         self.window, self.view, self.mapper = window, view, mapper
 
     def draw(self) -> None:
-        """Casts all rays, and shows the image in the window."""
+        """Cast all rays, and show the image in the window."""
         self.view.Modified()
         self.window.Render()
 
     def cast(self) -> None:
-        """The ray casting of `draw` alone: same rays, no window."""
+        """Cast the same rays as `draw`, without the window."""
         self.mapper.RenderSubVolume()
 
     def image(self) -> Float[np.ndarray, "height width 3"]:
-        """What the window shows, in [0, 1], top row first."""
+        """The image in the window, in [0, 1], top row first."""
         import vtk
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -96,17 +97,17 @@ def prepare(
     threads: int | None = None,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Drawn:
-    """The scene in VTK, drawn once.
+    """A scene in VTK, drawn once.
 
     - `step`: world length between samples.
-    - `threads`: that cast rays; one for each core by default.
+    - `threads`: number of threads that cast rays; by default one for each core.
     """
     import vtk
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     data, lowest = np.asarray(volume.data), 0
     if np.issubdtype(data.dtype, np.integer):
-        # VTK's faster loops are for values that begin at 0; from -1000, CT takes a third longer
+        # VTK's faster loops need values that begin at 0; CT that begins at -1000 takes a third longer
         lowest = int(data.min())
         data = (data.astype(int) - lowest).astype(np.min_scalar_type(int(data.max()) - lowest))
     grid = vtk.vtkImageData()
@@ -133,7 +134,7 @@ def prepare(
     mapper.SetInputData(grid)
     mapper.SetBlendModeToComposite()
     mapper.IntermixIntersectingGeometryOff()
-    # its own choices would draw a coarser image wherever time is short
+    # by default VTK draws a coarser image where time is short
     mapper.AutoAdjustSampleDistancesOff()
     mapper.LockSampleDistanceToInputSpacingOff()
     mapper.SetSampleDistance(step)
@@ -159,7 +160,7 @@ def prepare(
 
 
 def aim(view: Any, camera: jv.Camera) -> None:
-    """Gives VTK's camera the view of ours."""
+    """Give VTK's camera the view of ours."""
     left, right, bottom, top = camera.window.tolist()
     half_width, half_height = (right - left) / 2, (top - bottom) / 2
     if not np.isclose(half_width / half_height, camera.size[0] / camera.size[1]):
@@ -176,12 +177,12 @@ def aim(view: Any, camera: jv.Camera) -> None:
 
 
 def as_displayed(image: np.ndarray, mapper: Any) -> np.ndarray:
-    """An image as VTK's display would show it: drawn slightly too large, by a texture's linear interpolation.
+    """An image as VTK's display would show it: slightly enlarged, by a texture's linear interpolation.
 
     VTK casts one ray through the middle of every pixel, as we do, for the n x m pixels that the volume
-    may cover. It then stretches them from the first texel's middle to the last one's over the n x m
-    pixels, so that pixel i shows the texel coordinate (i + 1/2) (n - 1)/n - 1/2 past the first middle:
-    half a pixel off at the borders, which is more than all other differences together.
+    may cover. It then stretches the range from the middle of the first texel to that of the last over these
+    n x m pixels, so that pixel i shows the texel coordinate (i + 1/2) (n - 1)/n - 1/2 past the first middle.
+    This is half a pixel off at the borders, which is more than all other differences together.
     """
     cast = mapper.GetRayCastImage()
     blends = []

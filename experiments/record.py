@@ -1,4 +1,4 @@
-"""What was measured, on what, with what, and how is it run again? Results as JSON files."""
+"""Records of experiments: JSON files with the result, device, versions, seed and command."""
 
 import json
 import os
@@ -18,9 +18,9 @@ PACKAGES = ("jaxvol", "jax", "jaxlib", "equinox", "numpy", "scikit-image", "matp
 
 
 def write(path: Path, question: str, result: Any, *, seed: int, command: list[str]) -> Path:
-    """The result as JSON, and all that it takes to run the experiment again.
+    """Write a result as JSON, with all that is needed to run the experiment again.
 
-    - `question`: what the result answers.
+    - `question`: the question that the result answers.
     - `result`: anything that JSON can hold.
     - `command`: module and arguments, as after `python -m`.
     """
@@ -44,7 +44,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def arguments(argv: list[str] | None) -> list[str]:
-    """The arguments that a script was given: its caller's, or those of the command line."""
+    """The arguments of a script: its caller's, or else those of the command line."""
     return sys.argv[1:] if argv is None else list(argv)
 
 
@@ -67,7 +67,7 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """The checkout's commit, with + where files differ from it; None outside a checkout."""
+    """The checkout's commit, with + if files differ from it; None outside a checkout."""
     here = Path(__file__).parent
 
     def git(*words: str) -> str:

@@ -1,5 +1,5 @@
-"""Which volumes are measured, and how are they seen? Four real ones and the head phantom, at steps of one
-voxel, "a size like that of the voxels" (Kye 2013, section 2.1)."""
+"""The scenes that are measured: four real volumes and the head phantom, with steps of one voxel, "a size like
+that of the voxels" (Kye 2013, section 2.1)."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +21,7 @@ VESSELS = [
     (160, (0.95, 0.55, 0.40), 0.7),
     (255, (1.00, 0.95, 0.85), 0.9),
 ]
-"""Contrast agent in 8-bit angiography: the vessels alone."""
+"""For contrast agent in 8-bit angiography: shows the vessels alone."""
 
 
 SKIN = [
@@ -32,7 +32,7 @@ SKIN = [
     (185, (1.00, 0.95, 0.85), 0.95),
     (255, (1.00, 1.00, 1.00), 0.95),
 ]
-"""The head phantom under opaque skin: all but air is next to opaque."""
+"""For the head phantom under opaque skin: everything but air is nearly opaque."""
 
 
 def head(folder: Path | None, size: int, resolution: int = 192) -> Scene:
@@ -40,13 +40,13 @@ def head(folder: Path | None, size: int, resolution: int = 192) -> Scene:
 
 
 def seen_head(volume: jv.Volume, size: int) -> Scene:
-    """The head phantom, however it was made."""
+    """The scene of the head phantom, from a volume that was made or read elsewhere."""
     camera = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.45)
     return Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
 
 
 def skin_head(size: int, resolution: int) -> Scene:
-    """The head phantom under skin that light may enter; steps of half a voxel."""
+    """The head phantom under skin that light can enter; steps of half a voxel."""
     volume = jv.phantom("head", resolution)
     transfer = jv.TransferFunction.from_points(SKIN, unit_distance=0.05)
     camera = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(2)
@@ -66,7 +66,7 @@ def bonsai(folder: Path, size: int) -> Scene:
 
 
 def airway(folder: Path, size: int) -> Scene:
-    """A piece of a chest CT whose faces all cut tissue, from outside."""
+    """A part of a chest CT whose faces all cut tissue, seen from outside."""
     volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(0.78125, 0.78125, 1))
     camera = jv.Camera.looking_at(volume, (0.4, -1, 0.5), (0, 0, 1), size=(size, size)).zoom(1.3)
     return Scene(volume, jv.preset("ct_chest"), camera, 0.78125)

@@ -1,18 +1,18 @@
-"""How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?
+"""How fast is an image, and an image with its gradient, compared with VTK and Dr.Jit?
 
-Five scenes at steps of one voxel, two sizes. Ours leaps over empty space and ends rays early; "plain" does
+Five scenes at steps of one voxel, two image sizes. Ours skips empty space and ends rays early; "plain" does
 neither. VTK's fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All
 use as many threads as there are cores, and their frames are drawn in turn: a ratio is the median over rounds
 of a program's time over ours. Beside each time stands the RMSE of its image, over white, against one
-converged image of ours; VTK's is compared with that image as its display would show it.
+converged image of ours; VTK's image is compared with that image as VTK's display would show it.
 
-Also: which part of a frame goes into finding out where anything can be seen; the time from the start of a
-fresh process to its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient
-of every entry of a transfer function (256 of 8-bit data), over the image alone and against Dr.Jit's replay
-adjoint, with the relative difference of the two gradients.
+Also measured: the part of a frame that computes the occupancy; the time from the start of a fresh process to
+its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient of every entry of
+a transfer function (256 for 8-bit data), relative to the image alone and to Dr.Jit's replay adjoint, with the
+relative difference of the two gradients.
 
 Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
-JAXVOL_DATA names; without one, the head phantom is measured alone.
+JAXVOL_DATA names; without one, only the head phantom is measured.
 """
 
 import os
@@ -56,9 +56,9 @@ def fast(scene: Scene) -> jv.March:
 
 def peers() -> dict[str, str]:
     """The version of each peer, or why it is left out."""
-    lacking = peer_vtk.missing()
+    reason = peer_vtk.missing()
     return {
-        VTK: f"not here: {lacking}" if lacking else version("vtk"),
+        VTK: f"not here: {reason}" if reason else version("vtk"),
         DRJIT: f"mitsuba {version('mitsuba')}, drjit {version('drjit')}"
         if peer_drjit
         else f"not here: {NO_DRJIT}",
@@ -66,7 +66,7 @@ def peers() -> dict[str, str]:
 
 
 def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, dict[str, Any]]:
-    """Time and error of every program's frame, and the part of ours that is spent on the occupancy."""
+    """Time and error of every program's frame, and the part of ours that computes the occupancy."""
     truth = np.asarray(common.image(scene, marches.converged(scene.step, common.FINER)).image())
     under = {OURS: fast(scene), PLAIN: jv.March(scene.step)}
     programs: dict[str, Any] = {n: lambda m=m: common.image(scene, m) for n, m in under.items()}
@@ -88,7 +88,7 @@ def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, d
 
 
 def occupancy(scene: Scene) -> Any:
-    """The program that finds where anything can be seen: the first thing in every frame of ours."""
+    """The program that computes the occupancy, with which every frame of ours begins."""
 
     @eqx.filter_jit
     def found(scene: Scene, march: jv.March, blocks: Blocks) -> Sums:
@@ -114,7 +114,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
         gradient = jax.grad(loss)(scene.transfer, march)
         return np.column_stack([gradient.colors, gradient.extinction])
 
-    # a program of its own, as the image is
+    # compiled as one program, like the image
     both_of = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
     ours = entries(march)
     programs: dict[str, Any] = {
@@ -126,7 +126,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
         marcher = drjit(scene)
         programs[DRJIT] = marcher.gradient
         theirs = marcher.gradient()
-        # where rays leap, an extinction of 0 has a gradient that is not asked for; without leaps it is there
+        # with leaps, the gradient of an extinction of 0 is left out; without leaps it is computed
         seen = np.broadcast_to(np.asarray(scene.transfer.extinction > 0)[:, None], ours.shape).copy()
         seen[:, :3] = True
         plain = entries(jv.March(march.step, (jv.EarlyTermination(LEFT),)))
@@ -144,7 +144,7 @@ def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """How many times our time a program takes, scene by scene."""
+    """Each program's time over ours, scene by scene."""
     sizes, volumes = result["sizes"], result["volumes"]
     size = (6 * len(sizes), 0.75 * len(volumes) + 1.5)
     figure, (axes,) = plt.subplots(1, len(sizes), figsize=size, squeeze=False, layout="constrained")
@@ -161,8 +161,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set_xticks((0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
         panel.minorticks_off()
         ours = [(name, of_size[str(pixels)][OURS]) for name, of_size in volumes.items()]
-        told = [f"{name}\n{row['seconds'] * 1e3:.0f} ms, RMSE {row['rmse']:.4f}" for name, row in ours]
-        panel.set_yticks(range(len(volumes)), told, fontsize=8)
+        labels = [f"{name}\n{row['seconds'] * 1e3:.0f} ms, RMSE {row['rmse']:.4f}" for name, row in ours]
+        panel.set_yticks(range(len(volumes)), labels, fontsize=8)
         panel.set_ylim(len(volumes) - 0.5, -0.6)
         panel.set_xlabel(f"time / ours, {pixels} x {pixels} pixels; dotted: {GOAL:.0f}", fontsize=9)
     shown = [name for name in PEERS if any(name in r for v in volumes.values() for r in v.values())]
@@ -173,13 +173,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 def means(volumes: dict[str, Any], sizes: Sequence[int]) -> dict[str, float]:
-    """Over all scenes and sizes, the geometric mean of each program's time over ours."""
+    """Geometric mean over all scenes and sizes of each program's time over ours."""
     rows = [of_size[str(size)] for of_size in volumes.values() for size in sizes]
     there = [name for name in PEERS if all(name in row for row in rows)]
     return {name: common.geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in there}
 
 
-def tell(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:
+def print_rows(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:
     for program, row in rows.items():
         ratio = row["ratio"]
         print(
@@ -194,7 +194,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = common.options(__doc__, repetitions=15)
     parser.add_argument("--sizes", nargs="+", type=int, default=SIZES, help="pixels along a side")
     parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="VOLUME")
-    parser.add_argument("--gradients", action="store_true", help="at the first size")
+    parser.add_argument("--gradients", action="store_true", help="measure gradients, too, at the first size")
     given = record.arguments(argv)
     chosen = parser.parse_args(given)
     folder, names, resolution = common.data(), chosen.only, RESOLUTION
@@ -213,7 +213,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for size in chosen.sizes:
             scene = SCENES[name](folder, size, **more)
             rows = volumes[name][str(size)] = images(scene, there, chosen.repetitions)
-            tell(name, size, rows)
+            print_rows(name, size, rows)
             if chosen.gradients and size == chosen.sizes[0]:
                 slopes[name] = gradients(scene, chosen.repetitions)
                 print(f"{name:16} {size:4}  {slopes[name]}", flush=True)

@@ -1,8 +1,8 @@
-"""How much longer does one program take than another? Both run in turn, and each pair gives a ratio.
+"""How much longer does one program take than another? Both run in turn, and each pair of runs gives a ratio.
 
-A machine's speed drifts by more than what is asked for here. Runs that follow each other see the same
-machine, so their ratio holds still where their times do not; and its median forgets the runs that
-something else disturbed.
+The speed of a machine drifts by more than the differences that are measured here. Consecutive runs see the
+same machine, so their ratio is stable where their times are not, and the median of the ratios ignores runs
+that something else disturbed.
 """
 
 import time
@@ -15,7 +15,7 @@ import numpy as np
 
 def interleaved(programs: dict[str, Callable[[], Any]], repetitions: int) -> dict[str, list[float]]:
     """Seconds of every run of every program, warm: one run of each to compile it, then rounds of one run
-    each, in an order that turns round from one round to the next."""
+    each, in an order that is reversed from one round to the next."""
     for program in programs.values():
         jax.block_until_ready(program())
     seconds: dict[str, list[float]] = {name: [] for name in programs}

@@ -1,19 +1,20 @@
-"""Is a density recovered from a few X-ray views, beside filtered back projection and SART?
+"""Is a density recovered from a few X-ray views, compared with filtered back projection and SART?
 
-Through a transfer function that is black, and whose extinction is the value itself, a volume is seen as an
-X-ray image: -log(1 - opacity) is the line integral of its values. The head phantom, as a density of 64³
-voxels, is so rendered by parallel rays from 24 directions around its axis, without noise and as counts of
-photons. From the same line integrals it is recovered:
+With a black transfer function whose extinction is the value itself, a volume renders to an X-ray image:
+-log(1 - opacity) is the line integral of its values. The head phantom, as a density of 64³ voxels, is
+rendered this way by parallel rays from 24 directions around its axis, without noise and as photon counts. It
+is recovered from the same line integrals:
 
-- by scikit-image's filtered back projection (`iradon`), negative densities set to 0, with the filter that
+- by scikit-image's filtered back projection (`iradon`), with negative densities set to 0 and the filter that
   comes nearest to the truth;
-- by its SART (`iradon_sart`), which corrects the slices view by view, densities kept from becoming negative;
-- by `jv.fit`: L-BFGS, by the gradient that the renderer takes to every voxel. A bijection keeps densities
-  positive. Of the geometry it knows no more than its rays, which might as well come from any other cameras.
+- by its SART (`iradon_sart`), which corrects the slices view by view and keeps densities from being negative;
+- by `jv.fit` with L-BFGS and the renderer's gradient with respect to every voxel. A bijection keeps densities
+  positive. All it knows of the geometry is its rays, which could come from any other cameras.
 
 The views are marched at a sixth of a voxel, the fit at a half. Truth and results share a grid on which values
-are trilinear, for the fit as for SART, so none has to bear what a grid leaves out of the real world. Under
-noise both iterations come near the truth first and then fit the noise: the nearest and the last one are told.
+are trilinear, for the fit as for SART, so no method suffers from what a grid leaves out of the real world.
+Under noise both iterations first come near the truth and then fit the noise, so the nearest and the last
+error are recorded.
 """
 
 import time
@@ -38,7 +39,7 @@ from .common import plt
 DENSEST = 0.1
 """Density of the greatest value, 1/voxel: where the head is thickest, one photon in 14 passes."""
 THIN = 0.1
-"""Part of the mean density below which the bijection bends. With 1, what is thin moves too slowly."""
+"""Part of the mean density below which the bijection bends. With 1, low densities change too slowly."""
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
 FBP, SART, OURS = "FBP", "SART", "jaxvol"
 
@@ -48,7 +49,7 @@ Density = Float[np.ndarray, "n n n"]
 
 
 class Setting(NamedTuple):
-    """How long is iterated, and at which step the renderer marches, voxels."""
+    """Numbers of iterations, and the renderer's steps in voxels."""
 
     sweeps: int
     evaluations: int
@@ -62,8 +63,8 @@ def angles(views: int) -> np.ndarray:
 
 
 def rays(n: int, views: int) -> Rays:
-    """Origins and directions of parallel rays, one through each node of the plane across them. As for
-    scikit-image x points down and y to the right, and the axis runs through node n // 2."""
+    """Origins and directions of parallel rays, one through each node of the plane across them. As in
+    scikit-image, x points down and y to the right, and the axis runs through node n // 2."""
     turn, across = np.deg2rad(angles(views)), np.arange(n) - n // 2
     ahead = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)[:, None, None]
     aside = np.stack([-np.sin(turn), np.cos(turn), 0 * turn], axis=-1)[:, None, None]
@@ -73,14 +74,14 @@ def rays(n: int, views: int) -> Rays:
 
 
 def line_integrals(density: Any, rays: Rays, step: float) -> Sinogram:
-    """Of a density, 1/voxel, by rendering it."""
+    """Line integrals of a density, 1/voxel, by rendering it."""
     absorbing = jv.TransferFunction([0.0, 1.0], np.zeros((2, 3)), [0.0, 1.0])
     march = jv.March(step, (jv.AlphaCorrection(),), "midpoint")
     return -jnp.log1p(-jv.render_rays(jv.Volume(density), absorbing, *rays, march).rgba[..., 3])
 
 
 def counted(sinogram: np.ndarray, photons: float | None, seed: int) -> np.ndarray:
-    """Line integrals as they follow from counting so many photons sent along each ray; None for infinitely
+    """Line integrals estimated from photon counts, with `photons` sent along each ray; None for infinitely
     many."""
     if photons is None:
         return sinogram
@@ -89,7 +90,7 @@ def counted(sinogram: np.ndarray, photons: float | None, seed: int) -> np.ndarra
 
 
 class Difference(eqx.Module):
-    """Line integrals of a density minus those that were measured, over `unit`."""
+    """Line integrals of a density minus the measured ones, over `unit`."""
 
     rays: Rays
     measured: Sinogram
@@ -101,7 +102,7 @@ class Difference(eqx.Module):
 
 
 class Progress:
-    """The error after each iteration, and the seconds that the iterations took without looking at it."""
+    """Records the error after each iteration, and the seconds of the iterations without the recording."""
 
     def __init__(self, truth: Density):
         self.truth, self.spent, self.begun = truth, 0.0, time.perf_counter()
@@ -119,7 +120,7 @@ class Progress:
 
 
 def filtered(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
-    """FBP by each filter."""
+    """FBP with each filter."""
     progress = Progress(truth)
     for name in FILTERS:
         slices = [iradon(one.T, angles(len(one)), filter_name=name) for one in np.moveaxis(sinogram, 2, 0)]
@@ -129,7 +130,7 @@ def filtered(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Pr
 
 
 def algebraic(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
-    """SART, sweep after sweep over all views."""
+    """SART, one sweep over all views after the other."""
     progress, slices = Progress(truth), [None] * sinogram.shape[2]
     for _ in range(setting.sweeps):
         slices = [
@@ -141,10 +142,10 @@ def algebraic(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[P
 
 
 def fitted(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
-    """L-BFGS from a flat and thin density: `THIN` of what the views tell of the mean."""
+    """L-BFGS from a flat and thin density: `THIN` times the mean density, estimated from the views."""
     views, n, _ = sinogram.shape
     thin = THIN * float(sinogram.mean()) / n
-    # the loss bends by about 1 where all densities change alike, so that a first step is of the right length
+    # the loss has a curvature of about 1 where all densities change alike: a first step has the right length
     unit = jnp.float32(thin * np.sqrt(views * n))
     residual = Difference(rays(n, views), jnp.asarray(sinogram), unit, setting.step)
 
@@ -159,7 +160,7 @@ def fitted(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Prog
             callback=lambda step, density, loss: look(density),
         )
 
-    fit(2, lambda density: None)  # compiled before the clock runs
+    fit(2, lambda density: None)  # compiles before the clock starts
     progress = Progress(truth)
     fit(setting.evaluations, progress.look)
     return progress, "evaluations with gradient"
@@ -169,7 +170,7 @@ METHODS = {FBP: filtered, SART: algebraic, OURS: fitted}
 
 
 def measure(truth: Density, views: int, photons: float | None, setting: Setting, seed: int) -> dict[str, Any]:
-    """How near each method comes; the slice that is shown is kept under `"slice"`."""
+    """The error of each method; the slice to be drawn is kept under `"slice"`."""
     exact = np.array(line_integrals(truth, rays(len(truth), views), setting.step_of_views))
     sinogram, middle, rows = counted(exact, photons, seed), truth.shape[2] // 2, {}
     for name, method in METHODS.items():
@@ -188,7 +189,7 @@ def measure(truth: Density, views: int, photons: float | None, setting: Setting,
 
 
 def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
-    """A slice by each method, for all numbers of photons, over how the whole volume's error fell."""
+    """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
     figure = plt.figure(figsize=(10, 2.75 * len(result) + 3.2), layout="constrained")
     figure.get_layout_engine().set(h_pad=0.08)
     upper, lower = figure.subfigures(2, 1, height_ratios=(2.75 * len(result), 3))
@@ -198,8 +199,8 @@ def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
         for panel, (name, picture) in zip(line, pictures.items(), strict=True):
             panel.imshow(picture, cmap="gray", vmin=0, vmax=0.8 * truth.max())
             panel.set(xticks=[], yticks=[])
-            told = f"RMSE {rows[name]['rmse']:.5f}, {rows[name]['psnr']:.1f} dB" if name in rows else ""
-            panel.set_xlabel(told, fontsize=9)
+            caption = f"RMSE {rows[name]['rmse']:.5f}, {rows[name]['psnr']:.1f} dB" if name in rows else ""
+            panel.set_xlabel(caption, fontsize=9)
             if number == 0:
                 panel.set_title(name, fontsize=9)
         line[0].set_ylabel(photons, fontsize=9)
@@ -222,10 +223,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--resolution", type=int, default=64, help="voxels along an axis")
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument(
-        "--photons", type=float, nargs="*", default=[1e4], help="per ray; without noise always"
+        "--photons", type=float, nargs="*", default=[1e4], help="photons per ray; also without noise"
     )
-    parser.add_argument("--sweeps", type=int, default=30, help="of SART")
-    parser.add_argument("--evaluations", type=int, default=45, help="of the fit's loss and gradient")
+    parser.add_argument("--sweeps", type=int, default=30, help="sweeps of SART")
+    parser.add_argument("--evaluations", type=int, default=45, help="of the fit's loss and its gradient")
     given = record.arguments(argv)
     chosen = parser.parse_args(given)
     if chosen.quick:

@@ -1,8 +1,8 @@
 """Differentiable direct volume rendering in JAX.
 
-A camera makes rays; a march steps along them, with transforms that each change one of its answers;
-a volume gives values, a transfer function their colour and extinction; the cells blend front to
-back into a `Rendering`.
+A camera generates rays; a march steps along them, and each of its transforms changes one aspect of
+it. A volume gives values, a transfer function maps them to colour and extinction, and the cells are
+composited front to back into a `Rendering`.
 """
 
 from . import lighting as lighting, metrics as metrics
@@ -43,7 +43,7 @@ from .phantoms import (
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
-from .rendering import Picture as Picture, Rendering as Rendering
+from .rendering import Rendering as Rendering
 from .transfer import TransferFunction as TransferFunction
 from .transforms import (
     AlphaCorrection as AlphaCorrection,

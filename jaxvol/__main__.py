@@ -1,4 +1,4 @@
-"""`python -m jaxvol` is the command `jaxvol`."""
+"""`python -m jaxvol` runs the command `jaxvol`."""
 
 import sys
 

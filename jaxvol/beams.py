@@ -1,7 +1,7 @@
-"""Where do neighbouring rays run, and where is nothing along them? Boxes around beams, stretch by stretch.
+"""Which stretches of a beam of neighbouring rays are empty? Bounding boxes around beams.
 
-A beam is a handful of rays that are asked about together. At each distance from their origins they lie in a
-box, whose faces move along straight lines.
+A beam is a group of rays that share one query. At each distance from their origins, the rays lie in a
+bounding box whose faces move linearly with the distance.
 """
 
 import equinox as eqx
@@ -16,15 +16,15 @@ from .space import Ray
 
 
 STRETCHES = 128
-"""Pieces, at most, into which a beam is divided. In a volume that it crosses with more samples than these
-hold, each stands for a multiple of the samples that are taken at once."""
+"""Maximum number of stretches of a beam. If crossing the volume takes more segments (samples taken at once)
+than this, a stretch covers several."""
 
 ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
 
 
 class Box(eqx.Module):
-    """The box in which the rays of a beam are, at each distance from their origins: counted in cells of the
-    occupancy, from `low + u low_rate` to `high + u high_rate` at the distance `near + u`."""
+    """Bounding box of a beam's rays at each distance from their origins: at the distance `near + u`, from
+    `low + u low_rate` to `high + u high_rate`, in cells of the occupancy."""
 
     near: Float[Array, "*beams"]
     far: Float[Array, "*beams"]
@@ -35,7 +35,7 @@ class Box(eqx.Module):
 
     @classmethod
     def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
-        """The box of rays, the last axis being that of a beam's. Those that miss the volume do not count."""
+        """The box of rays; the last axis is that of a beam's rays. Rays that miss the volume are ignored."""
         rays = jax.lax.stop_gradient(rays)
         hit = rays.length > 0
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
@@ -46,21 +46,21 @@ class Box(eqx.Module):
 
     @classmethod
     def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
-        """The box of all rays of a camera between those of a beam's corners, which are the last axis."""
+        """The box of all camera rays between a beam's corner rays; the last axis is that of the corners."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
         spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
         x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
-        around = jnp.sqrt(sum(span**2 for span in spans)) / 2
-        # Directions between those of the corners are their averages, made unit vectors: longer by at most 1
-        # minus the cosine of the widest angle to the middle one.
+        radius = jnp.sqrt(sum(span**2 for span in spans)) / 2
+        # A direction between the corners is an average of theirs, normalized, which lengthens it by at most 1
+        # minus the cosine of the widest angle to the mean direction.
         axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
         cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
         bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
-        # of all rays: from parallel ones the grid is as far away as from the nearest and farthest corner
+        # bounds for all rays: parallel rays have different origins, hence the nearest and farthest corner
         nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
         spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
-        near, far = jnp.maximum(nearest - around - spread, 0), farthest + around + spread
+        near, far = jnp.maximum(nearest - radius - spread, 0), farthest + radius + spread
         start = along(origin, direction, near[..., None])
         return cls._of(occupancy, start, direction, near, far, jnp.ones(start[0].shape, bool), bulge)
 
@@ -80,7 +80,7 @@ class Box(eqx.Module):
 
         sides = []
         for s, d, size, corner in zip(start, direction, occupancy.size, occupancy.origin, strict=True):
-            # what float32 makes of the start of a ray whose camera is far away
+            # allows for rounding a ray's start to float32 when the camera is far away
             slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
             s, d = (s - corner) / size, d / size
             sides.append(
@@ -95,7 +95,7 @@ class Box(eqx.Module):
         return cls(near, far, low, high, low_rate, high_rate)
 
     def between(self, first: Scalar, last: Scalar) -> tuple[Vec3, Vec3]:
-        """The box of everything from `near + first` to `near + last`, both ≥ 0."""
+        """Bounding box of all rays from `near + first` to `near + last`, both ≥ 0."""
         low = jax.tree.map(lambda s, r: s + jnp.minimum(first * r, last * r), self.low, self.low_rate)
         high = jax.tree.map(lambda s, r: s + jnp.maximum(first * r, last * r), self.high, self.high_rate)
         return low, high
@@ -104,8 +104,8 @@ class Box(eqx.Module):
 class Stretches(eqx.Module):
     """Which stretches of beams are empty.
 
-    - `near`: distance from the origins at which the first stretch begins; `length`: of each.
-    - `following`: for each stretch the first one, itself or behind it, that is not empty.
+    - `near`: distance from the ray origins to the first stretch. `length`: of each stretch.
+    - `following`: for each stretch, the first at or behind it that is not empty.
     """
 
     near: Float[Array, " beams"]
@@ -114,14 +114,14 @@ class Stretches(eqx.Module):
 
 
 def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
-    """Ask for each stretch of each beam, from the last one to the first, which one is the next occupied."""
+    """Find the next occupied stretch for each stretch of each beam, from the last stretch to the first."""
     across = jnp.maximum(box.far - box.near, 0)
-    # whole multiples of what is sampled at once, the same for all beams, so that none is cut in two
+    # a whole multiple of `stretch`, the same for all beams, so that no segment is cut in two
     multiple = jnp.ceil(jnp.max(across) / (stretch * STRETCHES))
     length = jnp.maximum(multiple, 1) * stretch
     number = jnp.minimum(jnp.ceil(jnp.max(across) / length).astype(jnp.int32), STRETCHES)
 
-    def ask(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def visit(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         at, next_one, table = state
         at = at - 1
         first = at.astype(length.dtype) * length
@@ -131,7 +131,7 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
             inside &= (b >= 0) & (a <= n)
 
         def cells(corner: Vec3) -> Index:
-            """The cells of a corner, in the grid; some cell for boxes that are not."""
+            """Cell indices of a corner, clipped to the grid; arbitrary for boxes outside it."""
             x, y, z = (
                 jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
                 for c, n in zip(corner, shape, strict=True)
@@ -144,5 +144,5 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
 
     none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
     table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int32)
-    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, ask, varying((number, none, table)))
+    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, visit, varying((number, none, table)))
     return Stretches(box.near, length, table)

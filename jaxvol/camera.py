@@ -1,7 +1,7 @@
-"""Which ray belongs to this pixel?
+"""Which ray belongs to a pixel?
 
-Names and conventions are VTK's and PyVista's: `view_angle` and `parallel_scale` measure the height
-of the view. Pixel (0, 0) is the top left; a pixel's ray passes through its middle.
+Names and conventions follow VTK and PyVista: `view_angle` and `parallel_scale` measure the height
+of the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
 """
 
 from typing import Any
@@ -18,29 +18,29 @@ from .volume import Volume
 
 
 ALONG = 1e-3
-"""Sine of the angle between two directions up to which `looking_at` takes them for one."""
+"""`looking_at` treats directions as parallel up to this sine of the angle between them."""
 
 
 class Camera(eqx.Module):
-    """A pinhole camera, or an orthographic one where `parallel_scale` is given.
+    """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
     **Arguments:**
 
-    - `position`: world position. It may lie inside a volume (endoscopy); what is behind it is not seen.
-    - `focal_point`: the world point in the middle of the image.
-    - `view_up`: a direction that points up in the image, not along the view.
+    - `position`: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
+    - `focal_point`: world point at the center of the image.
+    - `view_up`: direction that points up in the image; not parallel to the view direction.
     - `view_angle`: angle between the lower and the upper edge of the image, degrees, in (0, 180).
-    - `parallel_scale`: half the height of the view in world length; makes the camera orthographic,
-      with rays that start in the plane through `position`.
+    - `parallel_scale`: half the height of the view, in world length. Makes the camera orthographic, with
+      ray origins in the plane through `position`.
     - `size`: (width, height) of the image in pixels.
-    - `window`: the part of the image plane that the image shows, (left, right, bottom, top) from its
-      middle, in units of half the height of the whole view. The default is the whole view,
-      (-width/height, width/height, -1, 1). `crop` and `zoom` set it.
+    - `window`: the part of the image plane that is shown, (left, right, bottom, top) relative to its
+      center, in units of half the height of the whole view. The default is the whole view,
+      (-width/height, width/height, -1, 1). Set by `crop` and `zoom`.
     - `corner`: column and row of the first pixel in the image that this one was cropped from, by default
-      (0, 0): what is random along a ray is keyed by its pixel there. `crop` sets it.
+      (0, 0). Pixels of that image key everything random along a ray. Set by `crop`.
 
-    **Raises:** `ValueError` for a camera at its focal point, `view_up` along the view, an angle, a
-    scale or a size out of range.
+    **Raises:** `ValueError` for a camera at its focal point, a `view_up` along the view direction, and an
+    angle, scale or size out of range.
     """
 
     position: Float[Array, "3"]
@@ -50,7 +50,7 @@ class Camera(eqx.Module):
     parallel_scale: Float[Array, ""] | None
     window: Float[Array, "4"]
     corner: Float[Array, "2"]
-    """Whole numbers, kept as floats so that `jax.grad` takes a camera as it is; their gradient is 0."""
+    """Whole numbers, stored as floats so that `jax.grad` accepts a camera; their gradient is 0."""
     size: tuple[int, int] = eqx.field(static=True)
 
     def __init__(
@@ -107,18 +107,18 @@ class Camera(eqx.Module):
     ) -> "Camera":
         """A camera that sees the whole volume from the side that `direction` points to.
 
-        As VTK's `ResetCamera`: the sphere around the volume's bounds just fits into the view.
+        Like VTK's `ResetCamera`: the bounding sphere of the volume just fits into the view.
 
         **Arguments:**
 
-        - `direction`: from the middle of the volume to the camera, of any length.
-        - `view_up`: as in `Camera`; where it lies within 0.06° of the direction, y points up in its place, or
-          -z where that does, too: seen from above, x runs to the right.
-        - `view_angle`: degrees; that of an orthographic camera just sets how far away it stands.
+        - `direction`: from the center of the volume to the camera, of any length.
+        - `view_up`: as in `Camera`. If it is within 0.06° of `direction`, y is used instead, or -z if y is
+          within 0.06°, too; seen from above, x then runs to the right.
+        - `view_angle`: degrees. For an orthographic camera, it only sets the distance.
         - `parallel`: whether the camera is orthographic.
 
-        **Raises:** `ValueError` as `Camera` does, for a direction or a `view_up` of 0, and for what is no
-        volume.
+        **Raises:** `ValueError` as `Camera` does, for a `direction` or `view_up` of 0, and if `volume` is not
+        a `Volume`.
         """
         if not isinstance(volume, Volume):
             raise ValueError(
@@ -131,16 +131,17 @@ class Camera(eqx.Module):
         view_up = finite_array("view_up", view_up, (3,))
         view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
         width, height = _image_size(size)
-        position, center, up, scale = _seeing_all(
+        position, center, up, scale = _fitted_view(
             volume, direction, view_up, view_angle, min(1, width / height)
         )
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale if parallel else None)
 
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
-        """The camera that renders just this rectangle of the image: the same pixels, jitter included, in an
-        image of their own. `left` and `top` are the column and row of its first pixel.
+        """A camera that renders only this rectangle of the image: the same pixels, jitter included.
 
-        **Raises:** `ValueError` for a rectangle that is empty or leaves the image.
+        `left` and `top` are the column and row of the rectangle's first pixel.
+
+        **Raises:** `ValueError` for a rectangle that is empty or extends beyond the image.
         """
         left, top = integer("left", left, 0), integer("top", top, 0)
         width, height = integer("width", width, 1), integer("height", height, 1)
@@ -158,16 +159,16 @@ class Camera(eqx.Module):
         )
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
-        """The camera that shows 1/`factor` of the image in an image of the same size, around
-        `center`, given as fractions of width and height from the top left.
+        """A camera that shows 1/`factor` of the image at the same image size, around `center`.
 
-        It magnifies the image plane, so perspective does not change.
+        `center` is given in fractions of width and height from the top left. Zooming magnifies the image
+        plane, so the perspective does not change.
         """
         factor = number("zoom factor", factor, above=0)
         return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
     def ray(self, column: Num[Array, ""], row: Num[Array, ""]) -> tuple[Vec3, Vec3]:
-        """Origin and unit direction of one pixel's ray; between whole numbers, of a ray between pixels'."""
+        """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         dtype = self.position.dtype
         x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)
         right, up, forward = (apart(axis) for axis in self._axes())
@@ -180,9 +181,9 @@ class Camera(eqx.Module):
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return position, (dx / norm, dy / norm, dz / norm)
 
-    @eqx.filter_jit  # compiled, as the renderer's rays are, so that both round alike
+    @eqx.filter_jit  # compiled like the renderer's rays, so that both round the same way
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
-        """Origins and unit directions of all pixels' rays, `[row, column]`."""
+        """Origins and unit directions of the rays of all pixels, indexed `[row, column]`."""
         width, height = self.size
         over_row = jax.vmap(self.ray, in_axes=(0, None))
         origin, direction = jax.vmap(over_row, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
@@ -190,14 +191,14 @@ class Camera(eqx.Module):
 
     @property
     def first_pixel(self) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """Column and row by which the first pixel is keyed: `corner` as whole numbers."""
+        """Column and row that key the first pixel: `corner` as integers."""
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
     def _showing(
         self, window: Float[Array, "4"], size: tuple[int, int], corner: Float[Array, "2"] | None = None
     ) -> "Camera":
-        shown = Camera(
+        camera = Camera(
             self.position,
             self.focal_point,
             self.view_up,
@@ -206,7 +207,7 @@ class Camera(eqx.Module):
             parallel_scale=self.parallel_scale,
             window=window,
         )
-        return shown if corner is None else eqx.tree_at(lambda camera: camera.corner, shown, corner)
+        return camera if corner is None else eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
     def _axes(self) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
         forward = self.focal_point - self.position
@@ -225,19 +226,19 @@ class Camera(eqx.Module):
         return top - (top - bottom) * (row / self.size[1])
 
 
-# One program each, rather than one for every operation: the first image waits for them.
+# Jitted: the first image would have to wait for a program per operation.
 
 
 @eqx.filter_jit
-def _seeing_all(
+def _fitted_view(
     volume: Volume,
     direction: Float[Array, "3"],
     view_up: Float[Array, "3"],
     view_angle: Float[Array, ""],
     aspect: float,
 ) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """From where a view of this angle, times `aspect` across, holds the sphere around a volume; the volume's
-    middle; what points up; and the scale of an orthographic view that holds the sphere."""
+    """Position, focal point, up direction and parallel scale of the view that holds a volume's bounding
+    sphere. `aspect` is width over height, at most 1."""
     low, high = volume.corners
     radius = jnp.linalg.norm(high - low) / 2
     half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
@@ -252,7 +253,7 @@ def _seeing_all(
 def _zoomed(
     window: Float[Array, "4"], factor: Float[Array, ""], center: Float[Array, "2"]
 ) -> Float[Array, "4"]:
-    """1/`factor` of a window, around this part of it."""
+    """1/`factor` of a window, around `center`, given in fractions from its top left."""
     left, right, bottom, top = window
     x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
     half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
@@ -260,7 +261,7 @@ def _zoomed(
 
 
 def _sine(a: Any, b: Any) -> Any:
-    """Sine of the angle between two vectors; 0 where one is zero."""
+    """Sine of the angle between two vectors; 0 if one is zero."""
     across = sum((a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2]) ** 2 for i in range(3))
     lengths = (a * a).sum() * (b * b).sum()
     return (across / (lengths + (lengths == 0).astype(lengths.dtype))) ** 0.5

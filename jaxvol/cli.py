@@ -1,5 +1,4 @@
-"""What does the command `jaxvol` do? Pictures of volumes, and transfer functions of pictures, without a line
-of Python."""
+"""What does the command `jaxvol` do? It renders volume files, and fits transfer functions to images."""
 
 import argparse
 import os
@@ -45,35 +44,36 @@ examples:
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
 
 INTERRUPTED = 130
-"""The exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    **Returns:** the exit code: 0, or 2 for bad input, told in one line. Ctrl-C is told in one line, too, and
-    ends the process at once, by `os._exit`, with 130: XLA does not stop compiling or computing for a signal.
+    **Returns:** the exit code: 0, or 2 for bad input, reported in one line. Ctrl-C is reported in one line,
+    too, and ends the process at once with code 130, by `os._exit`: XLA does not stop compiling or computing
+    for a signal.
     """
     options = _parser().parse_args(arguments)
     jax.config.update("jax_compilation_cache_dir", str(options.programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     try:
-        _apart(options)
+        _run_in_thread(options)
     except (ValueError, OSError, ImportError) as fault:
         print(f"jaxvol {options.command}: error: {' '.join(str(fault).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        kept = getattr(options, "checkpoint", None)
-        left = f"; the same command goes on from {kept}" if kept and kept.exists() else ""
-        print(f"\njaxvol {options.command}: interrupted{left}", file=sys.stderr, flush=True)
+        checkpoint = getattr(options, "checkpoint", None)
+        hint = f"; the same command resumes from {checkpoint}" if checkpoint and checkpoint.exists() else ""
+        print(f"\njaxvol {options.command}: interrupted{hint}", file=sys.stderr, flush=True)
         sys.stdout.flush()
         os._exit(INTERRUPTED)
     return 0
 
 
-def _apart(options: argparse.Namespace) -> None:
-    """Run a command in a thread of its own, so that the main one, to which Python gives signals, just waits
-    and can take them while XLA is at work."""
+def _run_in_thread(options: argparse.Namespace) -> None:
+    """Run a command in a thread of its own. Python delivers signals to the main thread, which only waits and
+    so can handle them while XLA is busy."""
     faults: list[BaseException] = []
 
     def run() -> None:
@@ -103,133 +103,147 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=_programs(),
         metavar="FOLDER",
-        help="where compiled programs are kept for the next time (default: %(default)s)",
+        help="cache of compiled programs (default: %(default)s)",
     )
     scene = _scene_options()
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    demo = commands.add_parser(
-        "demo", parents=[shared], help="render a built-in head, and what one transform changes"
+    demo_command = commands.add_parser(
+        "demo", parents=[shared], help="render a built-in head, and the effect of one transform"
     )
-    demo.add_argument("-o", "--output", type=Path, default=Path("jaxvol-demo"), metavar="FOLDER")
-    demo.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
-    demo.add_argument("--resolution", type=int, default=192, help="voxels along an axis of the phantom")
-    demo.set_defaults(run=_demo)
+    demo_command.add_argument("-o", "--output", type=Path, default=Path("jaxvol-demo"), metavar="FOLDER")
+    demo_command.add_argument(
+        "--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels"
+    )
+    demo_command.add_argument("--resolution", type=int, default=192, help="voxels per axis of the phantom")
+    demo_command.set_defaults(run=_demo)
 
-    one = commands.add_parser(
+    render_command = commands.add_parser(
         "render",
         parents=[shared, scene],
-        help="render a volume file to a picture",
-        description="Render a volume file to a picture.",
+        help="render a volume file to an image",
+        description="Render a volume file to an image.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    one.add_argument(
+    render_command.add_argument(
         "-o",
         "--output",
         type=Path,
         default=Path("out.png"),
         metavar="FILE",
-        help="picture to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); "
+        help="image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); "
         "default: %(default)s",
     )
-    one.add_argument(
+    render_command.add_argument(
         "--transparent",
         action="store_true",
-        help="write opacity in place of a background: .png (straight alpha), .tif or .npy (premultiplied)",
+        help="write opacity instead of a background: .png (straight alpha), .tif or .npy (premultiplied)",
     )
-    one.add_argument(
+    render_command.add_argument(
         "--depth",
         type=Path,
         metavar="FILE",
-        help="write the mean distance to what is seen, infinite where nothing is: .npy or .tif, float32",
+        help="also write depth, the mean distance to what is visible, else infinite: .npy or .tif, float32",
     )
-    one.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
+    render_command.add_argument(
+        "--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels"
+    )
 
-    look = one.add_argument_group("the look")
+    appearance = render_command.add_argument_group("appearance")
     kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
-    chosen = look.add_mutually_exclusive_group()
-    chosen.add_argument("--preset", metavar="NAME", help=kinds)
-    chosen.add_argument(
+    transfer = appearance.add_mutually_exclusive_group()
+    transfer.add_argument("--preset", metavar="NAME", help=kinds)
+    transfer.add_argument(
         "--cmap", metavar="NAME", help="a matplotlib colormap, or a colour, over --clim (default: gray)"
     )
-    chosen.add_argument(
-        "--transfer", type=Path, metavar="JSON", help="a transfer function, as jaxvol fit writes it"
+    transfer.add_argument(
+        "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"
     )
-    look.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
-    look.add_argument(
-        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values to stretch it over"
+    appearance.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
+    appearance.add_argument(
+        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values that it covers"
     )
-    look.add_argument("--unit-distance", type=float, help="length over which opacities count (default: 1)")
+    appearance.add_argument(
+        "--unit-distance", type=float, help="length to which opacities refer (default: 1)"
+    )
 
-    view = one.add_argument_group("the camera")
-    view.add_argument(
+    camera = render_command.add_argument_group("camera")
+    camera.add_argument(
         "--camera",
         type=float,
         nargs=6,
         metavar=("X", "Y", "Z", "FX", "FY", "FZ"),
-        help="position and focal point, world; it may stand inside the volume",
+        help="position and focal point in the world; the camera may be inside the volume",
     )
-    view.add_argument(
+    camera.add_argument(
         "--direction",
         type=float,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="without --camera: the side from which to see the whole volume (default: 0.5 -1 0.4)",
+        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)",
     )
-    view.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
-    view.add_argument(
-        "--view-angle", type=float, default=30, help="degrees between lower and upper edge (default: 30)"
+    camera.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
+    camera.add_argument(
+        "--view-angle",
+        type=float,
+        default=30,
+        help="degrees from the lower to the upper edge of the image (default: 30)",
     )
-    view.add_argument("--parallel", action="store_true", help="orthographic; goes with --direction")
-    view.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
-    one.set_defaults(run=_render)
+    camera.add_argument("--parallel", action="store_true", help="orthographic camera; use with --direction")
+    camera.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
+    render_command.set_defaults(run=_render)
 
-    found = commands.add_parser(
+    fit_command = commands.add_parser(
         "fit",
         parents=[shared, scene],
-        help="find the transfer function under which a volume looks as in pictures",
-        description="Find the transfer function under which a volume looks as in pictures.",
+        help="fit a transfer function to images of a volume",
+        description="Fit a transfer function to images of a volume.",
     )
-    found.add_argument(
-        "--images", type=Path, nargs="+", required=True, metavar="PICTURE", help="sRGB, as PNG"
+    fit_command.add_argument(
+        "--images", type=Path, nargs="+", required=True, metavar="IMAGE", help="sRGB, as PNG"
     )
-    found.add_argument(
+    fit_command.add_argument(
         "--cameras",
         type=Path,
         required=True,
         metavar="JSON",
-        help="a list with an object for each picture: position, focal_point, and optionally view_up, "
-        "view_angle, parallel_scale, window",
+        help="a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
+        "parallel_scale, window",
     )
-    found.add_argument(
+    fit_command.add_argument(
         "-o",
         "--output",
         type=Path,
         default=Path("transfer.json"),
         help="JSON to write (default: %(default)s)",
     )
-    begin = found.add_argument_group("the start")
-    begin.add_argument(
-        "--start", type=Path, metavar="JSON", help="a transfer function, as this command writes"
+    start = fit_command.add_argument_group("start")
+    start.add_argument(
+        "--start", type=Path, metavar="JSON", help="a transfer function written by this command"
     )
-    begin.add_argument("--points", type=int, default=8, help="else, flat grey of so many points (default: 8)")
-    begin.add_argument(
+    start.add_argument(
+        "--points", type=int, default=8, help="else, flat grey with this many points (default: 8)"
+    )
+    start.add_argument(
         "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of their values (default: all)"
     )
-    how = found.add_argument_group("the solver")
-    how.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
-    how.add_argument("--max-steps", type=int, default=100)
-    how.add_argument(
-        "--checkpoint", type=Path, metavar="FILE", help="keep every step; go on from here after a break"
+    solver = fit_command.add_argument_group("solver")
+    solver.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
+    solver.add_argument("--max-steps", type=int, default=100)
+    solver.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="save every step here; resume from here after an interruption",
     )
-    how.add_argument("--progress", action="store_true", help="show a progress bar")
-    found.set_defaults(run=_fit)
+    solver.add_argument("--progress", action="store_true", help="show a progress bar")
+    fit_command.set_defaults(run=_fit)
     return parser
 
 
 def _scene_options() -> argparse.ArgumentParser:
-    """Options of all that is rendered from a volume file."""
+    """Options shared by all commands that render a volume file."""
     scene = argparse.ArgumentParser(add_help=False)
     scene.add_argument(
         "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
@@ -240,19 +254,19 @@ def _scene_options() -> argparse.ArgumentParser:
     scene.add_argument(
         "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
     )
-    what = scene.add_argument_group("the data", "needed where the file and its name do not tell")
-    what.add_argument(
+    data = scene.add_argument_group("data", "needed if the file and its name do not specify it")
+    data.add_argument(
         "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
     )
-    what.add_argument("--dtype", help="such as uint8 or uint16le")
-    what.add_argument(
+    data.add_argument("--dtype", help="such as uint8 or uint16le")
+    data.add_argument(
         "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
     )
     return scene
 
 
 def _version() -> str:
-    """Of jaxvol, as installed, and of JAX."""
+    """Versions of jaxvol, as installed, and of JAX."""
     try:
         own = metadata.version("jaxvol")
     except metadata.PackageNotFoundError:  # run from a checkout
@@ -261,7 +275,7 @@ def _version() -> str:
 
 
 def _programs() -> Path:
-    """The folder of compiled programs: JAX's own where that is set, else one in the user's cache."""
+    """The compilation cache folder: JAX's own if that is set, else one in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(chosen) if chosen else caches / "jaxvol" / "programs"
@@ -275,8 +289,8 @@ def _demo(options: argparse.Namespace) -> None:
     march = March(float(head.spacing[0]) / 2, FAST, "midpoint")
     _picture(head, preset("head", unit_distance=0.01), camera, march, options.output / "head.png")
 
-    # A translucent cube at a step far too long: the last cell of each ray reaches past the cube by
-    # another part of a step, which shows as terraces, until it is cut at the exit.
+    # A translucent cube at a far too long step: each ray's last cell reaches past the cube by a different
+    # fraction of a step, which shows as terraces unless the cell is cut at the exit.
     cube = phantom("linear", 64)
     transfer = TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
     camera = Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=size).zoom(1.3)
@@ -294,10 +308,10 @@ def _render(options: argparse.Namespace) -> None:
     view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
     if options.camera and options.parallel:
         raise ValueError(
-            "--parallel goes with --direction, from which the whole volume is seen; leave out --camera."
+            "--parallel goes with --direction, which shows the whole volume; leave out --camera."
         )
     if options.camera and options.direction:
-        raise ValueError("--camera says where the camera is; leave out --direction.")
+        raise ValueError("--camera sets the position; leave out --direction.")
     if options.camera:
         camera = Camera(options.camera[:3], options.camera[3:], **view)
     else:
@@ -309,12 +323,12 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
-    """The transfer function that the options ask for."""
+    """The transfer function that the options specify."""
     if options.transfer:
         for name in ("clim", "opacity", "unit_distance"):
             if getattr(options, name) is not None:
                 raise ValueError(
-                    f"--{name.replace('_', '-')} is for presets and colormaps; --transfer says it all itself."
+                    f"--{name.replace('_', '-')} is for presets and colormaps; --transfer needs none."
                 )
         return read_transfer(options.transfer)
     unit_distance = 1.0 if options.unit_distance is None else options.unit_distance
@@ -330,24 +344,24 @@ def _fit(options: argparse.Namespace) -> None:
     output_file("--output", options.output)
     volume, march = _scene(options)
     views = read_views(options.images, options.cameras)
-    given = options.start
-    start = read_transfer(given) if given else flat_grey(volume, options.points, options.clim)
-    found = fit(
+    file = options.start
+    start = read_transfer(file) if file else flat_grey(volume, options.points, options.clim)
+    result = fit(
         ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, options.background),
         start,
         solver=options.solver,
         max_steps=options.max_steps,
         checkpoint=options.checkpoint,
-        checkpoint_seconds=0,  # Ctrl-C may come at any time, and what is kept is small
+        checkpoint_seconds=0,  # Ctrl-C may come at any time, and a checkpoint is small
         progress=options.progress,
     )
-    path = write_transfer(options.output, found.parameters)
-    error = (2 * found.loss) ** 0.5
-    print(f"{path}: RMSE {error:.5f} in linear RGB after {len(found.losses)} steps. {found.message}")
+    path = write_transfer(options.output, result.parameters)
+    error = (2 * result.loss) ** 0.5
+    print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")
 
 
 def _scene(options: argparse.Namespace) -> tuple[Volume, March]:
-    """The volume in the file, and how it is marched."""
+    """The volume in the file, and its march."""
     volume = load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     return volume, March(step, FAST, "midpoint")
@@ -363,7 +377,7 @@ def _picture(
     background: Sequence[float] | None = (1, 1, 1),
     depth: Path | None = None,
 ) -> None:
-    """Render to files, with opacity where there is no background; tell where they are and what it took."""
+    """Render to files, with opacity if there is no background; print their paths and the time taken."""
     begun = time.perf_counter()
     rendering = jax.block_until_ready(render(volume, transfer, camera, march))
     took = time.perf_counter() - begun
@@ -372,12 +386,12 @@ def _picture(
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     print(
         f"{path}: {' x '.join(map(str, camera.size))} pixels of {' x '.join(map(str, volume.shape))} voxels, "
-        f"{millions:.1f} million samples in {took:.2f} s with compilation, "
+        f"{millions:.1f} million samples in {took:.2f} s including compilation, "
         f"on {device.device_kind} ({device.platform})"
     )
     if depth:
         print(f"{save_image(depth, rendering.depth)}: distances, world length")
     if np.any(rendering.exhausted):
-        print(f"{path}: incomplete: rays ran out of their {march.most_samples} samples; take a longer step")
+        print(f"{path}: incomplete: rays used up their {march.most_samples} samples; use a longer step")
     if (why := why_unseen(volume, transfer, camera, rendering)) is not None:
         print(f"{path}: nothing is seen: {why}")

@@ -1,4 +1,4 @@
-"""How does linear light become a picture file? Through the sRGB curve."""
+"""How is linear colour saved as an image file? The sRGB curve, and the file formats."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ from ._util.checks import Arrayable, described, output_file
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
-    """Linear colour to sRGB display values, both in [0, 1]; what lies outside is clipped."""
+    """Linear colour to sRGB display values, both in [0, 1]; values outside are clipped."""
     linear = jnp.clip(jnp.asarray(linear), 0, 1)
     curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
@@ -24,34 +24,36 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
 
 def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
-    """Write an image, in the format that the ending of its name tells:
+    """Write an image, in the format given by the file extension:
 
-    | ending | what is written |
+    | extension | contents |
     |---|---|
-    | `.png` | sRGB, 8 bits; with opacity, transparent (straight alpha) |
-    | `.jpg`, `.jpeg` | sRGB, 8 bits, no opacity |
-    | `.tif`, `.tiff` | linear float32, as it is; with opacity, premultiplied (associated alpha) |
-    | `.npy` | linear float32, as it is: `numpy.load` reads it |
+    | `.png` | 8-bit sRGB; with opacity, transparent (straight alpha) |
+    | `.jpg`, `.jpeg` | 8-bit sRGB, no opacity |
+    | `.tif`, `.tiff` | linear float32, unchanged; with opacity, premultiplied (associated alpha) |
+    | `.npy` | linear float32, unchanged; read it with `numpy.load` |
 
     **Arguments:**
 
-    - `linear`: linear RGB, (height, width, 3), as `Rendering.image` gives; with opacity, (height, width, 4),
-      as `Rendering.rgba`, premultiplied; or one channel, (height, width), as `Rendering.depth`, which may be
-      infinite. 8 bits clip what lies outside [0, 1].
+    - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
+      (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
+      may be infinite. 8-bit formats clip to [0, 1].
 
-    **Returns:** the path. Its folder is made where there is none.
+    **Returns:** the path. Its folder is created if it does not exist.
 
-    **Raises:** `ValueError` for what is no array, another ending, a shape that the format does not hold, NaN,
-    colours that are infinite, and a path that cannot be written.
+    **Raises:** `ValueError` for input that is not an array, an unknown extension, a shape that the format
+    does not hold, NaN, infinite colours, and a path that cannot be written.
 
-    A viewer blends a transparent PNG over its background in sRGB; `Rendering.image` does so in linear light,
-    which looks different where the opacity lies between 0 and 1.
+    A viewer blends a transparent PNG over its background in sRGB, `Rendering.image` blends in linear light;
+    the two look different where the opacity lies between 0 and 1.
     """
     try:
         image = np.asarray(linear, np.float32)
     except (TypeError, ValueError) as fault:
-        given = f"linear must be an array of numbers; got {described(linear)}."
-        raise ValueError(f"{given} Of a Rendering, give rendering.image() or rendering.rgba.") from fault
+        raise ValueError(
+            f"linear must be an array of numbers; got {described(linear)}. For a Rendering, pass "
+            "rendering.image() or rendering.rgba."
+        ) from fault
     channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else None
     if channels not in (0, 3, 4) or 0 in image.shape:
         raise ValueError(
@@ -73,8 +75,10 @@ def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
 
 
 def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
-    """`save_image` for a path that must end in `.png`: linear RGB (height, width, 3) as 8-bit sRGB, or
-    premultiplied RGBA (height, width, 4) as a transparent one."""
+    """`save_image` for a path that must end in `.png`.
+
+    Writes linear RGB (height, width, 3) as 8-bit sRGB, premultiplied RGBA (height, width, 4) with alpha.
+    """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")
     return save_image(path, linear)
@@ -88,16 +92,15 @@ CHANNELS = {
     ".tiff": (0, 3, 4),
     ".npy": (0, 3, 4),
 }
-"""How many channels an image of each format may have; 0: it has no axis of channels."""
+"""Numbers of channels that each format can hold; 0 means no channel axis."""
 
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
-    """The path of an image with so many channels, once it is known that it can be written there: asked before
-    the image is made."""
+    """Check that an image with this many channels can be written to `path`, before it is rendered."""
     path, what = Path(path), {0: "depth", 3: "colours", 4: "colours and opacity"}[channels]
-    fitting = [ending for ending, counts in CHANNELS.items() if channels in counts]
-    if path.suffix.lower() not in fitting:
-        raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(fitting)}; got {path}.")
+    allowed = [ending for ending, counts in CHANNELS.items() if channels in counts]
+    if path.suffix.lower() not in allowed:
+        raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(allowed)}; got {path}.")
     return output_file(name, path)
 
 
@@ -112,7 +115,7 @@ def _save_display(path: Path, image: Float[np.ndarray, "height width channels"])
     from skimage.io import imsave
 
     color, opacity = image[..., :3], image[..., 3:]
-    # straight: a viewer multiplies by the opacity itself
+    # straight alpha: viewers multiply by the opacity
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
     display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
     imsave(path, np.asarray(jnp.round(display * 255)).astype(np.uint8), check_contrast=False)

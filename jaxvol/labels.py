@@ -1,26 +1,24 @@
-"""Which colour and extinction has a value within this structure? One transfer function for each label."""
+"""Transfer functions of segmented volumes: one for each label."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from ._util.checks import described, integer
+from ._util.piecewise_linear import (
+    clip_below,
+    interpolate_row,
+    points_below,
+    positive_between,
+    table_row,
+    upper_bound_between,
+)
 from ._util.vec3 import Scalar, Vec3
 from .occupancy import Blocks
-from .transfer import (
-    Classify,
-    Measured,
-    Transfer,
-    TransferFunction,
-    at_least,
-    interpolated,
-    points_below,
-    row_of,
-    seen_between,
-)
+from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume
 
 
@@ -33,10 +31,9 @@ class LabelTransferFunction(Transfer):
       label that is not seen. A label that is not named, or lies beyond the last, is not seen either. Labels
       are 0 to 255 here; number others anew, as by `np.unique(labels, return_inverse=True)`.
 
-    Where one function has fewer control points than another it is continued by points beyond its last, which
-    look like the last.
+    A function with fewer control points than another is padded with copies of its last point beyond it.
 
-    The label is that of the nearest node, so it changes along a ray at once, half-way between nodes;
+    The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
     `AlphaCorrection(labels=True)` cuts cells there.
 
     **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
@@ -44,7 +41,7 @@ class LabelTransferFunction(Transfer):
     """
 
     stacked: TransferFunction
-    """All functions as one, with a leading axis for the label; the last is that of labels not seen."""
+    """All functions, stacked along a leading axis for the label; the last is that of invisible labels."""
 
     def __init__(
         self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
@@ -73,20 +70,29 @@ class LabelTransferFunction(Transfer):
             value, label = measured
             label = jnp.where((label < 0) | (label > unseen), unseen, label)
             values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)
-            row = row_of(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
-            return interpolated(row, at_least(value - row[0], jnp.zeros_like(row[0])))
+            row = table_row(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
+            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return classify
 
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        bound = jnp.zeros_like(blocks.low)
+        for label, values, extinction in self._by_label():
+            own = upper_bound_between(values, extinction, blocks.low, blocks.high)
+            bound = jnp.where(blocks.may_hold(label), jnp.maximum(bound, own), bound)
+        return jnp.where(self.visible(blocks), bound, 0)
+
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume hold a label, and a value, of which something is seen."""
-        functions = jax.lax.stop_gradient(self.stacked)
         seen = jnp.zeros(blocks.low.shape, bool)
-        for label in range(functions.values.shape[0] - 1):
-            values, extinction = functions.values[label], functions.extinction[label]
-            inside = seen_between(values, extinction, blocks.low, blocks.high)
-            seen |= inside & blocks.may_hold(label)
+        for label, values, extinction in self._by_label():
+            seen |= positive_between(values, extinction, blocks.low, blocks.high) & blocks.may_hold(label)
         return seen
+
+    def _by_label(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
+        """Each label, with the control points and extinctions of its function, without their gradients."""
+        functions = jax.lax.stop_gradient(self.stacked)
+        for label in range(functions.values.shape[0] - 1):
+            yield label, functions.values[label], functions.extinction[label]
 
 
 def _by_label(functions: Any) -> list[TransferFunction | None]:

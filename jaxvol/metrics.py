@@ -1,8 +1,8 @@
-"""How far is an image from the truth, and in what way?
+"""How far is an image from a reference, and what kind of error is it?
 
-Images are (height, width) or (height, width, channels), computed with in float64. Energies are mean
-squares per pixel, summed over channels: in an error scaled by k they grow by k². Frequencies are in
-cycles per pixel, (along columns, along rows). NumPy, not JAX: these analyse finished images.
+Images are (height, width) or (height, width, channels), and are analysed in float64. Energies are mean
+squares per pixel, summed over channels: scaling an error by k scales them by k². Frequencies are (x, y)
+in cycles per pixel. This is NumPy, not JAX, since it analyses finished images.
 """
 
 from typing import Any, TypeAlias, cast
@@ -15,31 +15,31 @@ Image: TypeAlias = Float64[np.ndarray, "height width channels"]
 Plane: TypeAlias = Float64[np.ndarray, "height width"]
 
 BLOCK = 32
-"""Side of the blocks, in pixels, in which wood grain of no known frequency is looked for: small enough that
-rings on a curved surface are straight and even within one, large enough to tell frequencies apart."""
+"""Side, in pixels, of the blocks that are searched for wood grain of unknown frequency: small enough that
+rings on a curved surface are straight and evenly spaced within one, large enough to separate frequencies."""
 
 SLOWEST = 3
-"""Cycles per block below which an error is shading, and no wood grain: a period of 10.7 pixels."""
+"""Cycles per block below which an error counts as shading, not wood grain: a period of 10.7 pixels."""
 
 PEAKS = 16
-"""Frequencies of a block that count as its peaks: the main lobe of one wave between bins is 4 x 4."""
+"""Number of frequencies that count as a block's peaks: the main lobe of a wave between bins is 4 x 4."""
 
 
 def rmse(image: Any, reference: Any) -> float:
-    """Root of the mean squared difference, over pixels and channels.
+    """Root-mean-square difference over pixels and channels.
 
-    **Raises:** `ValueError` for NaN or infinity, shapes that differ, and what is no image.
+    **Raises:** `ValueError` for NaN or infinity, shapes that differ, and input that is not an image.
     """
     image, reference = _pair(image, reference)
     return float(np.sqrt(np.mean((image - reference) ** 2)))
 
 
 def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
-    """Peak signal to noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
+    """Peak signal-to-noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
 
     **Raises:** as `rmse`, and `ValueError` for a `data_range` that is not positive.
     """
-    from skimage.metrics import peak_signal_noise_ratio  # here: it takes longer to import than jaxvol
+    from skimage.metrics import peak_signal_noise_ratio  # here, since it imports more slowly than jaxvol
 
     image, reference = _pair(image, reference)
     if not np.any(image != reference):
@@ -52,24 +52,24 @@ def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
 
     **Raises:** as `psnr`, and `ValueError` for an image with fewer than 7 pixels along a side.
 
-    Source: Wang et al. 2004, as scikit-image has it.
+    Source: Wang et al. 2004, as implemented in scikit-image.
     """
-    from skimage.metrics import structural_similarity  # here: it takes longer to import than jaxvol
+    from skimage.metrics import structural_similarity  # here, since it imports more slowly than jaxvol
 
     image, reference = _pair(image, reference)
     _at_least("image", image, 7)
     data_range = _positive("data_range", data_range)
     mean = structural_similarity(reference, image, data_range=data_range, channel_axis=-1)
-    return float(cast(float, mean))  # a tuple only where more was asked for
+    return float(cast(float, mean))  # a tuple only if more outputs are requested
 
 
 def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: float) -> tuple[float, float]:
     """Frequency of the wood grain on an inclined plane seen by an orthographic camera, cycles per pixel.
 
-    Its depth grows by one step, and so its rings return, every `step / (pixel_size depth_slope)` pixels.
+    The plane's depth grows by one step, and the rings repeat, every `step / (pixel_size depth_slope)` pixels.
 
     - `step`: distance between samples, world length, > 0.
-    - `depth_slope`: world depth gained per world length to the right, and down, in the image.
+    - `depth_slope`: world depth gained per world length to the right and downwards in the image.
     - `pixel_size`: world length of a pixel, > 0.
 
     **Raises:** `ValueError` for a step or pixel size that is not positive, and slopes that are not finite.
@@ -80,34 +80,34 @@ def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: fl
 
 
 def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, harmonics: int = 3) -> float:
-    """How much of an error is wood grain: mean square per pixel, summed over channels.
+    """Energy of the wood grain in an error: mean square per pixel, summed over channels.
 
-    **With `frequency`** (a comb's fundamental, see `comb_frequency`): the energy of the waves of this
+    **With `frequency`** (the fundamental of the rings, see `comb_frequency`): the energy of the waves at this
     frequency and its harmonics, each measured by its Fourier coefficient under a Hann window over the image,
 
         a_h = Σ w (e - mean_w(e)) exp(-2πi h f·x) / Σ w,    energy = Σ_h 2 |a_h|²,  h = 1 … harmonics.
 
-    Exact frequencies, not bins: a wave `A cos(2π h f·x + φ)` has energy A²/2 wherever its frequency lies.
-    Harmonics above Nyquist are met where they fold to. Left out are those that cannot be told apart:
-    within two bins (2/width, 2/height) of 0, of their own mirror image, or of a harmonic before them. White
-    noise of variance v adds 2.25 v · 2 harmonics / pixels. `frequency` should be right to half a bin,
-    where 28 % are lost.
+    Frequencies are exact, not FFT bins: a wave `A cos(2π h f·x + φ)` has energy A²/2 at any frequency.
+    Harmonics above Nyquist are measured at their aliases. Harmonics that cannot be separated are left out:
+    those within two bins (2/width, 2/height) of 0, of their own mirror image, or of an earlier harmonic.
+    White noise of variance v adds 2.25 v · 2 harmonics / pixels. `frequency` should be accurate to half a
+    bin, at which 28 % is lost.
 
-    **Without**, for any scene: the energy that stands in few peaks of local spectra, beyond what stands
-    there by chance. In blocks of `BLOCK` pixels that overlap by half, less their windowed mean, under a
-    Hann window w, the periodogram |F|² / (BLOCK² Σ w²) over frequencies of at least `SLOWEST` cycles per
-    block (slower errors are shading) gives a total E and a sum T over its largest `PEAKS`. In white noise
-    the N periodogram values are exponentially distributed, of which the largest m hold the share
-    q = Σ_{i ≤ m} Σ_{i ≤ j ≤ N} 1 / (j N) on average. The energy is the mean over blocks of
+    **Without `frequency`**, for any scene: the energy in a few peaks of local spectra, beyond what noise
+    has there by chance. Blocks of `BLOCK` pixels overlap by half; each is taken minus its windowed mean and
+    under a Hann window w. Its periodogram |F|² / (BLOCK² Σ w²), over frequencies of at least `SLOWEST` cycles
+    per block (slower errors are shading), has the total E, and its `PEAKS` largest values have the sum T.
+    In white noise the N periodogram values are exponentially distributed, and the m largest hold on average
+    the share q = Σ_{i ≤ m} Σ_{i ≤ j ≤ N} 1 / (j N). The energy is the mean over blocks of
 
         (T - q E) / (1 - q),
 
-    which is E for waves and 0 in the mean for white noise (so a little above or below 0 for a given one).
-    Noise beside waves takes away up to 0.13 of its own energy, since it also raises what chance is held
-    to explain. An edge counts as structure, a lone pixel does not.
+    which is E for waves and averages 0 for white noise (so one noise image gives slightly more or less than
+    0). Noise added to waves lowers the result by up to 0.13 of its own energy, since it also raises the part
+    attributed to chance. An edge counts as structure, a single pixel does not.
 
-    **Raises:** `ValueError` for NaN or infinity, what is no image, an image smaller than a block, harmonics
-    < 1, and a fundamental that cannot be told from 0 or from its mirror image.
+    **Raises:** `ValueError` for NaN or infinity, input that is not an image, an image smaller than a block,
+    harmonics < 1, and a fundamental that cannot be separated from 0 or from its mirror image.
     """
     error = _image("error", error)
     if frequency is None:
@@ -119,19 +119,20 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
 
 
 def boundary_noise(image: Any, region: Any) -> float:
-    """Noise on part of an image, whatever its shading: variance per pixel, summed over channels.
+    """Noise in part of an image, without its shading: variance per pixel, summed over channels.
 
     Mean of (M * image)² / 36 over the pixels whose 3 x 3 neighbours all lie in `region`, with the mask
-    M = [1 -2 1; -2 4 -2; 1 -2 1]. White noise of variance v gives v. Shading that is a sum of a function of
-    the row and one of the column gives 0, as does any quadratic; of other smooth shading, ∂⁴/∂x²∂y² is left.
+    M = [1 -2 1; -2 4 -2; 1 -2 1]. White noise of variance v gives v. Shading that is the sum of a function of
+    the row and a function of the column gives 0, as does any quadratic; other smooth shading leaves its
+    ∂⁴/∂x²∂y².
 
     - `image`: an image, or an error.
-    - `region`: (height, width) booleans: where the bounds cut through material, say.
+    - `region`: (height, width) booleans, for example where the bounds cut through material.
 
-    **Raises:** `ValueError` for NaN or infinity, what is no image, a region of another shape, and one
-    that holds no 3 x 3 pixels.
+    **Raises:** `ValueError` for NaN or infinity, input that is not an image, a region of another shape, and
+    one that holds no 3 x 3 pixels.
 
-    Source: Immerkær, "Fast noise variance estimation", CVIU 64(2), 1996, with squares for his moduli.
+    Source: Immerkær, "Fast noise variance estimation", CVIU 64(2), 1996, with squares for absolute values.
     """
     image, region = _image("image", image), np.asarray(region)
     if region.dtype != bool or region.shape != image.shape[:2]:
@@ -151,11 +152,11 @@ def boundary_noise(image: Any, region: Any) -> float:
 
 
 def low_frequency_energy(error: Any, below: float = 1 / 16) -> float:
-    """Energy of an error in frequencies under `below` cycles per pixel, less its mean, under a Hann window.
+    """Energy of an error under `below` cycles per pixel, with its mean removed and a Hann window applied.
 
     Mean square per pixel, summed over channels. The default is the lowest eighth of what an image can hold.
 
-    **Raises:** `ValueError` for NaN or infinity, and what is no image.
+    **Raises:** `ValueError` for NaN or infinity, and input that is not an image.
     """
     error = _image("error", error)
     height, width, _ = error.shape
@@ -169,19 +170,19 @@ def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float
     height, width, _ = error.shape
     window = np.outer(_hann(height), _hann(width))
     windowed = _windowed(error, window) / window.sum()
-    met: list[Float64[np.ndarray, 2]] = [np.zeros(2)]
+    earlier: list[Float64[np.ndarray, 2]] = [np.zeros(2)]
     energy = 0.0
     for harmonic in range(1, harmonics + 1):
         wave = harmonic * np.array(frequency)
-        taken = [*met, -wave]
-        if any(np.all(np.abs(_folded(wave - other)) < 2 / np.array([width, height])) for other in taken):
+        others = [*earlier, -wave]
+        if any(np.all(np.abs(_folded(wave - other)) < 2 / np.array([width, height])) for other in others):
             if harmonic == 1:
                 raise ValueError(
                     f"frequency must be two bins (2/width, 2/height) away from 0 and from its mirror image; "
                     f"got {frequency} in an image of {width} x {height}."
                 )
             continue
-        met += [wave, -wave]
+        earlier += [wave, -wave]
         down, across = (
             np.exp(-2j * np.pi * f * np.arange(n)) for f, n in ((wave[1], height), (wave[0], width))
         )
@@ -190,7 +191,7 @@ def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float
 
 
 def _folded(frequency: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "2"]:
-    """The frequency in [-1/2, 1/2] that looks the same in whole pixels."""
+    """The alias of a frequency in [-1/2, 1/2]."""
     return frequency - np.round(frequency)
 
 
@@ -198,23 +199,23 @@ def _peaks(error: Plane) -> float:
     window = np.outer(_hann(BLOCK), _hann(BLOCK))
     cycles = np.fft.fftfreq(BLOCK, 1 / BLOCK)
     y, x = np.meshgrid(cycles, cycles, indexing="ij")
-    # one of each mirrored pair; the two lines at Nyquist, which mirror into themselves, are left out
+    # one of each mirrored pair, without the two lines at Nyquist, which are their own mirror images
     half = ((y > 0) | ((y == 0) & (x > 0))) & (np.abs(x) < BLOCK / 2) & (np.abs(y) < BLOCK / 2)
-    wanted = half & (np.hypot(x, y) >= SLOWEST)
+    selected = half & (np.hypot(x, y) >= SLOWEST)
 
     blocks = np.lib.stride_tricks.sliding_window_view(error, (BLOCK, BLOCK))
     starts = [np.append(np.arange(0, n - 1, BLOCK // 2), n - 1) for n in blocks.shape[:2]]
     blocks = blocks[np.ix_(*starts)].reshape(-1, BLOCK, BLOCK, 1)
-    spectra = [np.fft.fft2(_windowed(block, window)[..., 0])[wanted] for block in blocks]
+    spectra = [np.fft.fft2(_windowed(block, window)[..., 0])[selected] for block in blocks]
     energy = np.sort(2 * np.abs(np.array(spectra)) ** 2, axis=1) / (BLOCK**2 * np.sum(window**2))
 
-    chance = _share_of_largest(PEAKS, int(wanted.sum()))
+    chance = _share_of_largest(PEAKS, int(selected.sum()))
     total, top = energy.sum(axis=1).mean(), energy[:, -PEAKS:].sum(axis=1).mean()
     return float((top - chance * total) / (1 - chance))
 
 
 def _share_of_largest(m: int, n: int) -> float:
-    """Part of their sum that the largest m of n exponentially distributed numbers hold on average."""
+    """Average share of the m largest of n exponentially distributed numbers in their sum."""
     tails = np.cumsum(1 / np.arange(n, 0, -1))[::-1]  # the i-th largest has mean Σ_{i ≤ j ≤ n} 1/j
     return float(tails[:m].sum() / n)
 
@@ -224,13 +225,13 @@ def _hann(n: int) -> Float64[np.ndarray, " n"]:
 
 
 def _windowed(error: Image, window: Plane) -> Image:
-    """The error less its mean under the window, times the window."""
+    """The error minus its windowed mean, times the window."""
     mean = np.tensordot(window, error, axes=2) / window.sum()
     return (error - mean) * window[..., None]
 
 
 def _neighbours(array: Shaped[np.ndarray, "..."], axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pixel before, the pixel itself and the one after, for all that have both."""
+    """The previous, current and next pixel along an axis, for all pixels with both neighbours."""
     n = array.shape[axis]
     before, here, after = (np.take(array, np.arange(i, n - 2 + i), axis) for i in range(3))
     return before, here, after

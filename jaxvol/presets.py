@@ -1,4 +1,4 @@
-"""Which looks have names? Transfer functions for kinds of data, and any matplotlib colormap."""
+"""Transfer functions by name: presets for kinds of data, and any matplotlib colormap."""
 
 from difflib import get_close_matches
 from typing import Any
@@ -13,13 +13,13 @@ from .display import from_srgb
 from .transfer import TransferFunction, extinction_of
 
 
-# Without a light, shape shows where a surface is dark and thin at its foot and bright and dense above:
-# a ray that grazes it stays in the foot, and draws a dark contour.
+# Unlit surfaces show their shape if the foot of their opacity ramp is dark and thin, and the rest bright and
+# dense: a grazing ray stays in the foot and draws a dark contour.
 #
 # name: (what it is for, its range of values, control points (value, linear rgb, opacity per mm))
 PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float, float, float], float]]]] = {
     "ct_bone": (
-        "CT in Hounsfield units: bone alone",
+        "CT in Hounsfield units: bone only",
         (-1000, 3000),
         [
             (130, (0.10, 0.06, 0.03), 0.0),
@@ -82,7 +82,7 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
         ],
     ),
     "mr_head": (
-        "MR of a head, T1, 8 bit: skin, and the brain that shows through it",
+        "MR of a head, T1, 8 bit: skin, with the brain showing through",
         (0, 255),
         [
             (25, (0.05, 0.03, 0.03), 0.0),
@@ -133,13 +133,13 @@ def preset(
 
     **Arguments:**
 
-    - `name`: a key of `jaxvol.PRESETS`, which says what each is for and over which range of values it
-      is drawn: Hounsfield units for the `ct_…`, 0 to 255 for the others.
-    - `clim`: (low, high) in the volume's values: the preset's own range is stretched linearly to it.
-      CT stored as Hounsfield units + 1000, say, wants `clim=(0, 4000)`.
-    - `unit_distance`: world length over which the preset's opacities count; they are drawn for 1 mm.
+    - `name`: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values:
+      Hounsfield units for `ct_…`, 0 to 255 for the others.
+    - `clim`: (low, high) in the volume's values; the preset's own range is stretched linearly to it.
+      For example, CT stored as Hounsfield units + 1000 needs `clim=(0, 4000)`.
+    - `unit_distance`: world length to which the preset's opacities refer; they are designed for 1 mm.
 
-    **Raises:** `ValueError` for a name that is not there, and a `clim` that does not increase.
+    **Raises:** `ValueError` for an unknown name, and a `clim` that does not increase.
     """
     if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
@@ -157,18 +157,18 @@ def colormap(
     unit_distance: Arrayable = 1.0,
     n_colors: int | Any = 256,
 ) -> TransferFunction:
-    """A transfer function from a matplotlib colormap and an opacity ramp, as PyVista's `add_volume`.
+    """A transfer function from a matplotlib colormap and an opacity ramp, as in PyVista's `add_volume`.
 
     **Arguments:**
 
-    - `cmap`: name of a matplotlib colormap, or a colormap; or a colour, such as `"tomato"`, `"#ff6347"` or
-      (1, 0.39, 0.28), which the whole range takes; or several colours, a list or an array (m, 3), at equal
-      distances over the range and linear between, in sRGB, as matplotlib mixes them. All colours are sRGB,
-      and made linear here. Their transparency does not count: `opacity` does.
-    - `clim`: (low, high) in the volume's values: where the colormap begins and ends.
+    - `cmap`: a matplotlib colormap or its name; or one colour for the whole range, such as `"tomato"`,
+      `"#ff6347"` or (1, 0.39, 0.28); or several colours, a list or an (m, 3) array, evenly spaced over the
+      range and interpolated linearly in sRGB, as in matplotlib. All colours are sRGB and are converted to
+      linear. Their alpha is ignored; `opacity` applies.
+    - `clim`: (low, high), the volume's values at which the colormap begins and ends.
     - `opacity`: `"linear"`: from 0 to 1 over the range. `"sigmoid"`: `1/(1 + exp(-x))` for x from -10
-      to 10 over the range. An array in [0, 1]: opacities at equal distances over the range.
-    - `unit_distance`: world length of a layer that has these opacities.
+      to 10 over the range. An array in [0, 1]: opacities evenly spaced over the range.
+    - `unit_distance`: thickness, in world length, of a layer that has these opacities.
     - `n_colors`: number of control points, at least 2.
 
     **Raises:** `ValueError` for an unknown colormap, colour or opacity, opacities outside [0, 1], and a
@@ -183,7 +183,7 @@ def colormap(
 
 
 def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """sRGB at fractions of the range."""
+    """sRGB colours at fractions of the range."""
     from matplotlib import colormaps, colors
 
     if isinstance(cmap, str) and cmap in colormaps:
@@ -192,8 +192,8 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
         return cmap(at)[:, :3]
     cmap = jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, cmap)
     try:
-        given = colors.to_rgba_array(cmap)[:, :3]
-        if len(given) == 0 or given.min() < 0 or given.max() > 1:
+        rgb = colors.to_rgba_array(cmap)[:, :3]
+        if len(rgb) == 0 or rgb.min() < 0 or rgb.max() > 1:
             raise ValueError
     except (ValueError, TypeError) as fault:
         near = get_close_matches(cmap.lower(), list(colormaps), 3) if isinstance(cmap, str) else []
@@ -203,8 +203,8 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
             "cmap must be a matplotlib colormap or its name, or one or several colours, by name or sRGB in "
             f"[0, 1]; got {got}.{hint}"
         ) from fault
-    place = np.linspace(0, 1, len(given))
-    return np.stack([np.interp(at, place, channel) for channel in given.T], axis=-1)
+    positions = np.linspace(0, 1, len(rgb))
+    return np.stack([np.interp(at, positions, channel) for channel in rgb.T], axis=-1)
 
 
 def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:
@@ -213,10 +213,10 @@ def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:
         if opacity not in ramps:
             raise ValueError(f'opacity must be "linear", "sigmoid" or an array; got {opacity!r}.')
         return jnp.asarray(ramps[opacity], dtype=float)
-    given = unit_interval("opacity", opacity, (None,))
-    if given.shape[0] < 2:
-        raise ValueError(f"opacity must hold at least 2 values; got {given.shape[0]}.")
-    return jnp.interp(jnp.linspace(0, 1, n), jnp.linspace(0, 1, given.shape[0]), given)
+    opacities = unit_interval("opacity", opacity, (None,))
+    if opacities.shape[0] < 2:
+        raise ValueError(f"opacity must hold at least 2 values; got {opacities.shape[0]}.")
+    return jnp.interp(jnp.linspace(0, 1, n), jnp.linspace(0, 1, opacities.shape[0]), opacities)
 
 
 def _range(clim: Any) -> tuple[float, float]:

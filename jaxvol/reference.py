@@ -1,7 +1,7 @@
-"""What does one ray see? The definition: one ray, one cell after the other.
+"""What does one ray see? The definition: one ray, cell by cell.
 
-Every combination of transforms means what this file says. There is no acceleration here. A cell of extinction
-σ and width w has the opacity α = 1 - exp(-σ w); how cells become a pixel is `compositing`'s.
+This file defines what every combination of transforms means. There is no acceleration here. A cell of
+extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` says how cells become a pixel.
 """
 
 import math
@@ -17,12 +17,11 @@ from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, along, apart
 from .compositing import Over
-from .lighting.deferred import Deferred, Line, lit_once
 from .lighting.shading import Lighting, Sample, classification
 from .march import Cell, March
-from .rendering import AbstractPicture, DepthPicture, Found, Picture, Rendering
+from .rendering import Details, Outputs, Rendering
 from .scene import check_scene
-from .space import Ray, enter, invalid
+from .space import Line, Ray, enter, invalid
 from .transfer import Classification, Measured, Transfer
 from .volume import Volume, without_voxels
 
@@ -30,10 +29,10 @@ from .volume import Volume, without_voxels
 class Progress(eqx.Module):
     """How far a ray has come.
 
-    The front of the next cell lies at `(offset + index) d`. Counting steps, rather than adding them up,
-    keeps the ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps.
-    `seen` is what the cells so far have come to. `shift`, in steps, is added to `offset` behind the first
-    transparent cell, and is 0 from then on. What is not asked for is None.
+    The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
+    ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `seen` is the
+    composite of all cells so far. `shift`, in steps, is added to `offset` behind the first transparent cell,
+    and is 0 from then on. What is not asked for is None.
     """
 
     index: Int[Array, ""]
@@ -45,21 +44,21 @@ class Progress(eqx.Module):
 
 
 class Met(eqx.Module):
-    """What a ray has met."""
+    """What `Rendering.samples` and `Rendering.aligned` report."""
 
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
 
 
 def has_fault(volume: Volume, transfer: Transfer, march: March, lighting: Lighting | None) -> Bool[Array, ""]:
-    """Whether a number on which all pixels depend is NaN or infinite, or the step leads nowhere. A comparison
-    with NaN is false, and turns it into nothing seen: a fit that has diverged would look like one that has
-    converged. Of rays and voxels it is found out ray by ray."""
+    """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
+    Comparisons with NaN are false and would make it invisible, so that a fit that diverged would look
+    converged. Rays and voxels are checked ray by ray."""
     return ~(all_finite((without_voxels(volume), transfer, march, lighting)) & (march.step > 0))
 
 
-def begin(march: March, ray: Ray, outputs: Found | None = "all") -> Progress:
-    """A ray at its entry, which will find out so much, or nothing but its opacity."""
+def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+    """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
@@ -78,12 +77,12 @@ def pieces(march: March, ray: Ray, volume: Volume, front: Scalar) -> tuple[Cell,
 
 
 def measure(march: March, ray: Ray, seen: Classification, piece: Cell) -> Measured:
-    """What is read from the volume at the piece's sample, and what the transfer function finds of it."""
+    """The measured values at a piece's sample, and what the transfer function's search finds for them."""
     return seen.searched(seen.measure(ray.path(march.sample(piece))))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
-    """Whether the volume is at this depth: neither past the exit nor in a gap."""
+    """Whether this depth is inside the volume: neither past the exit nor in a gap."""
     inside = depth < ray.length
     return inside & ray.path.contains(ray.path(depth)) if ray.path.gaps else inside
 
@@ -92,7 +91,7 @@ def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured:
     """Opacity of a piece; 0 past the exit, and in gaps."""
     _, extinction = seen.classify(measured)
     optical_depth = jnp.where(contained(ray, march.sample(piece)), extinction, 0) * piece.width
-    # 1 - exp(-τ), and thin cells keep their digits, as under expm1, which takes half as much time again
+    # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
     t = jnp.tanh(optical_depth / 2)
     return 2 * t / (1 + t)
 
@@ -100,7 +99,7 @@ def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured:
 def color(
     march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured, transmittance: Scalar
 ) -> Vec3:
-    """Colour of a piece, of which so much reaches the camera; as lit, where there is a light."""
+    """Colour of a piece behind this transmittance, shaded where there is a lighting."""
     color, extinction = seen.classify(measured)
     if seen.light is None:
         return color
@@ -109,7 +108,7 @@ def color(
 
 
 def counts(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
-    """Whether a piece is one of a ray's samples. Of a whole cell some pieces have width 0."""
+    """Whether a piece counts as a sample. Where a cell is not divided, some of its pieces have width 0."""
     return (march.sample(piece) < ray.length) & (piece.width > 0)
 
 
@@ -119,7 +118,7 @@ def blend(
     at: Progress,
     cell: tuple[tuple[Cell, Vec3, Scalar], ...],
 ) -> Progress:
-    """What has been accumulated behind a cell. Of its pieces are known colour and opacity."""
+    """Composites a cell, given its pieces with their colours and opacities."""
     seen, met = at.seen, at.met
     for piece, own, alpha in cell:
         weight = jnp.where(at.finished, 0, seen.weight(alpha))
@@ -136,8 +135,8 @@ def blend(
 def move(
     march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, cells: Any = 1
 ) -> Progress:
-    """On over this many cells, of which the last one, or all, may have been transparent; None for a ray
-    without a shift ahead. The ray is finished where the next one begins past the exit."""
+    """Moves on by this many cells. `transparent`: whether the last one, or all of them, are, so that the ray
+    shifts; None where no shift is ahead. The ray is finished if the next cell begins past the exit."""
     at = replace(at, index=at.index + cells)
     if at.shift is not None and transparent is not None:
         shift = jnp.where(transparent, at.shift, 0)
@@ -146,12 +145,12 @@ def move(
 
 
 def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
-    """Depth at which the next cell begins, or one so many cells ahead."""
+    """Depth at which the next cell begins, or the one so many cells ahead of it."""
     return (at.offset + (at.index + ahead).astype(at.offset.dtype)) * march.step
 
 
 def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progress) -> Progress:
-    """Sample one cell, blend it, and move on. Changes nothing once the ray is finished."""
+    """Samples one cell, composites it, and moves on. Changes nothing once the ray is finished."""
     cut = pieces(march, ray, volume, front(march, at))
     measured = [measure(march, ray, seen, piece) for piece in cut]
     alphas = [opacity(march, ray, seen, piece, read) for piece, read in zip(cut, measured, strict=True)]
@@ -164,19 +163,17 @@ def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progr
     return move(march, ray, after, transparent)
 
 
-def end(ray: Ray, at: Progress) -> AbstractPicture:
-    """What the ray has seen: with its depth, and with what it met, if it was to find that out."""
-    valid = ~jnp.isnan(ray.t_in)
-    # by a product, since the derivative of a choice would be 0
+def end(ray: Ray, at: Progress) -> Rendering:
+    """The rendering of a ray, with the outputs that it was begun with."""
+    valid, details = ~jnp.isnan(ray.t_in), Details()
+    # a product, since the derivative of a `where` would be 0
     rgba = at.seen.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
-    exhausted = ~at.finished
-    if at.seen.moment is None:
-        return Picture(rgba, exhausted)
-    mean = at.seen.mean_depth()
-    depth = jnp.where(valid & jnp.isinf(mean), jnp.inf, ray.t_in + mean)
-    if at.met is None:
-        return DepthPicture(rgba, exhausted, depth)
-    return Rendering(rgba, exhausted, depth, at.met.samples, at.met.aligned)
+    if at.seen.moment is not None:
+        mean = at.seen.mean_depth()
+        details = Details(jnp.where(valid & jnp.isinf(mean), jnp.inf, ray.t_in + mean))
+    if at.met is not None:
+        details = details._replace(samples=at.met.samples, aligned=at.met.aligned)
+    return Rendering(rgba, ~at.finished, details)
 
 
 def render_ray_reference(
@@ -191,14 +188,14 @@ def render_ray_reference(
 ) -> Rendering:
     """What one ray sees, by a plain scan over its cells.
 
-    It runs in the float type of `origin` and `direction`, and is differentiable forwards and
-    backwards, any number of times. Memory for a backward pass grows with the number of samples.
+    Computes in the float type of `origin` and `direction`. Differentiable in forward and reverse mode, any
+    number of times; the memory of reverse mode grows with the number of samples.
 
     **Arguments:**
 
     - `origin`, `direction`: world point and unit direction of the ray.
-    - `pixel`: (column, row), on which everything random depends.
-    - `lighting`: how samples are lit.
+    - `pixel`: (column, row), which keys random numbers.
+    - `lighting`: how samples are shaded.
 
     **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
@@ -214,22 +211,22 @@ def render_ray_reference(
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, transfer, march, lighting))
     lit = classification(volume, transfer, space, lighting)
-    seen = transfer.over(volume) if isinstance(lighting, Deferred) else lit
+    of_pixels = lighting is not None and lighting.shades_pixels
+    seen = lit._replace(light=None) if of_pixels else lit
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(march, ray, volume, seen, at), None
 
     at, _ = jax.lax.scan(one, varying(begin(march, ray), ray), None, length=steps_across(volume, march))
     rendering = end(ray, at)
-    assert isinstance(rendering, Rendering)
-    if isinstance(lighting, Deferred):
-        rgba = lit_once(lit, space, line, rendering.rgba, rendering.depth)
-        rendering = replace(rendering, rgba=rgba)
-    return rendering
+    if lighting is None or not of_pixels:
+        return rendering
+    rgba = lighting.shade_pixel(lit, space, line, rendering.rgba, rendering.depth)
+    return replace(rendering, rgba=rgba)
 
 
 def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
-    """An array of floats keeps its type; all else is made JAX's default one."""
+    """A vector. Floats keep their type, all else becomes JAX's default float type."""
     floats = hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
     if floats and value.shape == (3,):
         return jnp.asarray(value)
@@ -237,7 +234,8 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 
 
 def steps_across(volume: Volume, march: March) -> int:
-    """Steps that suffice for any ray through the volume: its diagonal, and a few that transforms may add."""
+    """Number of steps that suffices for any ray: across the volume's diagonal, and a few more for
+    transforms."""
     if is_traced(volume.spacing, march):
         if march.max_samples is not None:
             return march.max_samples
@@ -248,7 +246,7 @@ def steps_across(volume: Volume, march: March) -> int:
     with jax.ensure_compile_time_eval():
         diagonal = float(march.locate(volume).diagonal)
         steps = diagonal / float(march.step) if march.step > 0 else math.nan
-    if not math.isfinite(steps):  # then nothing is marched, and NaN is seen
+    if not math.isfinite(steps):  # then nothing is marched, and the image is NaN
         return 1
-    # the first cell may begin a step early, one step finds the exit, one more is shortened by a jitter
+    # the first cell may begin a step early, one step finds the exit, and a jitter may shorten one more
     return min(math.ceil(steps) + 4, march.most_samples)

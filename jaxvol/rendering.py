@@ -1,6 +1,6 @@
-"""What does a render give back?"""
+"""What does a render return?"""
 
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,18 +10,54 @@ from jaxtyping import Array, Bool, Float, Int
 from ._util.checks import finite, is_traced
 
 
-Outputs: TypeAlias = Literal["all", "rgba"]
-"""What is asked for of rays: a `Rendering`, or just a `Picture`."""
-
-Found: TypeAlias = Literal["all", "depth", "rgba"]
-"""What is found out about rays: what is asked for, or a `DepthPicture`."""
+Outputs: TypeAlias = Literal["all", "depth", "rgba"]
+"""What is computed beside the image and `exhausted`: everything, the depth, or nothing."""
 
 
-class AbstractPicture(eqx.Module):
-    """What rays look like, at least."""
+class Details(NamedTuple):
+    """Outputs that cost time, each None where it was not asked for. See `Rendering`."""
 
-    rgba: eqx.AbstractVar[Float[Array, "*rays 4"]]
-    exhausted: eqx.AbstractVar[Bool[Array, "*rays"]]
+    depth: Float[Array, "*rays"] | None = None
+    samples: Int[Array, "*rays"] | None = None
+    aligned: Bool[Array, "*rays"] | None = None
+
+
+class Rendering(eqx.Module):
+    """The image of rays, and what they met. The leading shape is that of the rays: (height, width) from a
+    camera.
+
+    - `rgba`: linear colour, premultiplied by opacity, and opacity; not composited over a background.
+    - `exhausted`: whether the ray took `March.max_samples` before it was finished: what lies behind is
+      missing.
+    - `depth`: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
+      opacity, world length; infinite where nothing is visible.
+    - `samples`: number of samples evaluated, one for each piece of a cell.
+    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
+      (Kye 2013, Fig. 13).
+
+    The last three raise `ValueError` where they were not asked for (`outputs="rgba"`).
+    """
+
+    rgba: Float[Array, "*rays 4"]
+    exhausted: Bool[Array, "*rays"]
+    details: Details = Details()
+
+    @property
+    def depth(self) -> Float[Array, "*rays"]:
+        return self._detail("depth", self.details.depth)
+
+    @property
+    def samples(self) -> Int[Array, "*rays"]:
+        return self._detail("samples", self.details.samples)
+
+    @property
+    def aligned(self) -> Bool[Array, "*rays"]:
+        return self._detail("aligned", self.details.aligned)
+
+    def _detail(self, name: str, value: Array | None) -> Array:
+        if value is None:
+            raise ValueError(f'{name} is not part of this rendering: pass outputs="all" to compute it.')
+        return value
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
         """Linear RGB over a background: one colour (3,), or an image of the same shape."""
@@ -35,7 +71,7 @@ class AbstractPicture(eqx.Module):
         return self.rgba[..., :3] + (1 - self.rgba[..., 3:]) * background
 
     def _background(self, background: Any) -> Float[Array, "..."]:
-        """As numbers. A traced one may be NaN, and shows as it."""
+        """The background as an array. A traced one may be NaN, which then shows in the image."""
         if not is_traced(background):
             given = background
             try:
@@ -45,46 +81,3 @@ class AbstractPicture(eqx.Module):
             if not np.all(finite(background)):
                 raise ValueError("background must be finite; got NaN or infinity.")
         return jnp.asarray(background, self.rgba.dtype)
-
-
-class AbstractDepthPicture(AbstractPicture):
-    """What rays look like and how far away that is, at least."""
-
-    depth: eqx.AbstractVar[Float[Array, "*rays"]]
-
-
-class Picture(AbstractPicture):
-    """What rays look like. The leading shape is that of the rays: (height, width) from a camera.
-
-    - `rgba`: linear colour, premultiplied by opacity, and opacity; not yet over any background.
-    - `exhausted`: whether the ray spent `March.max_samples` before it was finished: it lacks what
-      lies behind.
-    """
-
-    rgba: Float[Array, "*rays 4"]
-    exhausted: Bool[Array, "*rays"]
-
-
-class DepthPicture(AbstractDepthPicture):
-    """What deferred light needs: a `Picture`, and its `depth`, as in `Rendering`."""
-
-    rgba: Float[Array, "*rays 4"]
-    exhausted: Bool[Array, "*rays"]
-    depth: Float[Array, "*rays"]
-
-
-class Rendering(AbstractDepthPicture):
-    """What rays look like, and what they met. `rgba` and `exhausted` as in `Picture`.
-
-    - `depth`: mean distance from the ray's origin to what is seen, weighted by how much each cell
-      adds to the opacity, world length; infinite where nothing is seen.
-    - `samples`: samples evaluated, one for each piece into which a cell falls.
-    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
-      (Kye 2013, Fig. 13).
-    """
-
-    rgba: Float[Array, "*rays 4"]
-    exhausted: Bool[Array, "*rays"]
-    depth: Float[Array, "*rays"]
-    samples: Int[Array, "*rays"]
-    aligned: Bool[Array, "*rays"]

@@ -1,4 +1,4 @@
-"""Are these a volume, a transfer function, a camera and a march? What renders asks before all else."""
+"""Are the arguments a volume, a transfer function, a camera and a march? Every renderer checks this first."""
 
 from types import NoneType
 from typing import Any
@@ -11,7 +11,7 @@ from .transfer import Transfer
 from .volume import Volume
 
 
-WANTED: dict[str, tuple[tuple[type, ...], str, str]] = {
+EXPECTED: dict[str, tuple[tuple[type, ...], str, str]] = {
     "volume": (
         (Volume,),
         "a jaxvol Volume",
@@ -34,22 +34,24 @@ WANTED: dict[str, tuple[tuple[type, ...], str, str]] = {
         "Pass lights as jv.lighting.ScattererTemplates(materials, lights).",
     ),
 }
-"""By the argument's name: what it may be, that in words, and how one is made."""
+"""For each argument name: its allowed types, their description, and how to make one."""
 
 
 def check_scene(call: str, **arguments: Any) -> None:
-    """Refuse arguments that are something else than their names say.
+    """Check that arguments are of the types that their names say.
 
-    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`: told
-    where arguments have changed places.
+    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`,
+    quoted when arguments are swapped.
 
     **Raises:** `ValueError` naming the first such argument, what came, and what to pass.
     """
     for name, value in arguments.items():
-        kinds, wanted, remedy = WANTED[name]
+        kinds, expected, remedy = EXPECTED[name]
         if isinstance(value, kinds):
             continue
-        elsewhere = [n for n, (other, *_) in WANTED.items() if value is not None and isinstance(value, other)]
+        elsewhere = [
+            n for n, (other, *_) in EXPECTED.items() if value is not None and isinstance(value, other)
+        ]
         if elsewhere:
             remedy = f"That is the {elsewhere[0]}: the order is {call}."
-        raise ValueError(f"{name} must be {wanted}; got {described(value)}. {remedy}")
+        raise ValueError(f"{name} must be {expected}; got {described(value)}. {remedy}")

@@ -1,12 +1,12 @@
-"""Which grid coordinate is this world point, and where does a ray meet the grid?
+"""Where does a world point lie in the grid, and where does a ray enter and leave the grid?
 
-This is the seam `locate`. A `Space` answers both questions for one volume; the default is `Affine`
-(spacing and origin), under which a ray stays straight in the grid. A space whose rays are curved
-in the grid gives another `Path`, and the rest of the march does not notice.
+A `Space` answers both for one volume; this is the seam `locate`. The default, `Affine`, applies
+spacing and origin, so rays stay straight in the grid. A space with curved rays returns a
+different `Path`; the rest of the march is unaffected.
 """
 
 from abc import abstractmethod
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,63 +19,71 @@ from .volume import Volume
 
 
 class Path(eqx.Module):
-    """A ray as seen in the grid."""
+    """A ray in grid coordinates."""
 
     gaps: ClassVar[bool] = False
     """Whether a ray may leave the grid between its entry and its exit."""
 
     @abstractmethod
     def __call__(self, s: Scalar) -> Vec3:
-        """The grid coordinate at depth `s`, the world length past the entry."""
+        """Grid coordinate at depth `s`, in world length past the entry."""
 
     def contains(self, coordinate: Vec3) -> Bool[Array, ""]:
-        """Whether there is anything at a coordinate of this path. False in gaps alone."""
+        """Whether a coordinate of this path is inside the volume. False only in gaps."""
         return jnp.ones((), bool)
 
 
 class Space(eqx.Module):
-    """Where a volume's grid lies in the world."""
+    """The mapping between the world and a volume's grid."""
 
     @property
     @abstractmethod
     def diagonal(self) -> Scalar:
-        """Length that no ray through the grid exceeds."""
+        """Upper bound on the length of a ray through the grid."""
 
     @property
     @abstractmethod
     def middle(self) -> Vec3:
-        """The world point from which no point of the grid is farther than half of `diagonal`."""
+        """World point within half of `diagonal` of every point of the grid."""
 
     @abstractmethod
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which the line enters and leaves the grid; the first exceeds the second on a miss."""
+        """Distances at which a line enters and leaves the grid; on a miss, the first exceeds the second."""
 
     @abstractmethod
     def coordinate(self, point: Vec3) -> Vec3:
-        """The grid coordinate of a world point."""
+        """Grid coordinate of a world point."""
 
     @abstractmethod
     def point(self, coordinate: Vec3) -> Vec3:
-        """The world point of a grid coordinate."""
+        """World point of a grid coordinate."""
 
     @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
-        """The blocks of the grid in which anything may be seen, as cells of the world."""
+        """World-space cells that may hold anything visible, from the visible blocks of the grid."""
 
     @abstractmethod
     def path(self, entry: Vec3, direction: Vec3) -> Path:
-        """The straight world ray from `entry`, as seen in the grid."""
+        """The straight world ray from `entry`, in grid coordinates."""
+
+
+class Line(NamedTuple):
+    """A ray before it is cut to the volume: world origin, unit direction, and (column, row) of its pixel."""
+
+    origin: Vec3
+    direction: Vec3
+    pixel: tuple[Int[Array, ""], Int[Array, ""]]
 
 
 class Ray(eqx.Module):
-    """One ray, cut to the part inside the volume.
+    """One ray, clipped to the volume.
 
-    - `entry`, `direction`: world point where the part begins, and the unit direction.
+    - `entry`, `direction`: world point where the ray enters the volume, and its unit direction.
     - `t_in`: distance from the ray's origin to the entry. `length`: from entry to exit; 0 on a miss.
-      Both carry gradients. All depths `s` along a march count from the entry: near 0 float32 resolves
-      them as finely as the volume needs, however far away the camera stands.
-    - `path`: the ray as seen in the grid.
-    - `pixel`: (column, row), the key of everything random along this ray.
+      Both carry gradients. Depths `s` along a march are measured from the entry, where float32 resolves
+      them as finely as the volume needs, however far away the camera is.
+    - `path`: the ray in grid coordinates.
+    - `pixel`: (column, row); keys everything random along the ray.
     """
 
     entry: Vec3
@@ -87,10 +95,12 @@ class Ray(eqx.Module):
 
 
 def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
-    """The part of a ray inside the volume and not behind its origin, which may lie inside. Where NaN or
-    infinity are among the numbers of ray or space, the ray is `invalid`."""
-    # Float32 rounds the distance of a far camera by more than the volume can stand. So the ray begins
-    # anew near the volume, from where distances are short.
+    """Clip a ray to the volume and to what lies ahead of its origin, which may be inside.
+
+    If a number of the ray or the space is NaN or infinite, the ray is `invalid`.
+    """
+    # Rounding the distance of a far camera to float32 errs by too much. So move the origin close to the
+    # volume, where distances are short.
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
     close = along(origin, direction, base)
@@ -105,15 +115,16 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
-    """The ray; where there is a fault, one that is never marched, and of which nothing but NaN is seen.
+    """Where `fault` is true, replace the ray by one that is never marched and renders as NaN.
 
-    Comparisons with NaN are false, so that a march would take it for a miss, or never end."""
+    Comparisons with NaN are false, so a march would treat such a ray as a miss or never end.
+    """
     t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
     return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
 
 
 class Straight(Path):
-    """A path straight in the grid: `start + s rate`."""
+    """A path that is straight in the grid: `start + s rate`."""
 
     start: Vec3
     rate: Vec3
@@ -123,7 +134,7 @@ class Straight(Path):
 
 
 class Affine(Space):
-    """A grid whose axes are those of the world: spacing and origin."""
+    """A grid along the world axes, given by spacing and origin."""
 
     low: Vec3
     high: Vec3
@@ -164,7 +175,7 @@ class Affine(Space):
 
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:
-    """Distances at which a line enters and leaves a box; the first exceeds the second on a miss."""
+    """Distances at which a line enters and leaves a box; on a miss, the first exceeds the second."""
     (near_x, far_x), (near_y, far_y), (near_z, far_z) = (
         _slab(*ends) for ends in zip(origin, direction, low, high, strict=True)
     )
@@ -176,9 +187,9 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
 def world_gradient(
     volume: Volume, space: Space, point: Vec3, method: Literal["trilinear", "central"] = "central"
 ) -> Vec3:
-    """Gradient of the value at a world point, value units per world length, wherever the grid lies.
+    """Gradient of the value with respect to a world point, in value units per world length.
 
-    As `Volume.gradient`, turned and scaled by the transposed derivative of `space.coordinate`.
+    `Volume.gradient`, transformed by the transposed Jacobian of `space.coordinate`.
     """
     coordinate, transpose = jax.vjp(space.coordinate, point)
     slopes = volume.gradient(coordinate, method)
@@ -188,7 +199,7 @@ def world_gradient(
 
 def _slab(origin: Scalar, direction: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
     """Distances to the nearer and the farther of two parallel planes."""
-    # Below this a direction runs along the planes. Not 0: the derivative of 1/d is 1/d², and must be finite.
+    # Smaller components count as parallel to the planes. Not 0: the derivative of 1/d, 1/d², must be finite.
     parallel = jnp.abs(direction) < float(jnp.finfo(direction.dtype).tiny) ** 0.25
     slope = jnp.where(parallel, 1, direction)
     a, b = (low - origin) / slope, (high - origin) / slope

@@ -1,4 +1,8 @@
-"""Which colour and extinction has this value?"""
+"""Which colour and extinction has this value?
+
+A transfer function is asked three things: `measured`, what it reads from the volume at a place; `classifier`,
+how that becomes colour and extinction; and `majorant`, a bound of its extinction over a block of the volume.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -7,74 +11,77 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ._util.checks import Arrayable, finite_array, number, require, unit_interval
+from ._util.piecewise_linear import (
+    FEW,
+    clip_below,
+    interpolate_row,
+    points_below,
+    positive_between,
+    table_entry,
+    table_row,
+    upper_bound_between,
+)
 from ._util.vec3 import Scalar, Vec3
 from .occupancy import Blocks
 from .volume import Volume
 
 
-FEW = 16
-"""Up to so many control points, a sample's interval is chosen by comparing with each of them, which costs
-less than looking its entries up."""
-
-Row: TypeAlias = tuple[Scalar, ...]
-"""What a sample between two control points needs: see `TransferFunction.rows`."""
-
 Measured: TypeAlias = tuple[Array, ...]
-"""What a transfer function wants to know of a place: the value, and whatever else it goes by."""
+"""What a transfer function reads at a place: the value first, then whatever else it depends on."""
 
 Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
-"""From what was measured to colour (r, g, b) and extinction (1/length)."""
+"""From `Measured` to colour (r, g, b) and extinction (1/length)."""
 
 
 class Classification(NamedTuple):
-    """What a transfer function makes of the places of one volume: measured first, then classified.
+    """A transfer function applied to one volume, in two stages: `measure` at a grid coordinate, then
+    `classify`.
 
-    The two are apart for engines to stand between them: what is measured is fetched from memory, and used
-    many times over.
+    The stages are separate because measuring fetches from memory, and an engine keeps what was fetched.
     """
 
     measure: Callable[[Vec3], Measured]
     classify: Classify
     search: Callable[[Measured], Measured] | None = None
-    """What is worth finding once, for all that `classify` makes of it. It comes after what was measured."""
+    """Looks up what `classify` needs beside the measured values, once; it is appended to them."""
     light: Callable[[Any], Vec3] | None = None
-    """From a sample (`lighting.seam.Sample`) to its colour as lit. None where colours are as classified."""
+    """From a `lighting.shading.Sample` to its shaded colour. None: colours are as classified."""
 
     def searched(self, measured: Measured) -> Measured:
-        """What was measured, and after it what is found of that."""
+        """The measured values, followed by what `search` finds for them."""
         return measured if self.search is None else (*measured, *self.search(measured))
 
 
 class Transfer(eqx.Module):
-    """What a renderer asks of a transfer function, of whatever kind."""
+    """The interface of all transfer functions."""
 
     def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """What is read from the volume at a grid coordinate, of which the value comes first: by default, it
-        alone."""
+        """What is read from the volume at a grid coordinate, the value first. By default the value alone."""
         return (volume.value(coordinate),)
 
     @abstractmethod
     def classifier(self) -> Classify:
-        """From what was measured to colour and extinction. What does not depend on it is computed here, once,
-        outside the march's loop."""
+        """The function from `Measured` to colour and extinction. Tables that it needs are computed here,
+        once, outside the march's loop."""
 
     def search(self) -> Callable[[Measured], Measured] | None:
-        """What the classifier wants to be found of what was measured, and given after it: nothing."""
+        """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
+        classifier gets after it. By default there is none."""
         return None
 
     def over(self, volume: Volume) -> Classification:
-        """Measuring and classifying the grid coordinates of this volume."""
+        """The two stages for this volume."""
         return Classification(
             lambda coordinate: self.measured(volume, coordinate), self.classifier(), self.search()
         )
 
     def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
-        """The transposed derivative of classifying many samples, arrays of any one shape: what the transfer
-        function, and what was measured, get of these cotangents of colour and extinction. None where there
-        is no derivative. `measured` ends in what `search` has found."""
+        """Vector–Jacobian product of classifying many samples, in arrays of one shape: the cotangents of the
+        transfer function and of the measured values, from those of colour and extinction. None where there
+        is no derivative. `measured` includes what `search` found."""
 
         def classified(given: tuple[Transfer, Measured]) -> tuple[Vec3, Scalar]:
             transfer, measured = given
@@ -86,10 +93,15 @@ class Transfer(eqx.Module):
         _, pull = eqx.filter_vjp(classified, (self, measured))
         return pull((color, extinction))[0]
 
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
+        block's range. 0 only where the extinction is proven to be 0. It carries no gradient. By default
+        infinite: nothing is proven."""
+        return jnp.full(blocks.low.shape, jnp.inf)
+
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """In which blocks of a volume anything may be seen: False is a proof that the extinction is 0
-        wherever the value lies in the block's range. It carries no gradient. By default nothing is proven."""
-        return jnp.ones(blocks.low.shape, bool)
+        """Where `majorant` is positive; to be overridden where that takes less time to find out."""
+        return self.majorant(blocks) > 0
 
 
 class TransferFunction(Transfer):
@@ -104,7 +116,7 @@ class TransferFunction(Transfer):
     - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
       `1 - exp(-extinction w)`.
 
-    Extinction is what is interpolated. VTK interpolates opacity; the two agree at the points, and
+    Extinction is what is interpolate_row. VTK interpolates opacity; the two agree at the points, and
     differ between points where the opacity of a unit distance is high.
 
     Put a step between values of the data rather than at one: interpolation may round a value to either side.
@@ -167,10 +179,14 @@ class TransferFunction(Transfer):
         """Opacity at the control points of a layer of thickness `unit_distance`."""
         return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
 
-    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume hold a value of which something is seen."""
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
-        return seen_between(values, extinction, blocks.low, blocks.high)
+        bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
+        return jnp.where(self.visible(blocks), bound, 0)
+
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
+        return positive_between(values, extinction, blocks.low, blocks.high)
 
     def search(self) -> Callable[[Measured], Measured] | None:
         values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
@@ -179,7 +195,9 @@ class TransferFunction(Transfer):
 
         def search(measured: Measured) -> Measured:
             interval = jnp.clip(points_below(values, measured[0]) - 1, 0, last)
-            return interval, at_least(measured[0] - _at(values, interval), jnp.zeros_like(values[0]))
+            return interval, clip_below(
+                measured[0] - table_entry(values, interval), jnp.zeros_like(values[0])
+            )
 
         return search
 
@@ -189,14 +207,14 @@ class TransferFunction(Transfer):
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
-            return interpolated(row_of(rows, interval), past)
+            return interpolate_row(table_row(rows, interval), past)
 
         def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
             row = tuple(rows[0])
             for start, following in zip(values[1:], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
-            return interpolated(row, at_least(value - row[0], jnp.zeros_like(row[0])))
+            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return chosen if values.shape[0] <= FEW else looked_up
 
@@ -204,17 +222,17 @@ class TransferFunction(Transfer):
         own = (TransferFunction.classifier, TransferFunction.rows)
         if any(getattr(type(self), method.__name__) is not method for method in own):
             transfer, (of_value, *found) = super().pull(measured, color, extinction)
-            if found:  # how far past its point a value lies changes with the value
+            if found:  # the distance past the point depends on the value
                 of_value = of_value + jnp.where(measured[0] < self.values[0], 0, found[1])
             return transfer, (of_value,)
-        # By one scatter of whole rows, where JAX would sum up for every entry of a row apart.
+        # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
         if self.values.shape[0] <= FEW:
             interval = jnp.maximum(points_below(self.values, value) - 1, 0)
-            past = at_least(value - row_of(rows, interval)[0], jnp.zeros_like(value))
+            past = clip_below(value - table_row(rows, interval)[0], jnp.zeros_like(value))
         else:
             _, interval, past = measured
-        *_, r, g, b, slope, inverse = row_of(rows, interval)
+        *_, r, g, b, slope, inverse = table_row(rows, interval)
         part = past * inverse
         parts = jnp.stack([*color, extinction], axis=-1)
         shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
@@ -227,100 +245,16 @@ class TransferFunction(Transfer):
         return transfer, (jnp.where(value < self.values[0], 0, of_value),)
 
     def rows(self) -> Float[Array, "points 10"]:
-        """A table with one row for each point: all that a sample needs which lies past it, but not past the
-        next one, so that it finds them side by side. Value, colour, extinction; the slopes of colour and
-        extinction; and 1 over the way to the next point. Past the last one all slopes are 0, and past the
-        first of two equal ones, where no value lies."""
+        """A table with one row for each point, so that a value between this point and the next finds all it
+        needs side by side: value, colour and extinction of the point, the slopes of colour and extinction,
+        and 1 over the gap to the next point. Slopes are 0 beyond the last point, and between two equal
+        ones."""
         values = jax.lax.stop_gradient(self.values)
         gap = (values[1:] - values[:-1])[:, None]
         inverse = jnp.where(gap > 0, 1 / jnp.where(gap > 0, gap, 1), 0)
         at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         slopes = jnp.concatenate([(at_points[1:] - at_points[:-1]) * inverse, inverse], axis=1)
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
-
-
-def at_least(value: Scalar, least: Scalar) -> Scalar:
-    """The larger of the two; NaN stays NaN."""
-    # by comparing, which takes less time than a maximum
-    return jnp.where(value < least, least, value)
-
-
-def points_below(
-    values: Float[Array, " n"], value: Float[Array, "*batch"], *, strictly: bool = False
-) -> Int[Array, "*batch"]:
-    """How many control points lie at or below a value, or strictly below it."""
-    values, last = jax.lax.stop_gradient(values), values.shape[0] - 1
-
-    def searched(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
-        # Comparing with every point is one fused kernel, the faster one while there are few points.
-        how, side = "compare_all" if last < 2 * FEW else "scan_unrolled", "left" if strictly else "right"
-        return jnp.searchsorted(values, value, side=side, method=how).astype(jnp.int32)
-
-    if last < FEW:
-        return searched(value)
-    first, step = values[0], (values[-1] - values[0]) / last
-
-    def counted(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
-        """For points that lie evenly: by a division, which may be off by one."""
-        guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
-        reached = [
-            value > at if strictly else value >= at for at in (_at(values, guess), _at(values, guess + 1))
-        ]
-        return guess + sum(each.astype(jnp.int32) for each in reached)
-
-    # by their places: small deviations of each from the one before would add up
-    places = first + step * jnp.arange(last + 1, dtype=values.dtype)
-    even = jnp.all(jnp.abs(values - places) < 0.4 * step)
-    return jax.lax.cond(even, counted, searched, value)
-
-
-def _at(values: Float[Array, " n"], point: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
-    return values.at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def row_of(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
-    """One row, by a look-up for each of its entries: batched, they are whole arrays from the start."""
-    point = jnp.clip(point, 0, rows.shape[0] - 1)
-    return tuple(
-        rows[:, i].at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
-        for i in range(rows.shape[1])
-    )
-
-
-def interpolated(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:
-    """Colour and extinction of a value so far past a point, from its row."""
-    r, g, b, extinction = (at + past * slope for at, slope in zip(row[1:5], row[5:9], strict=True))
-    # where it falls to 0 it may be rounded to less; NaN stays NaN
-    return (r, g, b), jnp.where(extinction < 0, 0, extinction)
-
-
-def seen_between(
-    values: Float[Array, " n"],
-    extinction: Float[Array, " n"],
-    low: Float[Array, "*blocks"],
-    high: Float[Array, "*blocks"],
-) -> Bool[Array, "*blocks"]:
-    """Whether the extinction is positive anywhere from `low` to `high`."""
-    low, high = low.astype(values.dtype), high.astype(values.dtype)
-    positive, n = extinction > 0, values.shape[0]
-    if n > FEW:  # comparing with each point would cost more than looking up how many lie below
-        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
-        # between two points there is something to see wherever one of the two has extinction
-        from_point = jnp.maximum(points_below(values, low) - 1, 0)
-        # the first point at `high` or above, or the second, where two stand at `high`
-        to_point = jnp.maximum(points_below(values, high, strictly=True), points_below(values, high) - 1)
-        to_point = jnp.minimum(to_point, n - 1)
-        return before[to_point + 1] > before[from_point]
-    seen = jnp.zeros(low.shape, bool)
-    for point in range(n):
-        # a point's extinction is seen from the point before it to the one behind it
-        reached = jnp.full(low.shape, positive[point])
-        if point > 0:
-            reached &= (high > values[point - 1]) | (high >= values[point])
-        if point < n - 1:
-            reached &= low < values[point + 1]
-        seen |= reached
-    return seen
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:

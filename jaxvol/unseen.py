@@ -1,4 +1,4 @@
-"""Why is nothing seen in an image?"""
+"""Why is nothing visible in an image?"""
 
 import jax
 import jax.numpy as jnp
@@ -7,72 +7,72 @@ from jaxtyping import Array, Bool, Float
 
 from ._util.vec3 import apart
 from .camera import Camera
-from .rendering import AbstractPicture
+from .rendering import Rendering
 from .space import Affine, Ray, enter
 from .transfer import Transfer, TransferFunction
 from .volume import Volume
 
 
 LEAST = 0.5 / 255
-"""Opacity below which a picture of 8 bits shows nothing."""
+"""Opacity below which an 8-bit image shows nothing."""
 
 RAYS, POINTS = 4096, 128
-"""At how many rays at most, and at how many points of each, a volume's values are looked up."""
+"""Maximum number of rays, and number of points per ray, at which a volume is sampled."""
 
 
-def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, picture: AbstractPicture) -> str | None:
-    """Why nothing shows in an image of this scene, and what to change; None where something shows.
+def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, rendering: Rendering) -> str | None:
+    """Why an image of this scene shows nothing, and what to change; None if it shows something.
 
-    Nothing shows where no pixel's opacity reaches 1/510, half a level of a picture of 8 bits. Values are
-    looked up at some 4096 rays, 128 points each, on the volume's own grid.
+    An image shows nothing if no pixel's opacity reaches 1/510, half a level of an 8-bit image. Values are
+    sampled along some 4096 rays, at 128 points each, on the volume's own grid.
     """
-    most = float(np.asarray(picture.rgba)[..., 3].max())
-    if most >= LEAST:
+    opacity = float(np.asarray(rendering.rgba)[..., 3].max())
+    if opacity >= LEAST:
         return None
     hit, values = (np.asarray(part) for part in _values_along(volume, camera))
     if not hit.any():
         low, high = (", ".join(f"{c:g}" for c in np.asarray(corner)) for corner in volume.corners)
         return (
-            f"no ray of the camera meets the volume, which lies from ({low}) to ({high}). Turn the camera to "
-            "its middle, as Camera.looking_at does."
+            f"no ray of the camera meets the volume, which extends from ({low}) to ({high}). Point the "
+            "camera at its center, as Camera.looking_at does."
         )
-    if most > 0:
+    if opacity > 0:
         return (
-            f"the opacity is {most:.2g} at most. Give a shorter unit distance, so that more of it counts, or "
-            "higher opacities."
+            f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, which raises the "
+            "extinction, or higher opacities."
         )
     low, high = float(values[hit].min()), float(values[hit].max())
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
     shown = _shown(transfer)
     if shown is None:
-        return f"{where}, and the transfer function shows nothing, or another label's."
+        return f"{where}, and the transfer function shows none of them, or only under another label."
     if not shown:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
-    told = " or ".join(_told(*ends) for ends in shown)
+    ranges = " or ".join(_range_text(*ends) for ends in shown)
     advice = f" A clim from {low:g} to {high:g} would show something." if low < high else ""
-    return f"{where}, and the transfer function shows values {told}.{advice}"
+    return f"{where}, and the transfer function shows values {ranges}.{advice}"
 
 
-def _told(low: float, high: float) -> str:
+def _range_text(low: float, high: float) -> str:
     if high == np.inf:
         return f"from {low:g} on" if low > -np.inf else "of any kind"
     return f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}"
 
 
 def _shown(transfer: Transfer) -> list[tuple[float, float]] | None:
-    """The ranges of values that are not transparent. None where that is not for the value alone to say."""
+    """Ranges of values that are not transparent; None if visibility depends on more than the value."""
     if not isinstance(transfer, TransferFunction):
         return None
     values = np.asarray(transfer.values)
     positive = np.concatenate([[False], np.asarray(transfer.extinction) > 0, [False]])
     ends = np.flatnonzero(positive[1:] != positive[:-1])
-    # a point's opacity reaches to the one before it and the one behind it, the last ones' on for ever
+    # the opacity of a control point extends to its neighbours, that of the first and last to infinity
     reach = np.concatenate([[-np.inf], values, [np.inf]])
     return [(float(reach[a]), float(reach[b + 1])) for a, b in ends.reshape(-1, 2)]
 
 
 def _values_along(volume: Volume, camera: Camera) -> tuple[Bool[Array, " rays"], Float[Array, "rays points"]]:
-    """For some rays, those that meet the volume first: whether they do, and which values they run through."""
+    """For some rays, preferably those that hit the volume: whether they hit, and the values along them."""
     space, zero = Affine(volume), jnp.zeros((), jnp.int32)
 
     @jax.jit

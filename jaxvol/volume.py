@@ -1,8 +1,8 @@
-"""Which value stands at this grid coordinate?
+"""What is a volume's value at a grid coordinate?
 
-Grid coordinates count voxels: the node `data[i, j, k]` stands at coordinate (i, j, k), so a
-grid of n nodes spans n - 1 steps along an axis. Between nodes the value is trilinear; outside
-the grid it is that of the nearest point of the grid.
+Grid coordinates count voxels: node `data[i, j, k]` lies at coordinate (i, j, k), so a grid of
+n nodes spans n - 1 cells along an axis. Values are interpolated trilinearly between nodes;
+a coordinate outside the grid takes the value of the nearest point of the grid.
 """
 
 import itertools
@@ -21,16 +21,16 @@ from ._util.voxels import label_array, voxel_array
 
 
 class Field(eqx.Module):
-    """A scalar field of one's own, in place of what is interpolated between voxels: a formula, say.
+    """A user-defined scalar field that replaces the interpolation of voxels, for example a formula.
 
-    `Volume(data, field=...)` is measured by it in every engine and adjoint. Its arrays are differentiable, as
-    all of a volume. `SpaceLeaping` leaps over nothing of it, since nothing is known of its range. The voxels'
-    gradient under `"replay"` takes those that it asks `volume.interpolated` for.
+    Every engine and adjoint evaluates it for `Volume(data, field=...)`. Its arrays are differentiable, like
+    all arrays of a volume. `SpaceLeaping` leaps over no part of it, since its range is unknown. The voxel
+    gradient of `"replay"` covers the voxels that the field reads through `volume.interpolated`.
     """
 
     @abstractmethod
     def value(self, volume: "Volume", coordinate: Vec3) -> Scalar:
-        """The value at a grid coordinate of the volume, whose place in the world is
+        """Value at a grid coordinate, whose world position is
         `volume.origin + coordinate * volume.spacing`."""
 
 
@@ -40,20 +40,21 @@ class Volume(eqx.Module):
     **Arguments:**
 
     - `data`: (nx, ny, nz) voxels, at least 2 along each axis: an array of any library and memory layout, or
-      nested sequences. uint8, int8, uint16, int16, float16, bfloat16 and float32 are kept as they are on the
-      device, and converted after a voxel is fetched. float64 follows JAX: kept where 64-bit types are
-      enabled, else made float32. Booleans, and integers of 32 and 64 bits, become the first of uint8, int8,
-      uint16, int16 and float32 that holds each of the values exactly.
+      nested sequences. uint8, int8, uint16, int16, float16, bfloat16 and float32 keep their type on the
+      device; a voxel is converted after it is fetched. float64 is kept if JAX's 64-bit types are enabled,
+      and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
+      int8, uint16, int16 and float32 that holds every value exactly.
     - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT).
     - `origin`: world position of node (0, 0, 0).
-    - `labels`: optional integer label of every node (a segmentation), of the same shape. 64 bits become 32.
-    - `field`: optional `Field` that gives the values in place of the voxels, whose grid then just tells how
-      far it reaches.
+    - `labels`: optional integer label of every node (a segmentation), of the same shape. 64-bit labels
+      become 32-bit.
+    - `field`: optional `Field` that supplies the values instead of the voxels; the voxel grid then only sets
+      the volume's extent.
 
-    **Raises:** `ValueError` naming the argument for data that are not 3-D, have an axis of one
-    voxel, another type, or voxels that are NaN or infinite, also in float32 alone; for integers that no type
-    holds exactly; for spacing that is not positive; and for labels of another shape or type, or beyond int32.
-
+    **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
+    unsupported type, or hold NaN or infinity, even if only after conversion to float32; for integers that no
+    type holds exactly; for spacing that is not positive; and for labels of another shape or type, or beyond
+    int32.
     """
 
     data: Shaped[Array, "nx ny nz"]
@@ -103,16 +104,16 @@ class Volume(eqx.Module):
 
     @property
     def center(self) -> Float[Array, "3"]:
-        """World position of the middle of the bounds."""
+        """World position of the center of the bounds."""
         low, high = self.corners
         return (low + high) / 2
 
     def value(self, coordinate: Vec3) -> Scalar:
-        """The value at a grid coordinate, in the coordinate's float type: of its field, if it has one."""
+        """Value at a grid coordinate, in the coordinate's float type; from `field` if there is one."""
         return self.interpolated(coordinate) if self.field is None else self.field.value(self, coordinate)
 
     def interpolated(self, coordinate: Vec3) -> Scalar:
-        """Trilinear value between the voxels around a grid coordinate, in the coordinate's float type."""
+        """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type."""
         cube, (fx, fy, fz) = self.fetch.cube(self.data, coordinate)
         ((c000, c001), (c010, c011)), ((c100, c101), (c110, c111)) = cube
         return _mix(
@@ -122,13 +123,13 @@ class Volume(eqx.Module):
         )
 
     def gradient(self, coordinate: Vec3, method: Literal["trilinear", "central"] = "central") -> Vec3:
-        """Gradient of the value in the grid's own axes, in value units per world length.
+        """Gradient of the value along the grid axes, in value units per world length.
 
-        - `"trilinear"`: derivative of the trilinear value inside the cell; exact for what is
-          rendered, and discontinuous where cells meet.
-        - `"central"`: difference over one node to either side, continuous, with an error of
-          O(spacing²) against the gradient of the field that was sampled; where the grid ends, the
-          difference is taken over the part inside.
+        - `"trilinear"`: derivative of the trilinear interpolant within a cell: exact for the rendered
+          field, discontinuous between cells.
+        - `"central"`: difference between one node to either side: continuous, with an error of
+          O(spacing²) relative to the gradient of the sampled field. At the border of the grid, the
+          difference spans only the part inside.
         """
         if method == "trilinear":
             slopes = self._trilinear_slopes(coordinate)
@@ -140,9 +141,9 @@ class Volume(eqx.Module):
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
-        """Label of the node nearest to a grid coordinate (the upper one half-way between two)."""
+        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one."""
         if self.labels is None:
-            raise ValueError("labels are needed here and this volume has none; give Volume(..., labels=...).")
+            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
         i, j, k = (
             jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)
             for c, n in zip(coordinate, self.shape, strict=True)
@@ -151,9 +152,9 @@ class Volume(eqx.Module):
         return fetched(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
-        """The trilinear share of a label at a grid coordinate: 1 among nodes that have it, 0 among others."""
+        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
         if self.labels is None:
-            raise ValueError("labels are needed here and this volume has none; give Volume(..., labels=...).")
+            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
         (i, j, k), fraction = split(coordinate, self.shape)
         _, ny, nz = self.shape
         share = jnp.zeros_like(fraction[0])
@@ -177,7 +178,7 @@ class Volume(eqx.Module):
             last = self.shape[axis] - 1
             before, after = (jnp.clip(coordinate[axis] + side, 0, last) for side in (-1, 1))
             rise = self.value(_with(coordinate, axis, after)) - self.value(_with(coordinate, axis, before))
-            # at least half a node apart for any coordinate less than half a node outside the grid
+            # at least half a node apart unless the coordinate is more than half a node outside the grid
             return rise / jnp.maximum(after - before, 0.5)
 
         return slope(0), slope(1), slope(2)
@@ -189,20 +190,20 @@ def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
 
 
 def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    # a + f (b - a) would round differently at f = 1; this form gives a and b exactly at the ends
+    # exactly a and b at the ends; a + f (b - a) would round at f = 1
     return a * (1 - fraction) + b * fraction
 
 
 def without_voxels(volume: Volume) -> Volume:
-    """A volume but for its voxels, of which there are too many to be handed around."""
+    """The volume without `data`, which is too large to pass around."""
     return eqx.tree_at(lambda v: v.data, volume, None)
 
 
 def with_voxels(volume: Volume, data: Array) -> Volume:
-    """The volume with these voxels."""
+    """The volume with `data` as its voxels."""
     return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
 
 
 def with_fetch(volume: Volume, fetch: Fetch) -> Volume:
-    """The volume, whose voxels are read in this way."""
+    """The volume with `fetch` as the way to read its voxels."""
     return eqx.tree_at(lambda v: v.fetch, volume, fetch, is_leaf=lambda leaf: isinstance(leaf, Fetch))

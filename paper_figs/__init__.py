@@ -1,1 +1,1 @@
-"""Figures and tables of the source papers, one script each. `python -m paper_figs.NAME`."""
+"""Figures and tables of the source papers, one script each. Run `python -m paper_figs.NAME`."""

@@ -1,5 +1,6 @@
-"""Chae and Shin, Fig. 5: time against the grid's cells. `experiments/minimum_distance.py` measures it; here
-it is drawn, with the number in the paper's text: at R = 8, 53 % less than the distance map alone."""
+"""Chae and Shin, Fig. 5: time against the grid's cells. Draws the record of
+`experiments/minimum_distance.py`, with the number in the paper's text: at R = 8, 53 % less than the distance
+map alone."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ PAPER = 8, 0.47  # R, time over that of the distance map
 
 
 def draw(measured: dict[str, Any], path: Path) -> None:
-    """A panel for each scene; above the published method's points, their wrong pixels."""
+    """A panel for each scene; above the points of the published method, their shares of wrong pixels."""
     scenes, cells = measured["result"]["scenes"], measured["result"]["cells"]
     size = (4.2 * len(scenes) + 0.4, 3.6)
     figure, (axes,) = plt.subplots(1, len(scenes), figsize=size, squeeze=False, layout="constrained")

@@ -1,7 +1,8 @@
 """Chae and Shin, Fig. 6: images against the grid's cells. The default is the colon phantom.
 
-A part of the image without leaping, and of those whose rays start where the corners of cells of R x R pixels
-say. Below, wrong pixels are green: those that differ by more than 1/255 in any channel.
+A part of the image without leaping, and of images whose rays start at the nearest first hit of the corner
+rays of their cell of R x R pixels. Below, wrong pixels are green: those that differ by more than 1/255 in any
+channel.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from .common import BLACK, Page, options
 
 
 CELLS = (8, 16, 32, 64)
-WHOLE = 512 / 184  # of the image's size over that of the part that is shown
+WHOLE = 512 / 184  # size of the image over that of the part that is shown
 MIDDLE = 0.38, 0.52
 GREEN = (0.0, 0.7, 0.05)
 
@@ -45,10 +46,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         image, off = np.asarray(rendering.image(BLACK)), wrong(rendering, reference)
         page.draw(0, column, image[part], "", f"R = {cell}")
         marked = np.where(off[..., None], GREEN, image)[part]
-        told = f"wrong {off.mean():.3%}, {off[part].sum()} pixels here"
-        told += f"\nRMSE from no leaping {rmse(image, whole):.1e}"
-        page.draw(1, column, marked, told)
-        print(f"chae_fig6 R = {cell}: {', '.join(told.splitlines())}")
+        caption = f"wrong {off.mean():.3%}, {off[part].sum()} pixels here"
+        caption += f"\nRMSE from no leaping {rmse(image, whole):.1e}"
+        page.draw(1, column, marked, caption)
+        print(f"chae_fig6 R = {cell}: {', '.join(caption.splitlines())}")
     page.save(chosen.output / "chae_fig6.png")
 
 

@@ -1,6 +1,6 @@
-"""How is a scene drawn under several marches: whole and zoomed, with the measures of its error?
+"""Draws a scene under several marches, whole and zoomed, with measures of its error.
 
-Images keep their pixels: one pixel of a picture is one ray, since resampling would smooth what is shown.
+Images keep their pixels: one pixel of a picture is one ray, since resampling would smooth the artefacts.
 """
 
 import argparse
@@ -26,7 +26,7 @@ OUTPUT = Path(__file__).parent / "output"
 METHODS = (PLAIN, JITTER, EMPTY, BOTH)
 BLACK = (0.0, 0.0, 0.0)
 DPI = 100
-GAP, HEAD, TEXT = 4, 40, 54  # pixels: between images, of the title, of the text under an image
+GAP, HEAD, TEXT = 4, 40, 54  # pixels: gap between images, height of the title and of the text under an image
 
 
 Region: TypeAlias = Callable[["View", jv.Camera], np.ndarray]
@@ -35,16 +35,16 @@ Measures: TypeAlias = dict[str, float | None]
 
 @dataclass(frozen=True)
 class View:
-    """A scene, and which part of its image is looked at closely."""
+    """A scene, and the part of its image that is zoomed."""
 
     volume: jv.Volume
     transfer: jv.TransferFunction
     camera: jv.Camera
     step: float
     factor: float
-    """Magnification of the closer look."""
+    """Magnification of the zoomed part."""
     middle: tuple[float, float]
-    """Its middle, as fractions of the image's width and height from the top left."""
+    """Centre of the zoomed part, as fractions of the image's width and height from the top left."""
 
     @property
     def cameras(self) -> dict[str, jv.Camera]:
@@ -75,7 +75,7 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
 
 
 def recorded(argv: Sequence[str] | None, about: str, name: str) -> tuple[dict[str, Any], Path]:
-    """For scripts that draw what an experiment measured: its record, and the folder to write into."""
+    """For scripts that draw an experiment's record: the record, and the folder to write into."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
@@ -84,14 +84,14 @@ def recorded(argv: Sequence[str] | None, about: str, name: str) -> tuple[dict[st
     return record.read(chosen.results / f"{name}.json"), chosen.output
 
 
-def write_table(told: str, path: Path) -> None:
-    """A table in Markdown, to a file and to the terminal."""
-    path.write_text(told, encoding="utf-8")
-    print(told)
+def write_table(table: str, path: Path) -> None:
+    """Write a Markdown table to a file and to the terminal."""
+    path.write_text(table, encoding="utf-8")
+    print(table)
 
 
 def options(argv: Sequence[str] | None, about: str, resolution: int = 160) -> argparse.Namespace:
-    """What every figure's script can be told."""
+    """The options that the script of every figure has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="real volumes, in place of phantoms")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER", help="default: %(default)s")
@@ -99,7 +99,7 @@ def options(argv: Sequence[str] | None, about: str, resolution: int = 160) -> ar
     parser.add_argument(
         "--resolution", type=int, default=resolution, help="voxels along an axis of a phantom"
     )
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that the script runs")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that the script runs")
     chosen = parser.parse_args(argv)
     if chosen.quick:
         chosen.size, chosen.resolution = 48, 40
@@ -115,21 +115,21 @@ def comparison(
 ) -> dict[str, dict[str, Measures]]:
     """Draw the view under every method, whole above and zoomed below, and print its measures.
 
-    `region`: the pixels of which boundary noise is told. **Returns** the measures by look and method.
+    `region`: the pixels whose boundary noise is measured. **Returns** the measures by look and method.
     """
     page = Page(len(methods), 2, view.camera.size[0], title)
     measures: dict[str, dict[str, Measures]] = {}
     for row, (look, camera) in enumerate(view.cameras.items()):
         truth = np.asarray(view.render(camera, converged(view.step)).image(BLACK))
-        there, measures[look] = region(view, camera), {}
+        mask, measures[look] = region(view, camera), {}
         for column, method in enumerate(methods):
             image = np.asarray(view.render(camera, jv.March(view.step, transforms(method))).image(BLACK))
-            measured = measures[look][method] = measure(image, truth, there)
-            page.draw(row, column, image, told(measured), method if row == 0 else "")
+            measured = measures[look][method] = measure(image, truth, mask)
+            page.draw(row, column, image, caption(measured), method if row == 0 else "")
     page.save(path)
     for look, of_method in measures.items():
         for method, measured in of_method.items():
-            print(f"{path.stem} {look}, {method}: {', '.join(told(measured).splitlines())}")
+            print(f"{path.stem} {look}, {method}: {', '.join(caption(measured).splitlines())}")
     return measures
 
 
@@ -142,12 +142,12 @@ def measure(image: np.ndarray, truth: np.ndarray, region: np.ndarray) -> Measure
     return {"wood grain": wood_grain_energy(error), "boundary noise": noise, "RMSE": rmse(image, truth)}
 
 
-def told(measured: Measures) -> str:
+def caption(measured: Measures) -> str:
     return "\n".join(f"{name} {'none' if v is None else f'{v:.2g}'}" for name, v in measured.items())
 
 
 class Page:
-    """A page of square images on which a pixel stays a pixel."""
+    """A page of square images that keeps their pixels."""
 
     def __init__(self, columns: int, rows: int, side: int, title: str):
         self.side, self.width = side, columns * side + (columns + 1) * GAP

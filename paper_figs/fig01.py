@@ -1,4 +1,4 @@
-"""Kye 2013, Fig. 1: the artefacts. Ray casting draws wood grain on a head; jittering takes it away, and makes
+"""Kye 2013, Fig. 1: the artefacts. Ray casting draws wood grain on a head; jittering removes it, and adds
 noise where the volume's bounds cut through the head."""
 
 from collections.abc import Sequence

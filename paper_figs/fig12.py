@@ -1,5 +1,5 @@
-"""Kye 2013, Fig. 12: what alignment does where vessels leave the volume. The default is the vessel phantom,
-whose root the lower face cuts."""
+"""Kye 2013, Fig. 12: the effect of alignment where vessels leave the volume. The default is the vessel
+phantom, whose root the lower face cuts."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ CONTRAST = [
     (120, (0.80, 0.20, 0.12), 0.12),
     (230, (1.00, 0.60, 0.45), 0.25),
 ]
-"""Translucent, so that rays reach the face at which they leave."""
+"""Translucent, so that rays reach their exit."""
 
 
 def phantom(resolution: int, size: int) -> View:

@@ -1,5 +1,5 @@
-"""Kye 2013, Fig. 13: the pixels that alignment changes, green, on the vessels of Fig. 12. The square is what
-Fig. 12 shows zoomed."""
+"""Kye 2013, Fig. 13: the pixels that alignment changes, in green, on the vessels of Fig. 12. The square marks
+the zoomed part of Fig. 12."""
 
 from collections.abc import Sequence
 
@@ -25,13 +25,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         rendering = view.render(camera, jv.March(view.step, transforms(BOTH)))
         aligned = np.asarray(rendering.aligned)
         image = np.where(aligned[..., None], GREEN, np.asarray(rendering.image(BLACK)))
-        told = f"{aligned.sum()} of {aligned.size} pixels, {aligned.mean():.1%}"
-        axes = page.draw(0, column, image, told, look)
+        caption = f"{aligned.sum()} of {aligned.size} pixels, {aligned.mean():.1%}"
+        axes = page.draw(0, column, image, caption, look)
         if look == "whole":
             side = size / view.factor
             corner = [middle * size - side / 2 for middle in view.middle]
             axes.add_patch(Rectangle(corner, side, side, fill=False, color="white", linewidth=0.8))
-        print(f"fig13 {look}: {told}")
+        print(f"fig13 {look}: {caption}")
     page.save(chosen.output / "fig13.png")
 
 

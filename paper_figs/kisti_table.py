@@ -1,6 +1,6 @@
 """The KISTI report's table (2005): what early ray termination (ERT) and empty-space skipping (ESS) save.
-`experiments/kisti.py` measures it; here it is written in Markdown, beside the report's, with the quotient of
-both speed-ups.
+Writes the record of `experiments/kisti.py` in Markdown, beside the report's table, with the quotient of both
+speed-ups.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from .common import recorded, write_table
 
 
 def table(measured: dict[str, Any]) -> str:
-    """The record of `experiments/kisti.py`, and the report's table, as one in Markdown."""
+    """The record of `experiments/kisti.py` and the report's table, as one Markdown table."""
     result = measured["result"]
     sizes, scenes = [str(size) for size in result["sizes"]], result["scenes"]
     lines = ["| | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
@@ -28,11 +28,11 @@ def table(measured: dict[str, Any]) -> str:
 
     for method in (ERT, ESS, BOTH):
         line(method, of(method, ".2f", "speed-up", "median"))
-        line(f"*report: {method}*", [[f"{told:.2f}" for told in REPORT[scene][method]] for scene in REPORT])
+        line(f"*report: {method}*", [[f"{gain:.2f}" for gain in REPORT[scene][method]] for scene in REPORT])
         quotients = [
             [
-                f"{scenes[scene][size][method]['speed-up']['median'] / told:.2f}"
-                for size, told in zip(sizes, REPORT[scene][method], strict=True)
+                f"{scenes[scene][size][method]['speed-up']['median'] / gain:.2f}"
+                for size, gain in zip(sizes, REPORT[scene][method], strict=True)
             ]
             for scene in REPORT
         ]

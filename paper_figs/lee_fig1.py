@@ -1,7 +1,7 @@
 """Lee, Kwon and Shin, Fig. 1: a template grown from one packet of light, and from four.
 
-Photons seen along z, lengths in mean free paths; the area of a dot is the photon's intensity. The sample
-that they light is at the cross, and the centre of their light at the ring.
+Photons seen along z, lengths in mean free paths; the area of a dot is the photon's intensity. The cross marks
+the sample that they light, and the ring the centre of their light.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ REACH = 5  # mean free paths from the middle to the edge of a panel
 
 
 def centre(template: ScattererTemplate) -> np.ndarray:
-    """Mean place of the photons, weighted by their intensity; of several templates, one each."""
+    """Mean position of the photons, weighted by their intensity; one for each of several templates."""
     intensity = np.asarray(template.intensity)[..., None]
     return (np.asarray(template.offset) * intensity).sum(-2) / intensity.sum(-2)
 
@@ -45,11 +45,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         dots = draw(panel, template)
         many = scatterer_templates(skin, 0, count=TEMPLATES, packets=packets, threshold=THRESHOLD)
         aside, mean = (np.linalg.norm(centre(t), axis=-1).mean() for t in (template, many))
-        told = (
+        caption = (
             f"{title}: centre of light {aside:.2f} λ aside,\n{mean:.2f} λ in the mean of {TEMPLATES} of them"
         )
-        panel.set_title(told, fontsize=10)
-        print(f"lee_fig1 {' '.join(told.split())}; {np.sum(template.intensity > 0)} photons")
+        panel.set_title(caption, fontsize=10)
+        print(f"lee_fig1 {' '.join(caption.split())}; {np.sum(template.intensity > 0)} photons")
     figure.colorbar(dots, ax=axes, label="z / λ")
     chosen.output.mkdir(parents=True, exist_ok=True)
     common.save(figure, chosen.output / "lee_fig1.png")

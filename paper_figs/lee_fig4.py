@@ -1,8 +1,8 @@
-"""Lee, Kwon and Shin, Fig. 4: the exceptional case. An ear before a head that keeps all light from it.
+"""Lee, Kwon and Shin, Fig. 4: the exceptional case. An ear before a head that blocks all light from it.
 
 The light comes from behind the head. Photons of a template reach through the thin ear into the gap before
-the head, where nothing hides them, so that the ear shines; tested further on as well, they are hidden.
-Under each image stands the mean brightness of the ear's pixels.
+the head, where nothing hides them, so the ear shines; if they are also tested farther out, they are hidden.
+The text under each image is the mean brightness of the ear's pixels.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from .common import BLACK, Page, options
 
 
 GAP, THICK, RADIUS = 0.15, 0.06, 0.75
-"""Between ear and head, of the ear, of the head; the cube is 2 wide."""
+"""Gap between ear and head, thickness of the ear, radius of the head; the cube is 2 wide."""
 FLESH = jv.Material(0.5, 0.045, 1.4)
 LIGHTS = DirectionalLight((0.0, -1.0, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
 HOW: dict[str, Any] = {"occlusion": "hard", "templates": 8, "blend": True, "packets": 8, "cutoff": 0.001}
@@ -28,9 +28,9 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def volume(resolution: int, *, head: bool) -> jv.Volume:
-    """An ear at the side of -y of a head, or without one."""
+    """An ear on the -y side of a head, or the ear alone."""
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
-    side = -0.35  # of the head, towards the ear
+    side = -0.35  # y of the head's side towards the ear
     ear = np.maximum(np.hypot(x, 0.7 * z) - 0.22, abs(y - side + GAP + THICK / 2) - THICK / 2)
     skull = np.sqrt(x**2 + (y - side - RADIUS) ** 2 + z**2) - RADIUS
     inside = np.minimum(ear, skull) if head else ear
@@ -54,9 +54,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         lighting = None if reach is None else ScattererTemplates(FLESH, LIGHTS, reach=reach, **HOW)
         rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
         image = np.asarray(rendering.image(BLACK))
-        told = f"brightness of the ear {(image[ear] @ LUMINANCE).mean():.3f}"
-        page.draw(0, column, image, told, title)
-        print(f"lee_fig4 {title}: {told}")
+        caption = f"brightness of the ear {(image[ear] @ LUMINANCE).mean():.3f}"
+        page.draw(0, column, image, caption, title)
+        print(f"lee_fig4 {title}: {caption}")
     page.save(chosen.output / "lee_fig4.png")
 
 

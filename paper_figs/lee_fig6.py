@@ -1,9 +1,10 @@
 """Lee, Kwon and Shin, Fig. 6: without light, and lit by scatterer templates. The defaults are the head
-phantom, and a frog whose translucent body and organs are each a material; `--data` adds CT of a head.
+phantom, and a frog whose translucent body and organs are a material each; `--data` adds CT of a head.
 
-In the middle hidden photons are left out, as published (hard occlusion), and each pixel uses one of eight
-templates, chosen at random; the paper makes eight of each material, and does not say which of them a sample
-uses. On the right occlusion is soft, and four templates of more packets are blended. The lights are the same.
+In the middle column hidden photons are left out, as published (hard occlusion), and each pixel uses one of
+eight templates, chosen at random; the paper makes eight for each material, and does not say which of them a
+sample uses. In the right column occlusion is soft, and four templates of more packets are blended. The lights
+are the same.
 """
 
 from collections.abc import Sequence
@@ -30,7 +31,7 @@ COLUMNS: dict[str, dict[str, Any] | None] = {
 
 
 class Subject(NamedTuple):
-    """A scene, what it is made of, and in which direction the light travels."""
+    """A scene, its materials, and the direction in which the light travels."""
 
     scene: Scene
     materials: list[jv.Material]
@@ -92,8 +93,8 @@ def draw(page: Page, row: int, name: str, subject: Subject) -> None:
             lights = DirectionalLight(direction, IRRADIANCE), AROUND
             lighting = ScattererTemplates(materials, lights, **how)
         rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
-        told = name if lighting is None else f"{lighting.photons} photon slots a template"
-        page.draw(row, column, rendering.image(BLACK), told, title if row == 0 else "")
+        caption = name if lighting is None else f"{lighting.photons} photon slots a template"
+        page.draw(row, column, rendering.image(BLACK), caption, title if row == 0 else "")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

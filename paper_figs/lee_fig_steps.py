@@ -1,9 +1,9 @@
-"""Lee, Kwon and Shin, the six steps of shading with a template: what each of them does to an image.
+"""Lee, Kwon and Shin, the six steps of shading with a template: the effect of each on an image.
 
-For each step a scene in which only that step matters, twice: as it is above, and with one thing changed
-below. The template is made by hand, of photons evenly around a sample, so that there is no noise; surfaces
-are so opaque that what lies under them is not seen but for the light that comes from there. Under each image
-stands the mean of its visible pixels, as linear red, green and blue.
+For each step, a scene in which only that step matters is drawn twice: as it is above, and with one thing
+changed below. The template is made by hand, of photons evenly around a sample, so that there is no noise;
+surfaces are so opaque that what lies under them shows only by the light that comes from there. The text under
+each image is the mean of its visible pixels, as linear red, green and blue.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from .common import BLACK, Page, options
 
 
 FAR = 0.2
-"""Of photons from their sample; the cube is 2 wide."""
+"""Distance of photons from their sample; the cube is 2 wide."""
 AIR, SKIN, DEEP, DEEPER, VEIL = 0.0, 1.0, 2.0, 3.0, 0.25
 PALE, RED, BLUE, GREY = (0.75, 0.6, 0.5), (0.9, 0.1, 0.05), (0.1, 0.2, 0.9), (0.1, 0.1, 0.1)
 LEFT = DirectionalLight((1.0, 0.3, -0.4), (28.0, 28.0, 28.0))
@@ -30,10 +30,10 @@ Place = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Look(NamedTuple):
-    """A scene, and how it is lit. `values`: at places of the cube; `seen`: colours of `DEEP` and `DEEPER`;
-    `inside`: what a place with one of these is made of."""
+    """A scene and its lighting. `values`: the volume's values at points of the cube; `seen`: colours of
+    `DEEP` and `DEEPER`; `inside`: the material of both."""
 
-    told: str
+    caption: str
     values: Callable[[Place, float], np.ndarray]
     seen: tuple[Any, Any] = (PALE, PALE)
     lights: tuple[Light, ...] = (LEFT, SKY)
@@ -44,7 +44,7 @@ class Look(NamedTuple):
 
 
 def inside(distance: np.ndarray, voxel: float) -> np.ndarray:
-    """1 where a distance is below 0, 0 above, and a ramp two voxels wide between."""
+    """1 where a distance is below 0, 0 where it is above, with a ramp two voxels wide in between."""
     return np.clip(0.5 - distance / voxel / 2, 0, 1)
 
 
@@ -64,7 +64,7 @@ def below_a_ball(place: Place, voxel: float) -> np.ndarray:
 
 
 def layers(place: Place, voxel: float) -> np.ndarray:
-    """A ball of skin, under one half of which lies something else, and under that one thing more."""
+    """A ball of skin with `DEEP` under one half of its surface, and `DEEPER` under that."""
     x, y, z = place
     r = np.sqrt(x**2 + y**2 + z**2)
     half = inside(-z, voxel)
@@ -74,7 +74,7 @@ def layers(place: Place, voxel: float) -> np.ndarray:
 
 
 def veiled(place: Place, voxel: float) -> np.ndarray:
-    """A ball, and a veil of no material before one half of it."""
+    """A ball, and a veil without material before one half of it."""
     x, y, z = place
     r = np.sqrt(x**2 + y**2 + z**2)
     veil = inside(-z, voxel) * inside(abs(r - 0.92) - 0.03, voxel)
@@ -145,8 +145,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         for row, look in enumerate(looks):
             image, visible = render(look, chosen.resolution, chosen.size)
             mean = " ".join(f"{part:.2f}" for part in image[visible].mean(axis=0))
-            page.draw(row, column, image, f"{look.told}\n{mean}", title if row == 0 else "")
-            print(f"lee_fig_steps {title}: {look.told}: {mean}")
+            page.draw(row, column, image, f"{look.caption}\n{mean}", title if row == 0 else "")
+            print(f"lee_fig_steps {title}: {look.caption}: {mean}")
     page.save(chosen.output / "lee_fig_steps.png")
 
 

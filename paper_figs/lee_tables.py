@@ -1,6 +1,6 @@
 """Lee, Kwon and Shin, Tables 1 to 3: the brightest photons of templates, brightest first. Generated here in
-the conserving form, which the paper's own tables have (README.md), lengths in mean free paths, beside the
-intensities that the paper prints in the same rows."""
+the conserving form, which the paper's own tables have (README.md), with lengths in mean free paths, beside
+the intensities that the paper prints in the same rows."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ ONE, FOUR, THIN, DENSE = (
     "Table 3, material B: opacity 70 %",
 )
 TEMPLATES = {ONE: (0.5, 1), FOUR: (0.5, 4), THIN: (0.3, 4), DENSE: (0.7, 4)}
-"""Opacity and packets."""
+"""Opacity, and number of packets."""
 PAPER = {
     ONE: (0.72760, 0.10492, 0.04836, 0.02219, 0.01002, 0.00454, 0.00206, 0.00945),
     FOUR: (0.18145, 0.12455, 0.12500, 0.12321, 0.05762, 0.05719, 0.05676, 0.02634),
@@ -31,7 +31,7 @@ PAPER = {
 
 
 def table() -> str:
-    """All three tables as one in Markdown."""
+    """All three tables as one Markdown table."""
     lines = ["| | x | y | z | intensity | *paper* |", "|---|---|---|---|---|---|"]
     for name, (opacity, packets) in TEMPLATES.items():
         template = jv.scatterer_template(jv.Material(opacity, 1.0, INDEX), 0, packets=packets)

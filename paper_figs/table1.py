@@ -1,5 +1,5 @@
-"""Kye 2013, Table 1: the time of a whole frame. `experiments/overhead.py` measures it; here it is told in
-Markdown, as ratios to ray casting, beside those of the paper.
+"""Kye 2013, Table 1: the time of a whole frame. Writes the record of `experiments/overhead.py` in Markdown,
+as ratios to ray casting, with those of the paper.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ PAPER = {  # seconds, 1024 x 1024 pixels, in the order of the table's columns
 
 
 def table(measured: dict[str, Any]) -> str:
-    """The record of `experiments/overhead.py`, and the paper's table, as one in Markdown."""
+    """The record of `experiments/overhead.py` and the paper's table, as one Markdown table."""
     lines = [
         f"| volume | pixels | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
         "|---|" + "---|" * (len(COLUMNS) + 4),

@@ -104,7 +104,7 @@ MUTATIONS = [
         "jitter: keyed by the place in a beam, not by the pixel",
         "engine/tiles.py",
         "(column + left, row + top))",
-        "((column + left) % BEAM, (row + top) % BEAM))",
+        "((column + left) % 8, (row + top) % 8))",
         (f"{RENDERED}[jittered-left]",),
     ),
     Mutation(
@@ -161,16 +161,16 @@ MUTATIONS = [
     ),
     Mutation(
         "leap: one cell too far",
-        "engine/wavefront.py",
+        "engine/batch.py",
         "/ march.step - 1e-3)",
         "/ march.step + 1)",
         (LEAPT_GRADIENT,),
     ),
     Mutation(
         "leap: finished rays move by an index that is none, and overflow",
-        "engine/wavefront.py",
-        "jnp.where((cells > 0) & ~at.finished, a, b), gone, at)",
-        "jnp.where(cells > 0, a, b), gone, at)",
+        "engine/batch.py",
+        "jnp.where((cells > 0) & ~at.finished, a, b), moved, at)",
+        "jnp.where(cells > 0, a, b), moved, at)",
         (LEAPT_GRADIENT,),
     ),
     Mutation(
@@ -225,8 +225,8 @@ MUTATIONS = [
     Mutation(
         "survey: blocks with NaN taken for empty",
         "engine/acceleration.py",
-        "transfer.visible(known.blocks) | known.blocks.unordered",
-        "transfer.visible(known.blocks)",
+        "transfer.visible(blocks) | blocks.unordered",
+        "transfer.visible(blocks)",
         (FAULTS,),
     ),
     Mutation(
@@ -303,7 +303,7 @@ MUTATIONS = [
     ),
     Mutation(
         "transfer function: NaN has extinction 0",
-        "transfer.py",
+        "_util/piecewise_linear.py",
         "jnp.where(extinction < 0, 0, extinction)",
         "jnp.where(extinction > 0, extinction, 0)",
         (FAULTS,),
@@ -317,14 +317,14 @@ MUTATIONS = [
     ),
     Mutation(
         "faults: a leaf that is NaN leaves the image black",
-        "render.py",
-        "rays, spans = invalid(waves.rays(source, space, number), fault), None",
-        "rays, spans = waves.rays(source, space, number), None",
+        "engine/image.py",
+        "return one(number, invalid(tiles.rays(source, space, number), fault))",
+        "return one(number, tiles.rays(source, space, number))",
         (FAULTS,),
     ),
     Mutation(
         "faults: and its gradient finite",
-        "render.py",
+        "engine/gradients.py",
         "return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)",
         "return found",
         (FAULTS,),
@@ -332,8 +332,8 @@ MUTATIONS = [
     Mutation(
         "faults: the second march of a faulty scene goes on for as many samples as it may",
         "engine/gradients.py",
-        "return invalid(waves.rays(source_, space, number), fault)",
-        "return waves.rays(source_, space, number)",
+        "return invalid(tiles.rays(source_, space, number), fault)",
+        "return tiles.rays(source_, space, number)",
         ("engine/test_faults.py::test_a_step_that_is_none_is_not_marched_in_the_gradient_either",),
     ),
     Mutation(
@@ -345,7 +345,7 @@ MUTATIONS = [
     ),
     Mutation(
         "transfer function: points taken for even whose deviations add up",
-        "transfer.py",
+        "_util/piecewise_linear.py",
         "even = jnp.all(jnp.abs(values - places) < 0.4 * step)",
         "even = jnp.all(jnp.abs(values[1:] - values[:-1] - step) < 1e-3 * step)",
         ("test_transfer.py::test_points_that_lie_nearly_evenly_are_counted_exactly",),
@@ -383,11 +383,11 @@ MUTATIONS = [
         "lighting/scatterers.py",
         "matter = jnp.minimum(2 * sum(notes.shares), 1)",
         "matter = sum(notes.shares)",
-        ("test_lighting.py::test_nothing_of_a_material_shines_by_itself[soft]",),
+        ("lighting/test_lighting.py::test_nothing_of_a_material_shines_by_itself[soft]",),
     ),
     Mutation(
         "path tracing: a block's majorant without the points within its range",
-        "path_tracing/majorants.py",
+        "_util/piecewise_linear.py",
         "return jnp.maximum(ends, inside) + ROUNDING * extinction.max()",
         "return ends + ROUNDING * extinction.max()",
         ("path_tracing/test_tracking.py::test_no_extinction_exceeds_its_majorant",),
@@ -420,7 +420,7 @@ MUTATIONS = [
     Mutation(
         "replay: samples behind early termination have a gradient",
         "engine/replay.py",
-        "slopes[i].append(jnp.where(known.finished[i][k], 0, slope))",
+        "slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))",
         "slopes[i].append(slope)",
         (FORWARD_GRADIENT,),
     ),
@@ -433,13 +433,13 @@ MUTATIONS = [
     ),
     Mutation(
         "replay: one of eight voxels gets no gradient",
-        "engine/voxel_gradient.py",
+        "_util/fetching.py",
         "for place, part in zip(asked, parts, strict=True):",
         "for place, part in list(zip(asked, parts, strict=True))[1:]:",
         (DIFFERENCES,),
     ),
     Mutation(
-        "replay: the gradient of a camera is that of its last wave",
+        "replay: the gradient of a camera is that of its last tile",
         "engine/gradients.py",
         "return (total, added(of_source, of_rays_source)), None",
         "return (total, jax.tree.map(jnp.zeros_like, of_source)), None",

@@ -10,6 +10,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.engine.tiles import RayTiles
+from jaxvol.engine.tiling import Tiling
 from jaxvol.space import Affine
 
 
@@ -152,11 +153,11 @@ def test_rays_round_alike_whether_or_not_they_are_differentiated(parallel_scale)
     place = (5.1, -6.2, 4.3), (0.53, 1.07, 0.9), (0.1, 0.2, 1.0)
     camera = jv.Camera(*place, 33.3, size=(64, 64), parallel_scale=parallel_scale)
     volume = jv.Volume(np.ones((9, 9, 9), np.float32), (0.31, 0.37, 0.29))
-    waves = RayTiles.of(camera)
+    tiles = RayTiles.of(camera, Tiling())
 
     def floats(given):
         camera, volume = given
-        return eqx.filter(waves.rays(camera, Affine(volume), jnp.int32(0)), eqx.is_inexact_array)
+        return eqx.filter(tiles.rays(camera, Affine(volume), jnp.int32(0)), eqx.is_inexact_array)
 
     @jax.jit
     def pulled(given):

@@ -133,7 +133,7 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
         ),
         (
             ["--preset", "ct_bone", "--clim", "20", "90", "--unit-distance", "1e6"],
-            r"nothing is seen: the opacity is .* at most\. Give a shorter unit distance",
+            r"nothing is seen: the opacity is at most .*\. Use a shorter unit distance",
         ),
         shown,
     ]:
@@ -196,7 +196,7 @@ def test_a_fit_that_is_interrupted_goes_on_from_its_checkpoint(volume_file, seen
     told = run.communicate(timeout=60)[1]
     assert time.monotonic() - begun < 2
     assert run.returncode == 130
-    assert told.splitlines()[-1] == f"jaxvol fit: interrupted; the same command goes on from {kept}"
+    assert told.splitlines()[-1] == f"jaxvol fit: interrupted; the same command resumes from {kept}"
     assert not (tmp_path / "t.json").exists()
     with np.load(kept) as file:
         steps = len(file["losses"])

@@ -105,7 +105,7 @@ def test_save_png_writes_nothing_else(tmp_path):
 
 def test_image_over_a_background():
     rgba = jnp.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0]]])
-    rendering = jv.Picture(rgba, exhausted=jnp.zeros(rgba.shape[:2], bool))
+    rendering = jv.Rendering(rgba, exhausted=jnp.zeros(rgba.shape[:2], bool))
     np.testing.assert_allclose(rendering.image((1, 1, 1)), [[[0.7, 0.6, 0.5], [1, 1, 1]]])
     np.testing.assert_allclose(
         rendering.image(jnp.full((1, 2, 3), 0.5)), [[[0.45, 0.35, 0.25], [0.5, 0.5, 0.5]]]

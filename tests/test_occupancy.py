@@ -12,8 +12,8 @@ from scipy.ndimage import distance_transform_cdt, map_coordinates
 
 import jaxvol as jv
 from jaxvol._util.memo import kept
+from jaxvol._util.piecewise_linear import positive_between
 from jaxvol.occupancy import BLOCK, Blocks, Occupancy, Sums
-from jaxvol.transfer import seen_between
 
 
 SHAPES = [(24, 20, 28), (5, 9, 13), (2, 2, 2), (6, 3, 18)]
@@ -143,7 +143,7 @@ def test_ranges_next_to_what_is_seen_are_told_from_it():
         ((3, 3), True),
     ]
     low, high = np.float32([ends for ends, _ in cases]).T
-    seen = seen_between(values, extinction, jnp.asarray(low), jnp.asarray(high))
+    seen = positive_between(values, extinction, jnp.asarray(low), jnp.asarray(high))
     np.testing.assert_array_equal(seen, [expected for _, expected in cases])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.transfer import points_below, seen_between
+from jaxvol._util.piecewise_linear import points_below, positive_between
 
 
 def evaluate(transfer, values):
@@ -166,7 +166,7 @@ def test_what_a_step_shows_is_known_to_be_visible(many):
     down = jv.TransferFunction(up.values, up.colors, [1, 1, 0, *np.zeros(len(filler))])
     low, high = np.meshgrid(np.arange(50.0, 71), np.arange(50.0, 71), indexing="ij")
     for transfer in (up, down):
-        seen = seen_between(transfer.values, transfer.extinction, jnp.asarray(low), jnp.asarray(high))
+        seen = positive_between(transfer.values, transfer.extinction, jnp.asarray(low), jnp.asarray(high))
         dense = evaluate(transfer, np.linspace(50, 70, 2001).astype(np.float32))[1] > 0
         for i, j in zip(*np.nonzero(high >= low), strict=True):
             within = slice(int(low[i, j] - 50) * 100, int(high[i, j] - 50) * 100 + 1)

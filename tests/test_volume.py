@@ -162,7 +162,7 @@ BAD = {
     ),
     "traced int32": (
         lambda: jax.jit(lambda data: jv.Volume(data).data)(np.zeros(SHAPE, np.int32)),
-        r"data must be of type .* where they are traced; got int32.*astype\(jnp\.float32\)",
+        r"data must be of type .* if traced; got int32.*astype\(jnp\.float32\)",
     ),
     "1e300": (
         lambda: jv.Volume(np.where(np.arange(6) == 2, 1e300, np.zeros(SHAPE))),
@@ -196,7 +196,7 @@ BAD = {
     ),
     "labels of another shape": (
         lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.zeros((5, 7, 5), np.uint8)),
-        r"labels must stand on the grid of data, shape \(5, 7, 6\); got shape \(5, 7, 5\)",
+        r"labels must have the shape of data, \(5, 7, 6\); got shape \(5, 7, 5\)",
     ),
     "labels that are no integers": (
         lambda: jv.Volume(np.zeros(SHAPE, np.uint8), labels=np.zeros(SHAPE)),

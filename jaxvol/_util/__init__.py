@@ -1,1 +1,1 @@
-"""What any numerical package has: of no volume, and no image."""
+"""Helpers for any numerical package, independent of volumes and images."""

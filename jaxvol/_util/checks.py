@@ -1,7 +1,7 @@
-"""How is a bad argument reported? By its name, what came, and what was expected.
+"""Checks arguments. An error names the argument, what came, and what was expected.
 
-A fault that shapes or Python values show raises `ValueError` at once. A fault that only
-traced values show is raised by `equinox.error_if` when the compiled program runs.
+A fault visible in shapes or Python values raises `ValueError` at once. A fault visible only in traced values
+is raised by `equinox.error_if` when the compiled program runs.
 """
 
 import contextlib
@@ -26,17 +26,17 @@ from .sharding import varies_over
 T = TypeVar("T")
 
 Arrayable: TypeAlias = Any
-"""What a caller may give for an array: an array of any library, nested sequences, a number. Any, since it
-is checked by its value, with an error that names the argument."""
+"""What a caller may pass for an array: an array of any library, nested sequences, a number. It is `Any`
+because the value is checked at run time, with an error that names the argument."""
 
 
 def is_traced(*values: Any) -> bool:
-    """Whether any of the values is known only when the compiled program runs."""
+    """Whether any of the values is a tracer."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def described(value: Any) -> str:
-    """A value in a few words, for the error that refuses it."""
+    """A short description of a value, for error messages."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if isinstance(value, np.ndarray | jax.Array):
@@ -48,60 +48,62 @@ def described(value: Any) -> str:
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """`value`, once `holds(value, *others)` is true everywhere.
+    """Return `value` after checking that `holds(value, *others)` is true everywhere.
 
     **Arguments:**
 
-    - `holds`: asked of NumPy arrays where values are concrete, else of traced ones; so it is made of what
-        both have, operators and methods.
-    - `message`: the error; `{got}` in it becomes the value.
+    - `holds`: called with NumPy arrays if the values are concrete, else with traced ones; so it uses only
+        operators and methods that both have.
+    - `message`: the error message; `{got}` in it is replaced by the value.
 
-    **Returns:** the value. Use what is returned: a check on a traced value vanishes without it.
+    **Returns:** the value. Use the returned value: without it, the check on a traced value vanishes.
 
     **Raises:** `ValueError` at once for a concrete value, an Equinox runtime error for a traced one. Inside
-    `jax.shard_map`, which Equinox's errors do not work in, a traced value becomes NaN instead.
+    `jax.shard_map`, where Equinox's errors do not work, a traced value becomes NaN instead.
     """
     if is_traced(value, *others):
         if any(map(varies_over, jax.tree.leaves((value, others)))):
             return jax.tree.map(lambda leaf: jnp.where(jnp.all(holds(value, *others)), leaf, jnp.nan), value)
-        # apart from what Equinox says around it, which under a plain `jax.jit` is long
+        # blank lines separate it from Equinox's own text, which is long under a plain `jax.jit`
         message = f"\n\n{message.format(got='a value known only when the program runs')}\n"
         return eqx.error_if(value, ~jnp.all(holds(value, *others)), message)
-    # by NumPy, which compiles nothing
-    if not np.all(holds(*(np.asarray(given) for given in (value, *others)))):
+    # in NumPy, which compiles nothing
+    if not np.all(holds(*(np.asarray(each) for each in (value, *others)))):
         raise ValueError(message.format(got=np.asarray(value)))
     return value
 
 
 def finite(values: Any) -> Any:
-    """For `require`: everything but NaN and infinity."""
+    """Condition for `require`: neither NaN nor infinite."""
     return abs(values) < np.inf
 
 
 def all_finite(tree: Any) -> Array:
-    """Whether no float of a tree's arrays is NaN or infinite; found when the program runs."""
+    """Whether all floats in a tree's arrays are finite; evaluated when the program runs."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves])) if leaves else jnp.array(True)
 
 
 def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | None, ...]) -> Array:
-    """`value` as an array of JAX's default float type, of this shape (None: any length; `...` in front: any
-    axes)."""
-    spelled = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
+    """`value` as an array of JAX's default float type and of this shape (None: any length; a leading `...`:
+    any axes)."""
+    shape_text = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
     given = value if is_traced(value) or isinstance(value, jax.Array) else _numbers(value)
     try:
         if given is None or jnp.issubdtype(given.dtype, jnp.complexfloating):
             raise TypeError
-        with np.errstate(over="ignore"):  # what becomes infinite is refused below
+        with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             cast = given.astype(jnp.result_type(float)) if isinstance(given, np.ndarray) else given
         with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
             array = jnp.asarray(cast, dtype=float)
     except (TypeError, ValueError) as fault:
-        raise ValueError(f"{name} must be numbers of shape {spelled}; got {value!r}.") from fault
-    wanted = tuple(n for n in shape if n is not ...)
-    held = array.shape[len(array.shape) - len(wanted) :] if ... in shape else array.shape
-    if len(held) != len(wanted) or any(w not in (None, n) for w, n in zip(wanted, held, strict=True)):
-        raise ValueError(f"{name} must have shape {spelled}; got shape {array.shape}.")
+        raise ValueError(f"{name} must be numbers of shape {shape_text}; got {value!r}.") from fault
+    expected = tuple(n for n in shape if n is not ...)
+    trailing = array.shape[len(array.shape) - len(expected) :] if ... in shape else array.shape
+    if len(trailing) != len(expected) or any(
+        w not in (None, n) for w, n in zip(expected, trailing, strict=True)
+    ):
+        raise ValueError(f"{name} must have shape {shape_text}; got shape {array.shape}.")
     if isinstance(given, np.ndarray) and not np.all(finite(cast)):
         beyond = f" in {array.dtype}" if np.all(finite(given)) else ""
         raise ValueError(f"{name} must be finite{beyond}; got {given}.")
@@ -109,12 +111,12 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
 
 
 def _numbers(value: Arrayable) -> np.ndarray | None:
-    """`value` as a NumPy array of real numbers; None for what is none."""
+    """`value` as a NumPy array of real numbers, or None if it is not one."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
         return None
-    return array if array.dtype.kind in "biufV" else None  # V: JAX's own short floats
+    return array if array.dtype.kind in "biufV" else None  # V: JAX's own 8- and 16-bit floats
 
 
 def number(
@@ -137,8 +139,8 @@ def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) ->
 
 
 def integer(name: str, value: Any, least: int, most: int | None = None, *, otherwise: str = "") -> int:
-    """`value` as a whole number from `least` to `most`, both included; `otherwise`: what else it might have
-    been."""
+    """`value` as an integer from `least` to `most`, inclusive; `otherwise`: an alternative that the message
+    names."""
     try:
         if isinstance(value, bool | np.bool_):
             raise TypeError
@@ -146,21 +148,21 @@ def integer(name: str, value: Any, least: int, most: int | None = None, *, other
     except TypeError:
         whole = None
     if whole is None or whole < least or (most is not None and whole > most):
-        wanted = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name} must be an integer {wanted}{otherwise}; got {described(value)}.")
+        expected = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} must be an integer {expected}{otherwise}; got {described(value)}.")
     return whole
 
 
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
-    """`path` as that of a file that can be written, whose folder is made: for what takes long to be made.
+    """Check that the file `path` can be written, and create its folder, before a long computation.
 
-    **Raises:** `ValueError` for one that cannot."""
+    **Raises:** `ValueError` if it cannot be written."""
     path = Path(path)
     try:
         if path.is_dir():
             raise IsADirectoryError("it is a folder")
         if path.parent.exists() and not path.parent.is_dir():
-            raise NotADirectoryError(f"{path.parent} is no folder")
+            raise NotADirectoryError(f"{path.parent} is not a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass

@@ -1,4 +1,4 @@
-"""How is something costly done to few of many things? They are put together, and taken so many at a time."""
+"""Gathers some entries of arrays, and processes them in chunks of fixed size."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,36 +11,39 @@ from .sharding import varying
 
 
 CHUNK = 2048
-"""Things that are taken at a time."""
+"""Entries processed at a time, if nothing else is asked for."""
 
 
 class Chosen(NamedTuple):
-    """Some of the entries of arrays (rows, columns), of which there may be several, one below the other.
+    """Chosen entries of arrays (rows, columns), of which there may be several, stacked along the rows.
 
-    - `place`: of the chosen ones, in front; counted row by row.
-    - `number`: how many there are.
+    - `place`: indices of the chosen entries, counted row by row, in front of indices past the end.
+    - `number`: how many are chosen.
     - `columns`: of the arrays.
+    - `chunk`: entries processed at a time.
     """
 
     place: Int[Array, " entries"]
     number: Int[Array, ""]
     columns: int
+    chunk: int
 
     @classmethod
-    def of(cls, chosen: list[Bool[Array, "rows columns"]]) -> "Chosen":
-        """Where these are true."""
+    def of(cls, chosen: list[Bool[Array, "rows columns"]], chunk: int = CHUNK) -> "Chosen":
+        """The entries where these are true."""
         whole = jnp.concatenate(chosen)
-        return cls(in_front(whole.reshape(-1)), jnp.sum(whole, dtype=jnp.int32), whole.shape[1])
+        number = jnp.sum(whole, dtype=jnp.int32)
+        return cls(in_front(whole.reshape(-1), chunk), number, whole.shape[1], chunk)
 
     def over(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
-        """`one(places, carry)`, a chunk after the other. The last is filled up with places past the end."""
+        """Folds `one(places, carry)` over the chunks. The last one is padded with places past the end."""
 
-        def chunk(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
+        def body(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
             i, carry = state
-            return i + 1, one(jax.lax.dynamic_slice_in_dim(self.place, i * CHUNK, CHUNK), carry)
+            return i + 1, one(jax.lax.dynamic_slice_in_dim(self.place, i * self.chunk, self.chunk), carry)
 
         begin = varying((jnp.zeros((), jnp.int32), start), self.number)
-        return jax.lax.while_loop(lambda state: state[0] * CHUNK < self.number, chunk, begin)[1]
+        return jax.lax.while_loop(lambda state: state[0] * self.chunk < self.number, body, begin)[1]
 
     def take(self, arrays: list[PyTree], places: Int[Array, " chunk"]) -> PyTree:
         """The entries at these places."""
@@ -51,24 +54,24 @@ class Chosen(NamedTuple):
         return jax.tree.map(taken, *arrays)
 
     def put(self, whole: PyTree, places: Int[Array, " chunk"], part: PyTree) -> PyTree:
-        """These in their places, of flat arrays."""
+        """Flat arrays with these entries at these places."""
         return jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), whole, part)
 
     def apart(self, whole: PyTree, arrays: int) -> list[PyTree]:
-        """So many arrays (rows, columns) again, from flat ones."""
+        """Flat arrays, split into so many arrays (rows, columns) again."""
         leaves, tree = jax.tree.flatten(whole)
         each = (leaf.reshape(arrays, -1, self.columns) for leaf in leaves)
         return [jax.tree.unflatten(tree, part) for part in zip(*each, strict=True)]
 
 
-def in_front(chosen: Bool[Array, " entries"]) -> Int[Array, " padded"]:
-    """The places of those that are chosen, in order, then numbers past the last place; as many as fill up
-    whole chunks.
+def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, " padded"]:
+    """Indices of the chosen entries, in order, followed by indices past the end, up to a whole number of
+    chunks. `chunk`: a multiple of 128.
 
-    As `jnp.nonzero`, in a quarter of its time for 16 384 entries on CPU, and two thirds for 65 536, where the
-    scatter weighs more: XLA sums up slowly along an array. Here it is a product with a triangle of ones,
-    exact for numbers as small as these."""
-    padded = jnp.pad(chosen, (0, -chosen.size % CHUNK))
+    Like `jnp.nonzero`, in a quarter of its time for 16 384 entries on CPU, and two thirds for 65 536, where
+    the scatter weighs more. XLA's cumulative sums are slow; here they are a product with a triangle of ones,
+    which is exact for numbers as small as these."""
+    padded = jnp.pad(chosen, (0, -chosen.size % chunk))
     rows = padded.reshape(-1, 128).astype(jnp.float32)
     within = jnp.matmul(rows, jnp.triu(jnp.ones((128, 128), rows.dtype), 1), precision="highest")
     totals = jnp.sum(rows, axis=1)

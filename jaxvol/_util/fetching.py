@@ -1,4 +1,4 @@
-"""How are the voxels around a coordinate read from memory? One by one, from packed words, or on record."""
+"""Reads the voxels around a coordinate: one by one, from packed words, or recording each fetch."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -21,18 +21,18 @@ class Fetch(eqx.Module):
 
     @abstractmethod
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
-        """The eight voxels around a grid coordinate, and the fractions between them."""
+        """The eight voxels around a grid coordinate, and its fractional position between them."""
 
 
 class OneByOne(Fetch):
-    """Eight voxels, each by itself."""
+    """Fetches each of the eight voxels separately."""
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         return cube_of(lambda flat: fetched(data, flat), data.shape, coordinate)
 
 
 class Packed(Fetch):
-    """From a packed copy: the same voxels, in a half or a quarter of the fetches."""
+    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches."""
 
     words: UInt32[Array, " voxels"]
 
@@ -45,7 +45,7 @@ class Packed(Fetch):
         signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
 
         def voxel(word: Int[Array, ""], place: int) -> Scalar:
-            if signed:  # its sign comes with it when it is shifted down from the top
+            if signed:  # shifting down from the top bits extends the sign
                 return (word << (32 - bits * (place + 1)) >> (32 - bits)).astype(dtype)
             return (word >> (bits * place) & (2**bits - 1)).astype(dtype)
 
@@ -60,16 +60,16 @@ class Packed(Fetch):
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
         word = self.words.at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
-        # XLA fetches anew for each of several uses, but not for those of what a fetched value is converted to
+        # XLA repeats a fetch for each use of its value, but not for uses of the converted value
         return word.astype(jnp.int32)
 
 
 class Recording(Fetch):
-    """Writes down which voxels are asked for, and adds something to each: what the VJP returns for that is
-    one cotangent for each fetch.
+    """Records which voxels are fetched, and adds a value to each, so that the VJP with respect to these
+    values returns one cotangent per fetch.
 
-    - `added`: for each fetch in its order; empty: nothing, to find out how many there are.
-    - `asked`: places in the flattened voxels, filled while a program is traced.
+    - `added`: the values, in the order of the fetches; if empty, nothing is added (to count the fetches).
+    - `asked`: indices into the flattened voxels, filled while a program is traced.
     """
 
     added: list
@@ -87,7 +87,7 @@ class Recording(Fetch):
 def scatter_add(
     voxels: Float[Array, " voxels"], asked: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
 ) -> Float[Array, " voxels"]:
-    """Parts of a gradient added to the voxels that were asked for."""
+    """Add the cotangents `parts` of fetches to the voxels `asked` that they read."""
     for place, part in zip(asked, parts, strict=True):
         voxels = voxels.at[place].add(
             part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
@@ -98,8 +98,8 @@ def scatter_add(
 def cube_of(
     voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], coordinate: Vec3
 ) -> tuple[Cube, Vec3]:
-    """The eight voxels around a coordinate, each by its place in the flattened array, and the fractions
-    between them."""
+    """The eight voxels around a coordinate, each by its index into the flattened array, and the fractional
+    position between them."""
     dtype = coordinate[0].dtype
     (i, j, k), fraction = split(coordinate, shape)
     _, ny, nz = shape
@@ -113,13 +113,13 @@ def cube_of(
 def split(
     coordinate: Vec3, shape: tuple[int, ...]
 ) -> tuple[tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]], Vec3]:
-    """The node below a coordinate and the fractions past it; the last node belongs to the cell below."""
+    """The node below a coordinate, and the fractions past it; the last node belongs to the cell below."""
     x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
-    # the second limit also keeps NaN inside the array
+    # the second clip also keeps the index of a NaN inside the array
     i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
     return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
 
 
 def fetched(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
-    """The entry at this place of the flattened array."""
+    """The entry at index `flat` of the flattened array."""
     return array.reshape(-1).at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -1,7 +1,7 @@
-"""Does a file hold what is said of it?
+"""Checks the sizes of files against their headers.
 
-Sizes are checked against headers before memory is taken, or, where only decompressing tells, while
-the file is read, never a byte further.
+Sizes are checked before memory is allocated or, if only decompressing tells, while the file is read, never
+further than one byte past the expected size.
 """
 
 import zipfile
@@ -16,13 +16,13 @@ import numpy as np
 
 CHUNK = 2**20
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
-# RuntimeError: ITK's own, and zipfile's for encryption and unknown compression; OSError: gzip's own
+# RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 @runtime_checkable
 class Stream(Protocol):
-    """Bytes that are read one piece after the other: of a file, of gzip, of a member of a zip archive."""
+    """Bytes read piece by piece: of a file, of a gzip stream, of a member of a zip archive."""
 
     def read(self, size: int = -1, /) -> bytes: ...
 
@@ -30,34 +30,34 @@ class Stream(Protocol):
 
 
 class Header(NamedTuple):
-    """What the caller of `load` said of a file's voxels, as it came; None where nothing was said."""
+    """Shape and type of a file's voxels as passed to `load`, unchecked; None if not given."""
 
     shape: Sequence[int] | Any | None
     dtype: str | Any | None
 
     def refuse(self, path: Path) -> None:
-        """For readers of files that carry their own header: a second one is an error."""
-        if any(said is not None for said in self):
+        """Raise an error if either is given; for readers of files that have their own header."""
+        if any(value is not None for value in self):
             raise ValueError(
-                f"shape and dtype are for raw files; {path} carries its own, and got shape={self.shape} "
-                f"and dtype={self.dtype} besides. Leave them out."
+                f"shape and dtype are for raw files; {path} has its own, but got shape={self.shape} and "
+                f"dtype={self.dtype} as well. Leave them out."
             )
 
 
 def file_size(path: Path) -> int:
-    """Bytes of a regular file that is not empty."""
+    """Size in bytes of a regular, non-empty file."""
     if not path.is_file():
         fault = "is a directory" if path.is_dir() else "is not a regular file"
         raise ValueError(f"path: {path} {fault}; give the path of one file.")
-    held = path.stat().st_size
-    if held == 0:
+    size = path.stat().st_size
+    if size == 0:
         raise ValueError(f"path: {path} is empty (0 bytes). Fetch or write it again.")
-    return held
+    return size
 
 
 def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
-    """All bytes of a stream, which are as many as expected; of more than that, one is read."""
-    content = bytearray()  # grows with what is there: a header alone takes no memory
+    """All bytes of a stream, which must be `expected`; at most one more is read."""
+    content = bytearray()  # grows with the data, so a header alone allocates nothing
     for chunk in chunks(stream, expected + 1):
         content += chunk
     check_size(path, len(content), expected)
@@ -65,16 +65,16 @@ def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
 
 
 def chunks(stream: Stream, limit: int) -> Iterator[bytes]:
-    """A stream piece by piece, at most `limit` bytes of it."""
+    """Yield at most `limit` bytes of a stream, piece by piece."""
     while limit > 0 and (chunk := stream.read(min(limit, CHUNK))):
         limit -= len(chunk)
         yield chunk
 
 
-def check_size(path: Path, held: int, expected: int) -> None:
-    """Bytes of voxels that are there must be as many as the header says."""
-    if held != expected:
-        fault = f"cut short: it holds {held}" if held < expected else f"oversized: it holds {held} or more"
+def check_size(path: Path, size: int, expected: int) -> None:
+    """Check that a file holds as many bytes of voxels as its header says."""
+    if size != expected:
+        fault = f"cut short: it holds {size}" if size < expected else f"oversized: it holds {size} or more"
         raise ValueError(
             f"path: {path} is {fault} bytes of voxels where its header (shape and dtype) says {expected}. "
             "Check the header, or fetch the file again."
@@ -83,7 +83,7 @@ def check_size(path: Path, held: int, expected: int) -> None:
 
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
-    """What a decoder raises within, of whatever kind, becomes the `ValueError` of a corrupt file."""
+    """Turn any error of a decoder within the context into the `ValueError` of a corrupt file."""
     try:
         yield
     except CORRUPT as fault:
@@ -95,6 +95,6 @@ def decoding(path: Path) -> Iterator[None]:
 def as_array(
     content: bytes | bytearray, shape: Sequence[int], dtype: np.dtype, order: Literal["C", "F"]
 ) -> np.ndarray:
-    """Bytes as an array in native byte order, its last axis fastest in memory."""
+    """Bytes as an array in native byte order, with its last axis fastest in memory."""
     array = np.frombuffer(content, dtype).reshape(shape, order=order)
     return np.ascontiguousarray(array, dtype=dtype.newbyteorder("="))

@@ -1,7 +1,7 @@
-"""What has been computed from this array before? Kept for as long as the array lives.
+"""Memoizes results computed from an array, for as long as the array lives.
 
-Arrays do not change: whoever updates a volume puts another array into it, and what was computed from the old
-one is never asked for again. So nothing kept here goes stale, and nothing outlives its array.
+Arrays are immutable: an update of a volume replaces its array, and results for the old one are never
+requested again. So nothing stored here goes stale, and nothing outlives its array.
 """
 
 import weakref
@@ -20,9 +20,9 @@ T = TypeVar("T")
 
 
 def kept(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
-    """`compute(array)`, computed once in the lifetime of a concrete array. It carries no gradient. Under
+    """`compute(array)`, computed once in the lifetime of a concrete array; it carries no gradient. Under
     `jax.vmap`, it is computed once in the lifetime of the batch."""
-    if not isinstance(array, jax.Array):  # a NumPy array may change
+    if not isinstance(array, jax.Array):  # NumPy arrays are mutable
         return compute(array)
     if is_traced(array):
         return _of_batch(compute)(jax.lax.stop_gradient(array))
@@ -36,13 +36,13 @@ def kept(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
 
 @cache
 def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """`compute` of one array, with a rule that keeps the results of a batch of them."""
+    """`compute` of one array, with a batching rule that memoizes the results of a batch."""
     one, several = jax.custom_batching.custom_vmap(compute), jax.vmap(compute)
 
     @one.def_vmap
     def _(size: int, batched: list[bool], arrays: Array) -> Any:
-        found = kept(arrays, several)
-        return found, jax.tree.map(lambda _: True, found)
+        results = kept(arrays, several)
+        return results, jax.tree.map(lambda _: True, results)
 
     return one
 

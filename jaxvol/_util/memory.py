@@ -1,4 +1,4 @@
-"""Would that fit into memory? Asked before it is taken, since what does not fit ends the process."""
+"""Checks that an allocation fits into memory before it is made, since running out ends the process."""
 
 import os
 from pathlib import Path
@@ -7,19 +7,19 @@ import jax
 
 
 def require_room(wanted: int, of: str) -> None:
-    """**Raises** `ValueError` if so many bytes are more than the device has. `of`: which arguments ask for
-    them, and what to do."""
+    """**Raises** `ValueError` if the device has less than `wanted` bytes. `of`: which arguments require them,
+    and what to do."""
     if wanted > (room := memory_of_device()):
         raise ValueError(f"{of}: asks for {_spelled(wanted)} of memory, and the device has {_spelled(room)}.")
 
 
 def memory_of_device() -> int:
-    """Bytes that the default device may use: what it says itself, or else what the machine, or a container on
-    it, has."""
+    """Bytes that the default device may use: the limit it reports, or else that of the machine or of a
+    container on it."""
     device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
-    told = (device.memory_stats() or {}).get("bytes_limit") if isinstance(device, jax.Device) else None
-    if told:
-        return told
+    reported = (device.memory_stats() or {}).get("bytes_limit") if isinstance(device, jax.Device) else None
+    if reported:
+        return reported
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     container = Path("/sys/fs/cgroup/memory.max")
     limit = container.read_text().strip() if container.is_file() else "max"

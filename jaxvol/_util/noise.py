@@ -1,4 +1,4 @@
-"""Which random number belongs to a pixel? Hashes, and a tile of blue noise."""
+"""Per-pixel random numbers: hashes, and a tile of blue noise."""
 
 from functools import cache
 from typing import Any
@@ -13,10 +13,10 @@ from .vec3 import Vec3
 
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:
-    """The word that a seed stands for.
+    """The 32-bit word of a seed.
 
     **Arguments:** `seed`: an integer in [0, 2³²), which is its own word; a traced one, of any integer type,
-    is taken modulo 2³². Or a key of `jax.random`, of which the word is drawn.
+    is taken modulo 2³². Or a key of `jax.random`, from which the word is drawn.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -32,7 +32,7 @@ def seed_word(seed: int | Any) -> UInt32[Array, ""]:
 
 
 def is_key(seed: Any) -> bool:
-    """Whether a seed is a single key of `jax.random`, of either kind."""
+    """Whether a seed is a single key of `jax.random`, typed or raw."""
     if not isinstance(seed, jax.Array):
         return False
     if jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
@@ -43,17 +43,17 @@ def is_key(seed: Any) -> bool:
 def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""], dtype: Any) -> Vec3:
     """Three numbers in [0, 1), independent of each other and from key to key.
 
-    A hash rather than `jax.random`, whose every number costs some hundred operations where this takes
-    twenty: drawing them must not show in the time of a frame. Source: pcg3d of Jarzynski and Olano,
+    A hash rather than `jax.random`, which takes some hundred operations per number where this takes twenty:
+    drawing them must not show in the frame time. Source: pcg3d of Jarzynski and Olano,
     "Hash Functions for GPU Rendering", JCGT 9(3), 2020.
     """
     a, b, c = (key.astype(jnp.uint32) * np.uint32(1664525) + np.uint32(1013904223) for key in (x, y, seed))
-    a, b, c = _stir(a, b, c)
+    a, b, c = _mix(a, b, c)
     a, b, c = (word ^ (word >> np.uint32(16)) for word in (a, b, c))
-    a, b, c = _stir(a, b, c)
+    a, b, c = _mix(a, b, c)
 
     def unit(word: UInt32[Array, ""]) -> Float[Array, ""]:
-        # 24 bits are what float32 holds exactly; rounding up to 1 is so ruled out
+        # float32 holds 24 bits exactly, which rules out rounding up to 1
         return (word >> np.uint32(8)).astype(dtype) * (2.0**-24)
 
     return unit(a), unit(b), unit(c)
@@ -67,20 +67,20 @@ def hashed_uniforms_4(
     Source: pcg4d of Jarzynski and Olano, as above.
     """
     a, b, c, d = (key * np.uint32(1664525) + np.uint32(1013904223) for key in (a, b, c, d))
-    a, b, c, d = _stir_4(a, b, c, d)
+    a, b, c, d = _mix_4(a, b, c, d)
     a, b, c, d = (word ^ (word >> np.uint32(16)) for word in (a, b, c, d))
-    a, b, c, d = ((word >> np.uint32(8)).astype(jnp.float32) * (2.0**-24) for word in _stir_4(a, b, c, d))
+    a, b, c, d = ((word >> np.uint32(8)).astype(jnp.float32) * (2.0**-24) for word in _mix_4(a, b, c, d))
     return a, b, c, d
 
 
-def _stir(a, b, c):
+def _mix(a, b, c):
     a = a + b * c
     b = b + c * a
     c = c + a * b
     return a, b, c
 
 
-def _stir_4(a, b, c, d):
+def _mix_4(a, b, c, d):
     a = a + b * d
     b = b + c * a
     c = c + a * b
@@ -90,28 +90,28 @@ def _stir_4(a, b, c, d):
 
 @cache
 def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
-    """Ranks 0 … side² - 1 on a torus, neighbours far apart in rank: void and cluster (Ulichney 1993).
+    """Ranks 0 … side² - 1 on a torus, with neighbours far apart in rank: void and cluster (Ulichney 1993).
 
-    Each rank goes to the emptiest place, that farthest, in the sense of a Gaussian of `sigma` pixels, from
-    those taken so far; the pattern to begin with is evened out by moving its tightest point into its
+    Each rank goes to the largest void: the pixel farthest, in the sense of a Gaussian of `sigma` pixels, from
+    those taken so far. The initial pattern is evened out by moving the point in its tightest cluster into its
     largest void until it stays there.
     """
     distance = np.minimum(np.arange(side), side - np.arange(side))
     bell = np.exp(-(distance**2) / (2 * sigma**2)).astype(np.float32)
     kernel = np.tile(np.outer(bell, bell), (2, 2))
     taken = np.zeros((side, side), bool)
-    crowd = np.zeros((side, side), np.float32)
+    density = np.zeros((side, side), np.float32)
 
     def put(place: int, sign: int) -> None:
         y, x = divmod(place, side)
         taken[y, x] = sign > 0
-        crowd[...] += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
+        density[...] += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
 
     def largest_void() -> int:
-        return int(np.where(taken, np.inf, crowd).argmin())
+        return int(np.where(taken, np.inf, density).argmin())
 
     def tightest_cluster() -> int:
-        return int(np.where(taken, crowd, -np.inf).argmax())
+        return int(np.where(taken, density, -np.inf).argmax())
 
     first = side * side // 10
     for place in np.random.default_rng(0).permutation(side * side)[:first]:
@@ -124,14 +124,14 @@ def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
         if void == moved:
             break
 
-    # from this pattern down to none the tightest go first; from it up to all, the largest voids are filled
-    start = taken.copy(), crowd.copy()
+    # ranks below `first`: remove points from the tightest clusters; ranks above: fill the largest voids
+    start = taken.copy(), density.copy()
     order = []
     for _ in range(first):
         order.append(tightest_cluster())
         put(order[-1], -1)
     order.reverse()
-    taken[...], crowd[...] = start
+    taken[...], density[...] = start
     for _ in range(first, side * side):
         order.append(largest_void())
         put(order[-1], 1)
@@ -141,7 +141,7 @@ def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
 
 
 def blue_tile() -> Float[Array, "side side"]:
-    """Numbers in (0, 1), each as often as any other, low frequencies suppressed, on a torus."""
+    """Blue noise on a torus: numbers in (0, 1), each equally often, with low frequencies suppressed."""
     ranks = _blue_ranks()
     with jax.ensure_compile_time_eval():
         return jnp.asarray((ranks + 0.5) / ranks.size, jnp.float32)

@@ -1,4 +1,4 @@
-"""Which arrays are in a NumPy file? Read without numpy's own loader, which would take memory on trust."""
+"""Reads NumPy files without NumPy's own loader, which allocates memory as an unchecked header says."""
 
 import math
 import zipfile
@@ -11,15 +11,15 @@ from .files import CORRUPT, MOST_VOXELS, Header, Stream, as_array, check_size, d
 
 
 def read_npy(path: Path, header: Header) -> dict[str, Any]:
-    """Reader of `.npy`: one array, which is the data."""
+    """Reader for `.npy`: one array, the data."""
     header.refuse(path)
-    held = file_size(path)
+    size = file_size(path)
     with decoding(path), path.open("rb") as stream:
-        return {"data": _npy_array(path, stream, held)}
+        return {"data": _npy_array(path, stream, size)}
 
 
 def read_npz(path: Path, header: Header) -> dict[str, Any]:
-    """Reader of `.npz`: arrays named as the arguments of `Volume`, or one array of any name."""
+    """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
     header.refuse(path)
     file_size(path)
     with decoding(path), zipfile.ZipFile(path) as archive:
@@ -37,7 +37,7 @@ def read_npz(path: Path, header: Header) -> dict[str, Any]:
 
 
 def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The arrays of these names from an `.npz` file. **Raises** `ValueError` where one is missing."""
+    """The arrays of these names from an `.npz` file. **Raises** `ValueError` if one is missing."""
     file_size(path)
     with decoding(path), zipfile.ZipFile(path) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
@@ -51,20 +51,20 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 def _arrays(
     path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]
 ) -> dict[str, np.ndarray]:
-    found = {}
+    arrays = {}
     for name, member in members.items():
         with archive.open(member) as stream:
-            found[name] = _npy_array(path, stream, member.file_size)
-    return found
+            arrays[name] = _npy_array(path, stream, member.file_size)
+    return arrays
 
 
-def _npy_array(path: Path, stream: Stream, held: int) -> np.ndarray:
+def _npy_array(path: Path, stream: Stream, size: int) -> np.ndarray:
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, fortran, dtype = readers[np.lib.format.read_magic(stream)](stream)
     except CORRUPT:
         raise
-    except Exception as fault:  # what numpy raises depends on how the header is broken
+    except Exception as fault:  # NumPy raises different errors for different faults
         raise ValueError(f"path: {path} has no valid .npy header ({fault!r}).") from fault
     if dtype.kind not in "biuf":
         raise ValueError(
@@ -74,5 +74,5 @@ def _npy_array(path: Path, stream: Stream, held: int) -> np.ndarray:
     if not 0 < math.prod(shape) <= MOST_VOXELS or min(shape, default=1) < 0:
         raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
     expected = math.prod(shape) * dtype.itemsize
-    check_size(path, held - stream.tell(), expected)
+    check_size(path, size - stream.tell(), expected)
     return as_array(read_all(path, stream, expected), shape, dtype, "F" if fortran else "C")

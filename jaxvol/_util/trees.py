@@ -1,4 +1,4 @@
-"""What has a gradient in a tree, and how are gradients of trees added up?"""
+"""Differentiable leaves of trees, and sums of trees."""
 
 import equinox as eqx
 import jax
@@ -7,10 +7,10 @@ from jaxtyping import PyTree
 
 
 def floats(tree: PyTree) -> PyTree:
-    """What of it can have a gradient."""
+    """The leaves that can have a gradient; None in place of the others."""
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
 def added(a: PyTree, b: PyTree) -> PyTree:
-    """Leaf by leaf."""
+    """Sum of two trees, leaf by leaf."""
     return jax.tree.map(jnp.add, a, b)

@@ -1,9 +1,9 @@
-"""How are the three components of a point kept? Apart, as a tuple of three scalars.
+"""Points and directions as tuples of three scalars.
 
 Batched over rays, three arrays of length n run 3 to 5 times faster in a loop than one of shape
-(n, 3), whose components XLA must pick out and put together again at every step. Functions of a
-single point or direction on the march's path therefore take and give triples; what a user holds
-(a camera's position, an image) is stacked.
+(n, 3), whose components XLA must extract and recombine at every step. Functions of a single point
+or direction on the march's path therefore take and return triples; what a user holds (a camera's
+position, an image) is stacked.
 """
 
 from typing import TypeAlias
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 
 Scalar: TypeAlias = Float[Array, "..."]
-"""A number: one ray's, or each one's of a batch, for all that is done to it is done to each apart."""
+"""A number per ray, for one ray or a batch: all operations on it are elementwise."""
 
 Vec3: TypeAlias = tuple[Scalar, Scalar, Scalar]
 

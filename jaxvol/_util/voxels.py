@@ -1,4 +1,4 @@
-"""Which arrays can be voxels, and which labels?"""
+"""Checks arrays of voxels and labels, and converts them to supported types."""
 
 import os
 
@@ -19,7 +19,7 @@ WHOLE = {
     "int16": (-(2**15), 2**15 - 1),
     "float32": (-(2**24), 2**24),
 }
-"""The whole numbers that a type holds exactly, from the smallest type on."""
+"""The range of integers that each type holds exactly, smallest type first."""
 
 
 def voxel_array(data: Arrayable) -> Array:
@@ -36,40 +36,40 @@ def voxel_array(data: Arrayable) -> Array:
     if str(data.dtype) not in (*DTYPES, "float64"):
         raise ValueError(
             f"data must be of type {', '.join(DTYPES)}; got {data.dtype}. Convert it, for example with "
-            "data.astype(np.float32), where that keeps the values apart."
+            "data.astype(np.float32), if that keeps the values distinct."
         )
     if data.dtype.kind in "ui":
         return jnp.asarray(data)
     if is_traced(data):
         message = "data must be finite; got some voxels that are NaN or infinite. Replace them first."
         return require(jnp.asarray(data), finite, message)
-    kept = np.asarray(data)
-    if kept.dtype == np.float64:
-        with np.errstate(over="ignore"):  # what becomes infinite is refused below
-            kept = kept.astype(jnp.result_type(float))
-    if not np.all(finite(kept)):
-        beyond = f" in {kept.dtype}, as which they are kept" if np.all(finite(np.asarray(data))) else ""
+    stored = np.asarray(data)
+    if stored.dtype == np.float64:
+        with np.errstate(over="ignore"):  # overflow to infinity is rejected below
+            stored = stored.astype(jnp.result_type(float))
+    if not np.all(finite(stored)):
+        beyond = f" in {stored.dtype}, as they are stored" if np.all(finite(np.asarray(data))) else ""
         raise ValueError(
-            f"data must be finite{beyond}; got {np.sum(~finite(kept))} of {kept.size} voxels that are NaN or "
-            "infinite. Replace them, or rescale all, first."
+            f"data must be finite{beyond}; got {np.sum(~finite(stored))} of {stored.size} voxels that are "
+            "NaN or infinite. Replace them, or rescale all, first."
         )
-    return jnp.asarray(kept if kept.dtype != data.dtype else data)
+    return jnp.asarray(stored if stored.dtype != data.dtype else data)
 
 
 def _narrow(data: Array | np.ndarray) -> np.ndarray:
-    """The same whole numbers in the smallest type that voxels may have."""
+    """The same integers in the smallest type that voxels may have."""
     if is_traced(data):
         raise ValueError(
-            f"data must be of type {', '.join(DTYPES)} where they are traced; got {data.dtype}, whose range "
-            "is not known before the program runs. Convert them: data.astype(jnp.float32)."
+            f"data must be of type {', '.join(DTYPES)} if traced; got {data.dtype}, whose range is not "
+            "known before the program runs. Convert them: data.astype(jnp.float32)."
         )
     low, high = int(data.min()), int(data.max())
     for dtype, (least, most) in WHOLE.items():
         if least <= low and high <= most:
             return np.asarray(data).astype(dtype)
     raise ValueError(
-        f"data must be whole numbers from -2**24 to 2**24, which float32 keeps apart; got {data.dtype} from "
-        f"{low} to {high}. Subtract an offset, or rescale them to data.astype(np.float32)."
+        "data must be whole numbers from -2**24 to 2**24, which float32 holds exactly; got "
+        f"{data.dtype} from {low} to {high}. Subtract an offset, or rescale them to data.astype(np.float32)."
     )
 
 
@@ -80,7 +80,7 @@ def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
             f"labels must be integers; got {labels.dtype}. Convert them: labels.astype(np.int32)."
         )
     if labels.shape != shape:
-        raise ValueError(f"labels must stand on the grid of data, shape {shape}; got shape {labels.shape}.")
+        raise ValueError(f"labels must have the shape of data, {shape}; got shape {labels.shape}.")
     if labels.dtype.kind == "b":
         return jnp.asarray(labels, jnp.uint8)
     if labels.dtype.itemsize < 4 or labels.dtype == np.int32 or is_traced(labels):
@@ -88,14 +88,14 @@ def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
     low, high = int(labels.min()), int(labels.max())
     if low < -(2**31) or high >= 2**31:
         raise ValueError(
-            f"labels must lie within int32; got {labels.dtype} from {low} to {high}. Number them anew: "
+            f"labels must lie within int32; got {labels.dtype} from {low} to {high}. Renumber them: "
             "np.unique(labels, return_inverse=True)."
         )
     return jnp.asarray(np.asarray(labels).astype(np.int32))
 
 
 def _array(name: str, value: Arrayable) -> Array | np.ndarray:
-    """An array of JAX or, in native byte order, of NumPy."""
+    """`value` as a JAX array or, in native byte order, a NumPy array."""
     if isinstance(value, str | os.PathLike):
         raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
     if is_traced(value) or isinstance(value, jax.Array):

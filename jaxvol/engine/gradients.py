@@ -1,6 +1,7 @@
-"""What does every part of a scene get of an image's gradient?
+"""Vector–Jacobian product of `render`.
 
-Rays are made and marched once more, wave by wave. What each of their samples gets is `replay`'s business.
+Rays are made and marched once more, tile by tile; `replay` pulls their samples back, and JAX the making of
+rays.
 """
 
 from collections.abc import Callable
@@ -15,63 +16,92 @@ from .._util.sharding import varying
 from .._util.trees import added, floats
 from ..lighting.shading import Surroundings
 from ..reference import has_fault
-from ..rendering import AbstractDepthPicture, AbstractPicture
+from ..rendering import Rendering
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import Scene, VolumeAcceleration, empty_space_of
+from .batch import Beams, CellRange
+from .image import RenderOptions
 from .packing import with_words
 from .replay import Cotangents, Replay, Total
 from .shading_gradient import Lit
 from .tiles import RayTiles
-from .wavefront import Beams, CellRange, march_rays
+from .wavefront import march_rays
 
 
 def render_vjp(
     scene: Scene,
     perturbed: Any,
-    known: VolumeAcceleration,
-    rendering: AbstractPicture,
-    spans: CellRange | None,
-    gradient: AbstractPicture,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    residuals: tuple[Rendering, CellRange | None],
+    cotangent: Any,
 ) -> Any:
-    """Vector–Jacobian product of `render`: a cotangent for each perturbed leaf of the scene."""
+    """Vector–Jacobian product of `render`: a cotangent for each perturbed leaf of the scene.
+
+    `residuals`: the image, and the visible cells of its rays where they were recorded. `cotangent`: of the
+    image, None for what the loss does not use. A loss that uses a pixel that is NaN has the gradient NaN."""
+    rendering, ranges = residuals
+    whole = jax.tree.map(
+        lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
+        *(rendering, cotangent),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    found = eqx.filter(_pulled(scene, perturbed, options, acceleration, rendering, ranges, whole), perturbed)
+    # rays that are NaN are not marched, and would leave a gradient of 0
+    floats_of = (jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)) for tree in (rendering, whole))
+    lost = [jnp.any(jnp.isnan(leaf) & (part != 0)) for leaf, part in zip(*floats_of, strict=True)]
+    fault = jnp.any(jnp.stack(lost))
+    return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
+
+
+def _pulled(
+    scene: Scene,
+    perturbed: Any,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    rendering: Rendering,
+    ranges: CellRange | None,
+    cotangent: Rendering,
+) -> Any:
+    """The cotangents of a scene's parts, tile by tile."""
     volume, transfer, source, march, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
     places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
-    packed = with_words(volume, known.words)
-    waves, index = RayTiles.of(source), empty_space_of(scene, known)
-    if index is not None and spans is not None:
+    packed, tiling = with_words(volume, acceleration.words), options.tiling
+    tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
+    if index is not None and ranges is not None:
         index = index.within_ranges()
     seen, fault = transfer.over(packed), has_fault(volume, transfer, march, lighting)
     light, pull_light = None, None
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
 
-    def wave(
-        sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, AbstractPicture, AbstractPicture]
-    ) -> Any:
-        (total, of_source), (number, span, rendering, gradient) = sums, given
+    def tile(
+        sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, Rendering, Rendering]
+    ) -> tuple[tuple[Total, PyTree], None]:
+        (total, of_source), (number, range_, rendering, cotangent) = sums, given
 
         def made(moving: PyTree) -> Ray:
             volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
             space = march_.locate(with_voxels(volume_, volume.data))
-            return invalid(waves.rays(source_, space, number), fault)
+            return invalid(tiles.rays(source_, space, number), fault)
 
         moving = floats((without_voxels(volume), source, march))
         rays, pull = eqx.filter_vjp(made, moving)
         replay = Replay(
-            (volume, known.words, transfer, march),
+            (volume, acceleration.words, transfer, march),
             seen,
-            *(rays, Cotangents.of(rays, rendering, gradient), total, light),
+            *(rays, Cotangents.of(rays, rendering, cotangent), total, light, tiling),
             places=places,
         )
-        beams = Beams(rays, waves.beams, waves.box(source, rays, number), span)
-        _, (_, of_rays, total) = march_rays(march, packed, seen, index, beams, None, replay)
+        beams = Beams(rays, tiles.beams, tiles.box(source, rays, number), range_)
+        _, (_, of_rays, total) = march_rays(march, packed, seen, index, beams, tiling, None, replay)
         if not places:
             return (total, of_source), None
-        if isinstance(gradient, AbstractDepthPicture):
-            # a depth counts from the ray's origin, a sample's from the entry
-            toward = jnp.where(rendering.rgba[..., 3] > 0, gradient.depth, 0)
+        if cotangent.details.depth is not None:
+            # depth is measured from the ray's origin, and a sample's from the entry
+            toward = jnp.where(rendering.rgba[..., 3] > 0, cotangent.depth, 0)
             of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
         of_volume, of_rays_source, of_march = pull(of_rays)[0]
         total = eqx.tree_at(
@@ -85,9 +115,9 @@ def render_vjp(
         Total.zeros(volume, transfer, march, light, voxels=of_voxels),
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
-    image = jax.tree.map(waves.apart, (rendering, gradient))
+    image = jax.tree.map(tiles.apart, (rendering, cotangent))
     (total, of_source), _ = jax.lax.scan(
-        wave, varying(start, image), (jnp.arange(waves.number), spans, *image)
+        tile, varying(start, image), (jnp.arange(tiles.number), ranges, *image)
     )
     of_volume = total.volume
     if total.voxels is not None:
@@ -106,15 +136,15 @@ def render_vjp(
 
 
 def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable[[PyTree], Any]]:
-    """By what an image is lit; and what volume, transfer function, march and lighting get of the gradient of
-    that."""
+    """What shades an image; and the pull-back of its leaves to volume, transfer function, march and
+    lighting."""
     volume, transfer, _, march, lighting = scene
     parts = volume if voxels else without_voxels(volume), transfer, march, lighting
     moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
 
     def made(moving: PyTree) -> tuple[PyTree, Lit]:
         moved, transfer, march, lighting = eqx.combine(moving, fixed)
-        # the packed copy is for fetching alone
+        # the packed copy serves fetching only
         whole = moved if voxels else with_voxels(moved, volume.data)
         around = Surroundings(whole, transfer, march.locate(whole))
         light = Lit(lighting.over(around), around)

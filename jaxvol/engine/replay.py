@@ -1,21 +1,21 @@
-"""What does a loss see of each sample? A second march, front to back, that computes the samples again.
+"""Vector–Jacobian product of a march: a second march, front to back, computes the samples again.
 
-Say the loss changes by c̄, ā and d̄ with a ray's colour C, opacity A and depth D = t_in + Σ w s / A, in which
-sample k has weight w_k, colour c_k and depth s_k past the entry. Then each unit of its weight is worth
+Let c̄, ā and d̄ be the cotangents of a ray's colour C, opacity A and depth D = t_in + Σ w s / A, where sample
+k has weight w_k, colour c_k and depth s_k past the entry. Then a unit of its weight is worth
 
     q_k = c̄ · c_k + ā + (d̄ / A) (s_k - (D - t_in))
 
-and, with T_k the transmittance behind sample k and τ_k its optical depth (extinction times width),
+to the loss and, with T_k the transmittance behind sample k and τ_k its optical depth (extinction × width),
 
     ∂L/∂τ_k = T_k q_k - Σ_{j>k} w_j q_j        ∂L/∂c_k = w_k c̄        ∂L/∂s_k = w_k d̄ / A
 
-The sum over what lies behind is what the sums in front leave of Σ w_j q_j = c̄ · C + ā A, which the image
-tells, so nothing need be kept from the first march, and nothing is divided by a transmittance, which may
-be 0. What the optical depths, colours and depths owe to the transfer function, the voxels, the ray and the
-step is left to JAX, a segment at a time.
+The sum over j > k is Σ w_j q_j = c̄ · C + ā A, known from the image, minus the sum over j ≤ k. So nothing is
+kept from the first march, and nothing is divided by a transmittance, which may be 0. JAX pulls optical
+depths, colours and depths back to the transfer function, the voxels, the ray and the step, one segment at a
+time.
 
-Where rays leap over what cannot be seen, the first march also watches between which cells each ray sees
-anything, and the second one leaps over the rest: two fifths of a head's samples.
+Where rays leap over empty space, the first march records each ray's first and last visible cell, and the
+second one leaps over all cells outside of these: two fifths of the head's samples.
 """
 
 from typing import Any, NamedTuple
@@ -31,19 +31,21 @@ from .._util.vec3 import Scalar, Vec3, along
 from ..compositing import pull_over
 from ..march import March
 from ..reference import Progress, contained, front, pieces
-from ..rendering import AbstractDepthPicture, AbstractPicture
+from ..rendering import Rendering
 from ..space import Ray
 from ..transfer import Classification, Transfer
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
+from .batch import CellRange
 from .packing import with_words
-from .shading import Weighed, weighed
+from .segment import Samples, SampleVisitor, vmap_cells
+from .shading import Weights, weights_of
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
-from .wavefront import CELLS, CellRange, Samples, SampleVisitor, vmap_cells
+from .tiling import Tiling
 
 
 class VisibleRangeRecorder(SampleVisitor):
-    """Records the first and the last visible cell of each ray of a march, over rays of this shape. A ray
-    without any has `until` = 0, and a `first` that is none of its cells."""
+    """Records each ray's first and last visible cell, over rays of this shape. A ray without any has
+    `until` = 0, and a `first` that is not one of its cells."""
 
     given = sums = total = None
 
@@ -52,10 +54,11 @@ class VisibleRangeRecorder(SampleVisitor):
             jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32)
         )
 
-    def follow(
+    def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: None, kept: CellRange, total: None
     ) -> tuple[CellRange, None, None]:
-        cells = at.index[None] + jnp.arange(CELLS, dtype=at.index.dtype)[:, None]
+        count = samples.opacity[0].shape[0]
+        cells = at.index[None] + jnp.arange(count, dtype=at.index.dtype)[:, None]
         seen = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
         first = jnp.min(jnp.where(seen, cells, kept.first[None]), axis=0)
         until = jnp.max(jnp.where(seen, cells + 1, kept.until[None]), axis=0)
@@ -63,8 +66,8 @@ class VisibleRangeRecorder(SampleVisitor):
 
 
 class Cotangents(NamedTuple):
-    """What the loss makes of each ray: how it changes with colour, opacity, and a unit of weight at a depth
-    from `middle` on, where depth was asked for; and what all the ray's samples are worth."""
+    """Of each ray, the cotangents of colour and opacity; `worth`, what all its samples are worth to the loss;
+    and, where the loss depends on depth, what a unit of weight gains for each unit of depth past `middle`."""
 
     color: Vec3
     opacity: Scalar
@@ -73,11 +76,11 @@ class Cotangents(NamedTuple):
     middle: Scalar | None = None
 
     @classmethod
-    def of(cls, ray: Ray, rendering: AbstractPicture, gradient: AbstractPicture) -> "Cotangents":
-        """For rays (groups, rays in a group) and their part of the image, and of its gradient."""
+    def of(cls, ray: Ray, rendering: Rendering, gradient: Rendering) -> "Cotangents":
+        """Of rays (groups, rays in a group), from their part of the image and of its cotangent."""
         red, green, blue, opacity = (gradient.rgba[..., i] for i in range(4))
         worth = jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
-        if not (isinstance(rendering, AbstractDepthPicture) and isinstance(gradient, AbstractDepthPicture)):
+        if gradient.details.depth is None:
             return cls((red, green, blue), opacity, worth)
         seen = rendering.rgba[..., 3] > 0
         middle = jnp.where(seen, rendering.depth - ray.t_in, 0)
@@ -86,40 +89,41 @@ class Cotangents(NamedTuple):
 
 
 class Total(eqx.Module):
-    """Gradients that all rays add to; None for what is not asked for."""
+    """Gradients summed over all rays; None for what is not asked for."""
 
     transfer: PyTree
     march: PyTree
     volume: PyTree
-    """Of all but the voxels."""
+    """Of everything in it but the voxels."""
     voxels: Float[Array, " voxels"] | None
     light: PyTree
-    """Of its shading, and the space in which it looks around."""
+    """Of `Lit.leaves`."""
 
     @classmethod
     def zeros(
         cls, volume: Volume, transfer: Transfer, march: March, light: Lit | None, *, voxels: bool
     ) -> "Total":
-        """None yet."""
+        """Zeros for these parts."""
         lit = None if light is None else light.leaves
         parts = transfer, march, without_voxels(volume), lit
         transfer, march, volume_, lit = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
         sums = None
         if voxels:
-            # many small parts are added up, which 16 bits would lose
+            # many small parts are summed, which 16 bits would lose
             dtype = volume.data.dtype
             sums = jnp.zeros(volume.data.size, dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32)
         return cls(transfer, march, volume_, sums, lit)
 
 
 class Replay(SampleVisitor):
-    """The second march over rays (groups, rays in a group).
+    """Pulls the samples of rays (groups, rays in a group) back.
 
     **Arguments:**
 
     - `scene`: volume, the packed copy of its voxels, transfer function and march.
+    - `given`: cotangents of the rays.
     - `total`: to be added to.
-    - `light`: by what the samples are lit.
+    - `light`: what shades the samples.
     - `places`: whether the gradient of anything but the transfer function is asked for.
     """
 
@@ -131,51 +135,55 @@ class Replay(SampleVisitor):
         given: Cotangents,
         total: Total,
         light: Lit | None,
+        tiling: Tiling,
         *,
         places: bool,
     ):
         self.volume, self.words, self.transfer, self.march = scene
         self.seen, self.places, self.light = seen, places, light
-        self.given, self.total = given, total
-        self.kept = jnp.zeros_like(given.worth)  # of the samples in front
+        self.given, self.total, self.tiling = given, total, tiling
+        self.kept = jnp.zeros_like(given.worth)  # what the samples in front are worth
         self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if places else None
 
-    def follow(
+    def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, kept: Scalar, total: Total
     ) -> tuple[Scalar, PyTree, Total]:
-        each = jax.tree.map(lambda leaf: leaf[None], given)  # for all cells of a ray
+        each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
         red, green, blue = each.color
         classify = vmap_cells(self.seen.classify)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.march.sample(cell) for cell in samples.cells]
-        known = weighed(self.march, at, samples.opacity)
-        wanted = [(weight * red, weight * green, weight * blue) for weight in known.weight]
+        weights = weights_of(self.march, at, samples.opacity)
+        of_color = [(weight * red, weight * green, weight * blue) for weight in weights.weight]
         lit: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
         if self.light is not None:
             sums = LightTotal(total.light, total.transfer, total.voxels)
-            lit, sums = shading_vjp(self.light, self.seen, self.march, ray, samples, known, wanted, sums)
+            lit, sums = shading_vjp(
+                *(self.light, self.seen, self.march, ray, samples, weights, of_color),
+                *(self.tiling.chunk, sums),
+            )
             total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
-            colors, wanted = [part.color for part in lit], [part.of_color for part in lit]
+            colors, of_color = [part.color for part in lit], [part.of_color for part in lit]
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [
                 value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
             ]
         inside = vmap_cells(contained, of_cells=(False, True))
-        kept, slopes = _slopes(known, worth, given.worth, kept)
+        kept, slopes = _slopes(weights, worth, given.worth, kept)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if lit is None else lit[i].of_extinction)
-            of_transfer, pulled = self.transfer.pull(measured, wanted[i], of_extinction)
+            of_transfer, pulled = self.transfer.pull(measured, of_color[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
             of_measured.append(pulled if lit is None else added(pulled, lit[i].of_measured))
         if not self.places:
             return kept, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
-        of_depth = [None if each.depth is None else weight * each.depth for weight in known.weight]
+        of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
         of_march, of_volume, of_rays, asked, of_voxels = self._placed(
             ray, at, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
@@ -184,10 +192,10 @@ class Replay(SampleVisitor):
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return kept, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
-    def _placed(self, ray: Ray, at: Progress, wanted: list[tuple[PyTree, Scalar, Any, Any]]) -> tuple:
-        """What march, volume and rays get of what is wanted of each piece's measured values and width, its
-        depth where that counts, and its point where it is lit; then the voxels that were asked for, and what
-        they get. Which samples a ray has is taken as it is."""
+    def _placed(self, ray: Ray, at: Progress, cotangents: list[tuple[PyTree, Scalar, Any, Any]]) -> tuple:
+        """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
+        its depth where the loss depends on that, and of its point where it is shaded; then the voxels that
+        were fetched, and their cotangents. The number of samples counts as constant."""
         voxels = self.total.voxels is not None
         march, march_rest = eqx.partition(self.march, eqx.is_inexact_array)
         volume, volume_rest = eqx.partition(without_voxels(self.volume), eqx.is_inexact_array)
@@ -209,7 +217,7 @@ class Replay(SampleVisitor):
                 found.append((floats(measured), piece.width, asked, point))
             return found, record.asked
 
-        ahead = jnp.arange(CELLS, dtype=at.index.dtype)
+        ahead = jnp.arange(self.tiling.cells, dtype=at.index.dtype)
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))
         cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
 
@@ -228,16 +236,18 @@ class Replay(SampleVisitor):
                 )
             taps = [jnp.zeros(place.shape, self.volume.data.dtype) for place in asked]
         _, pull, asked = jax.vjp(all_, march, volume, ray_floats, taps, has_aux=True)
-        of_march, of_volume, of_ray, of_taps = pull(wanted)
+        of_march, of_volume, of_ray, of_taps = pull(cotangents)
         return of_march, of_volume, of_ray, asked, of_taps
 
 
-def _slopes(known: Weighed, worth: list[Scalar], whole: Scalar, front: Scalar) -> tuple[Scalar, list[Scalar]]:
-    """What the samples so far are worth, and how the loss changes with each one's optical depth."""
+def _slopes(
+    weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar
+) -> tuple[Scalar, list[Scalar]]:
+    """What all samples so far are worth, and the derivative of the loss by each one's optical depth."""
     slopes: list[list[Scalar]] = [[] for _ in worth]
-    for k in range(CELLS):
+    for k in range(worth[0].shape[0]):
         for i, value in enumerate(worth):
-            front = front + known.weight[i][k] * value[k]
-            slope = pull_over(value[k], known.behind[i][k], whole - front)
-            slopes[i].append(jnp.where(known.finished[i][k], 0, slope))
+            front = front + weights.weight[i][k] * value[k]
+            slope = pull_over(value[k], weights.behind[i][k], whole - front)
+            slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
     return front, [jnp.stack(each) for each in slopes]

@@ -1,27 +1,27 @@
-"""Which samples are seen, and worth lighting? Few of those that are taken; they are put together and lit.
+"""Gathers the samples of positive weight, or the visible pixels, and shades them in chunks.
 
-To light a sample costs many times as much as to take it. So those of a segment whose weight is positive
-are gathered from all its rays, and lit so many at a time.
+Shading a sample costs many times as much as fetching it, and few samples are visible.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from .._util.compaction import Chosen
+from .._util.compaction import CHUNK, Chosen, in_front
 from .._util.vec3 import Scalar, Vec3, along
-from ..lighting.shading import Sample
+from ..lighting.shading import Lighting, Sample
 from ..march import Cell, March
 from ..reference import Progress
-from ..space import Ray
+from ..space import Line, Ray, Space
 from ..transfer import Classification, Measured
 
 
-class Weighed(NamedTuple):
-    """What each of some samples, arrays (cells, rays), adds to its ray's opacity; the transmittance in front
-    of it, and behind it; and whether the ray was finished before."""
+class Weights(NamedTuple):
+    """Of samples, arrays (cells, rays), one for each piece of a cell: what each adds to its ray's opacity,
+    the transmittance in front of it and behind it, and whether the ray was finished before."""
 
     weight: list[Scalar]
     front: list[Scalar]
@@ -29,8 +29,8 @@ class Weighed(NamedTuple):
     finished: list[Bool[Array, "cells rays"]]
 
 
-def weighed(march: March, at: Progress, alphas: list[Scalar]) -> Weighed:
-    """The weights of cells that come after each other, from the opacity of each of their pieces."""
+def weights_of(march: March, at: Progress, alphas: list[Scalar]) -> Weights:
+    """The weights of consecutive cells, from the opacities of their pieces."""
     seen, finished = at.seen, at.finished
     found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
@@ -40,12 +40,12 @@ def weighed(march: March, at: Progress, alphas: list[Scalar]) -> Weighed:
             found[i].append((weight, before, seen.transmittance, finished))
         finished |= jax.vmap(march.stop)(seen.transmittance)
     each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
-    return Weighed(*(list(parts) for parts in zip(*each, strict=True)))
+    return Weights(*(list(parts) for parts in zip(*each, strict=True)))
 
 
-def visible(known: Weighed) -> Chosen:
-    """The samples that add anything."""
-    return Chosen.of([weight > 0 for weight in known.weight])
+def visible(weights: Weights, chunk: int) -> Chosen:
+    """The samples of positive weight."""
+    return Chosen.of([weight > 0 for weight in weights.weight], chunk)
 
 
 def samples_of(
@@ -56,14 +56,14 @@ def samples_of(
     ray: Ray,
     cells: list[Cell],
     measured: list[Measured],
-    known: Weighed,
+    weights: Weights,
 ) -> Sample:
     """The samples at these places of a segment."""
     entry, direction, pixel = jax.tree.map(
         lambda leaf: leaf.at[places % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
     )
     depths = [march.sample(cell) for cell in cells]
-    depth, read, front = chosen.take(list(zip(depths, measured, known.front, strict=True)), places)
+    depth, read, front = chosen.take(list(zip(depths, measured, weights.front, strict=True)), places)
     color, extinction = jax.vmap(seen.classify)(read)
     return Sample(along(entry, direction, depth), direction, read, color, extinction, front, pixel)
 
@@ -71,20 +71,53 @@ def samples_of(
 def shaded_colors(
     seen: Classification,
     march: March,
+    chunk: int,
     ray: Ray,
     at: Progress,
     cells: list[Cell],
     measured: list[Measured],
     alphas: list[Scalar],
 ) -> list[Vec3]:
-    """Colours of a segment's samples as lit; 0 for those that are not seen."""
-    known, light = weighed(march, at, alphas), seen.light
-    chosen = visible(known)
+    """Shaded colours of a segment's samples; 0 for invisible ones."""
+    weights, light = weights_of(march, at, alphas), seen.light
+    chosen = visible(weights, chunk)
     assert light is not None
 
     def one(places: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        samples = samples_of(chosen, places, seen, march, ray, cells, measured, known)
+        samples = samples_of(chosen, places, seen, march, ray, cells, measured, weights)
         return chosen.put(colors, places, jax.vmap(light)(samples))
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
     return chosen.apart(chosen.over(one, (none, none, none)), len(alphas))
+
+
+def shade_pixels(
+    lighting: Lighting,
+    seen: Classification,
+    space: Space,
+    line: Callable[[Int[Array, ""]], Line],
+    rgba: Float[Array, "*rays 4"],
+    depth: Float[Array, "*rays"],
+) -> Float[Array, "*rays 4"]:
+    """`Lighting.shade_pixel` for many rays, by chunks of those that are not transparent. `line`: the ray of
+    an index into the flattened image."""
+    flat, depth = rgba.reshape(-1, 4), depth.reshape(-1)
+    visible = flat[:, 3] != 0
+    place, last = in_front(visible), jnp.maximum(jnp.sum(visible, dtype=jnp.int32) - 1, 0)
+
+    # recomputed in the backward pass, where its states would take memory for all rays
+    @jax.checkpoint
+    def shaded(places: Int[Array, " chunk"]) -> Float[Array, "chunk 4"]:
+        # beyond the last visible one that one again, since nothing can be shaded at an infinite depth
+        places = jnp.where(places < visible.size, places, place[last])
+        one = jax.vmap(lambda place, *ray: lighting.shade_pixel(seen, space, line(place), *ray))
+        return one(places, flat[places], depth[places])
+
+    def chunk(number: Int[Array, ""]) -> Float[Array, "chunk 4"]:
+        places = jax.lax.dynamic_slice_in_dim(place, number * CHUNK, CHUNK)
+        return jax.lax.cond(
+            number * CHUNK <= last, shaded, lambda _: jnp.zeros((CHUNK, 4), flat.dtype), places
+        )
+
+    found = jax.lax.map(chunk, jnp.arange(place.size // CHUNK, dtype=jnp.int32)).reshape(-1, 4)
+    return jnp.zeros_like(flat).at[place].set(found, mode="drop").reshape(rgba.shape)

@@ -1,6 +1,6 @@
-"""What does a loss see of the light? Each visible sample is lit again, with the derivatives of that.
+"""Vector–Jacobian product of shading: each visible sample is shaded again, and pulled back.
 
-The counterpart of `visible.shaded_colors` in the second march.
+The counterpart of `shading.shaded_colors` in the second march.
 """
 
 from typing import Any, NamedTuple
@@ -17,24 +17,24 @@ from ..lighting.shading import Shading, Surroundings, lit
 from ..march import March
 from ..space import Ray
 from ..transfer import Classification
-from .shading import Weighed, samples_of, visible
-from .wavefront import Samples
+from .segment import Samples
+from .shading import Weights, samples_of, visible
 
 
 class Lit(NamedTuple):
-    """By what the samples of an image are lit."""
+    """What shades the samples of an image."""
 
     shading: Shading
     around: Surroundings
 
     @property
     def leaves(self) -> PyTree:
-        """What has a gradient, but for the transfer function and the voxels."""
+        """All that has a gradient, except the transfer function and the voxels."""
         return self.shading, self.around.space
 
 
 class LightTotal(NamedTuple):
-    """Gradients that all samples add to: of what lights, of the transfer function, and of the voxels."""
+    """Gradients summed over all samples: of what shades them, of the transfer function, and of the voxels."""
 
     light: PyTree
     transfer: PyTree
@@ -42,8 +42,8 @@ class LightTotal(NamedTuple):
 
 
 class ShadingVjp(NamedTuple):
-    """Samples as lit, arrays (cells, rays); and what their colour, extinction, measured values and world
-    points get of what is wanted of them. 0 for those that are not seen."""
+    """Shaded colours of samples, arrays (cells, rays); and the cotangents of their unshaded colour,
+    extinction, measured values and world points. 0 for invisible samples."""
 
     color: Vec3
     of_color: Vec3
@@ -58,20 +58,22 @@ def shading_vjp(
     march: March,
     ray: Ray,
     samples: Samples,
-    known: Weighed,
-    wanted: list[Vec3],
+    weights: Weights,
+    cotangents: list[Vec3],
+    chunk: int,
     total: LightTotal,
 ) -> tuple[list[ShadingVjp], LightTotal]:
-    """A segment's samples, and the total with what they add to it. `wanted`: of each piece's colour."""
-    chosen, around = visible(known), light.around
-    size = sum(weight.size for weight in known.weight)
+    """Pulls back the shading of a segment's samples, and adds to the total. `cotangents`: of each piece's
+    shaded colour."""
+    chosen, around = visible(weights, chunk), light.around
+    size = sum(weight.size for weight in weights.weight)
     moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
 
     def one(
         places: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
     ) -> tuple[ShadingVjp, LightTotal]:
         found, total = carry
-        some = samples_of(chosen, places, seen, march, ray, samples.cells, samples.measured, known)
+        some = samples_of(chosen, places, seen, march, ray, samples.cells, samples.measured, weights)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
         def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Vec3, Any]:
@@ -86,16 +88,16 @@ def shading_vjp(
             taps = [jnp.zeros(each.shape, around.volume.data.dtype) for each in asked]
         color, pull, asked = jax.vjp(colors, moving, moving_sample, taps, has_aux=True)
         real = places < size
-        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(wanted, places))
+        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, places))
         (of_light, of_transfer), of_sample, of_taps = pull(cotangent)
         voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_taps)
         total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
         return chosen.put(found, places, part), total
 
-    zero = jnp.zeros(size, known.weight[0].dtype)
+    zero = jnp.zeros(size, weights.weight[0].dtype)
     measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))
     zeros = zero, zero, zero
     start = ShadingVjp(zeros, zeros, zero, measured, zeros)
     found, total = chosen.over(one, (start, total))
-    return chosen.apart(found, len(known.weight)), total
+    return chosen.apart(found, len(weights.weight)), total

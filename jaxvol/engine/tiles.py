@@ -1,7 +1,7 @@
-"""In which order are the rays of an image marched? In beams of neighbouring pixels, and waves of beams.
+"""In which order are the rays of an image made? Tile by tile, in beams of neighbouring pixels.
 
-A wave's memory is all that a march holds beside the finished pixels, however large the image. Rays are made
-wave by wave, as arrays (groups, rays in a group); as many groups after each other make up a beam.
+Only one tile's rays are in memory beside the finished pixels, however large the image. They are arrays
+(groups, rays in a group), in which equally many groups in a row make up a beam.
 """
 
 import math
@@ -20,29 +20,19 @@ from .._util.vec3 import Vec3
 from .._util.xla import in_memory
 from ..beams import Box
 from ..camera import Camera
-from ..lighting.deferred import Line
 from ..occupancy import Occupancy
-from ..space import Ray, Space, enter
-from .wavefront import GROUP
+from ..space import Line, Ray, Space, enter
+from .tiling import Tiling
 
-
-SIDE = math.isqrt(GROUP)
-"""Pixels along the side of a group of rays."""
-
-BEAM = 2 * SIDE
-"""Pixels along the side of a beam, which is 2 x 2 groups."""
-
-WAVE = 4096
-"""Beams in a wave: 262 144 rays."""
 
 Lanes = Int[Array, "groups rays"]
 
 
 class OwnRays(eqx.Module):
-    """Rays of one's own: world origins, and unit directions.
+    """Rays given by world origins and unit directions.
 
-    What is random along a ray is keyed by its pixel, (column, row), which without `pixels` is
-    (`first` + place in the flattened array, 0)."""
+    Random numbers along a ray are keyed by its pixel, (column, row); without `pixels` that is
+    (`first` + index in the flattened array, 0)."""
 
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
@@ -50,7 +40,7 @@ class OwnRays(eqx.Module):
     first: Int[Array, ""] | int = 0
 
     def pixel(self, place: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
-        """The pixels of the rays at these places."""
+        """The pixels of the rays at these indices."""
         if self.pixels is None:
             return self.first + place, jnp.zeros_like(place)
         flat = self.pixels.reshape(-1, 2)
@@ -60,101 +50,112 @@ class OwnRays(eqx.Module):
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
-    - `number`: of waves. `beams`: in each wave.
+    - `number`: of tiles. `beams`: in each tile.
     """
 
     number: int = eqx.field(static=True)
     beams: int = eqx.field(static=True)
+    tiling: Tiling = eqx.field(static=True)
 
     @classmethod
-    def of(cls, source: Camera | OwnRays, most_beams: int | None = None) -> "RayTiles":
-        """Those of a camera's pixels, or of one's own rays, with at most so many beams in a wave."""
-        most_beams = WAVE if most_beams is None else most_beams
+    def of(cls, source: Camera | OwnRays, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
+        """The tiles of a camera's pixels, or of given rays; small ones for `"direct"`."""
+        side, most_beams = tiling.beam, tiling.direct_tile if direct else tiling.tile
         if isinstance(source, Camera):
             width, height = source.size
-            across, down = -(-width // BEAM), -(-height // BEAM)
+            across, down = -(-width // side), -(-height // side)
             beams = min(most_beams, across * down)
-            return _PixelTiles(-(-across * down // beams), beams, source.size, across, down)
+            return _PixelTiles(-(-across * down // beams), beams, tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
-        needed = -(-math.prod(shape) // BEAM**2)
+        needed = -(-math.prod(shape) // side**2)
         beams = max(min(most_beams, needed), 1)
-        return _OwnRayTiles(-(-needed // beams), beams, shape)
+        return _OwnRayTiles(-(-needed // beams), beams, tiling, shape)
 
     @abstractmethod
-    def rays(self, source: Any, space: Space, wave: Int[Array, ""]) -> Ray:
-        """The rays of a wave, cut to the volume. Those that only fill up groups miss it."""
+    def rays(self, source: Any, space: Space, tile: Int[Array, ""]) -> Ray:
+        """The rays of a tile, cut to the volume. Those that only fill up groups miss it."""
 
     @abstractmethod
-    def box(self, source: Any, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
-        """The boxes around the beams of a wave."""
+    def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+        """The boxes around the beams of a tile."""
 
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:
-        """From (waves, groups, rays in a group, *rest) to the image's shape."""
+        """From (tiles, groups, rays in a group, *rest) to the image's shape."""
 
     @abstractmethod
     def apart(self, leaf: Array) -> Array:
-        """The other way round; 0 for rays that only fill up groups."""
+        """The inverse of `assemble`; 0 for rays that only fill up groups."""
 
 
 class _PixelTiles(RayTiles):
-    """A camera's pixels: beams row by row, and each group by group."""
+    """A camera's pixels: beams row by row, and each beam group by group."""
 
     size: tuple[int, int] = eqx.field(static=True)
     across: int = eqx.field(static=True)
     down: int = eqx.field(static=True)
 
-    def rays(self, source: Camera, space: Space, wave: Int[Array, ""]) -> Ray:
-        group_y, group_x, y, x = jnp.unravel_index(jnp.arange(BEAM * BEAM), (2, 2, SIDE, SIDE))
-        column, row = self._pixels(wave, group_y * SIDE + y, group_x * SIDE + x)
-        column, row = column.reshape(-1, GROUP), row.reshape(-1, GROUP)
+    def rays(self, source: Camera, space: Space, tile: Int[Array, ""]) -> Ray:
+        group_y, group_x, y, x = jnp.unravel_index(
+            jnp.arange(self.tiling.beam * self.tiling.beam), (2, 2, self.tiling.side, self.tiling.side)
+        )
+        column, row = self._pixels(tile, group_y * self.tiling.side + y, group_x * self.tiling.side + x)
+        column, row = column.reshape(-1, self.tiling.group), row.reshape(-1, self.tiling.group)
         width, height = self.size
         return entering(space, *lines(source, column, row), (column < width) & (row < height))
 
-    def box(self, source: Camera, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, source: Camera, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
-        column, row = self._pixels(wave, y * (BEAM - 1), x * (BEAM - 1))
+        column, row = self._pixels(tile, y * (self.tiling.beam - 1), x * (self.tiling.beam - 1))
         return lambda occupancy: Box.within(occupancy, *vmap_rays(source.ray)(column, row))
 
-    def _pixels(self, wave: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
-        """Columns and rows of these places in each of a wave's beams."""
-        beam = (wave * self.beams + jnp.arange(self.beams))[:, None]
-        return (beam % self.across) * BEAM + x[None], (beam // self.across) * BEAM + y[None]
+    def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
+        """Columns and rows of these places in each of a tile's beams."""
+        beam = (tile * self.beams + jnp.arange(self.beams))[:, None]
+        return (beam % self.across) * self.tiling.beam + x[None], (
+            beam // self.across
+        ) * self.tiling.beam + y[None]
 
     def assemble(self, leaf: Array) -> Array:
         rest, (width, height) = leaf.shape[3:], self.size
-        beams = leaf.reshape(-1, BEAM * BEAM, *rest)[: self.across * self.down]
-        image = beams.reshape(self.down, self.across, 2, 2, SIDE, SIDE, *rest)
+        beams = leaf.reshape(-1, self.tiling.beam * self.tiling.beam, *rest)[: self.across * self.down]
+        image = beams.reshape(self.down, self.across, 2, 2, self.tiling.side, self.tiling.side, *rest)
         image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
-        return image.reshape(self.down * BEAM, self.across * BEAM, *rest)[:height, :width]
+        return image.reshape(self.down * self.tiling.beam, self.across * self.tiling.beam, *rest)[
+            :height, :width
+        ]
 
     def apart(self, leaf: Array) -> Array:
         rest, (width, height) = leaf.shape[2:], self.size
-        more = (self.down * BEAM - height, self.across * BEAM - width)
+        more = (self.down * self.tiling.beam - height, self.across * self.tiling.beam - width)
         image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
-        image = image.reshape(self.down, 2, SIDE, self.across, 2, SIDE, *rest)
-        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, BEAM * BEAM, *rest)
+        image = image.reshape(self.down, 2, self.tiling.side, self.across, 2, self.tiling.side, *rest)
+        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(
+            -1, self.tiling.beam * self.tiling.beam, *rest
+        )
         missing = self.number * self.beams - self.across * self.down
         beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (1 + len(rest)))
-        return beams.reshape(self.number, -1, GROUP, *rest)
+        return beams.reshape(self.number, -1, self.tiling.group, *rest)
 
 
 class _OwnRayTiles(RayTiles):
-    """Rays of one's own, in the order in which they were given."""
+    """Given rays, in their order."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def rays(self, source: OwnRays, space: Space, wave: Int[Array, ""]) -> Ray:
+    def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
             source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
-        place = wave * self.beams * BEAM**2 + jnp.arange(self.beams * BEAM**2).reshape(-1, GROUP)
+        place = tile * self.beams * self.tiling.beam**2 + jnp.arange(
+            self.beams * self.tiling.beam**2
+        ).reshape(-1, self.tiling.group)
         known = jnp.minimum(place, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
         return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), place < count)
 
-    def box(self, source: OwnRays, rays: Ray, wave: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beams, -1), rays)
         return lambda occupancy: Box.around(occupancy, by_beam)
 
@@ -164,13 +165,15 @@ class _OwnRayTiles(RayTiles):
 
     def apart(self, leaf: Array) -> Array:
         rest, count = leaf.shape[len(self.shape) :], math.prod(self.shape)
-        missing = self.number * self.beams * BEAM**2 - count
+        missing = self.number * self.beams * self.tiling.beam**2 - count
         padded = jnp.pad(leaf.reshape(count, *rest), [(0, missing)] + [(0, 0)] * len(rest))
-        return padded.reshape(self.number, self.beams * BEAM**2 // GROUP, GROUP, *rest)
+        return padded.reshape(
+            self.number, self.beams * self.tiling.beam**2 // self.tiling.group, self.tiling.group, *rest
+        )
 
 
 def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
-    """The ray at a place of the flattened image."""
+    """The ray of an index into the flattened image."""
     if isinstance(source, Camera):
         width = source.size[0]
         return _of_pixel(source, place % width, place // width)
@@ -187,9 +190,9 @@ def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Li
 def lines(camera: Camera, columns: Lanes, rows: Lanes) -> Line:
     """The rays of pixels, rounded alike in every program.
 
-    A program that also differentiates them would round them by other roundings, 1e-4 of a voxel away; and a
-    sample that comes to lie beyond a face of voxels has the slope of the other side. So they are a branch of
-    their own, of which a derivative is no part. Of a camera that is not finite, all rays are NaN."""
+    Otherwise a program that also differentiates them would round them differently, by 1e-4 of a voxel; and a
+    sample on the other side of a voxel's face has another slope. So they are computed in a branch of their
+    own, without derivatives. If the camera is not finite, all rays are NaN."""
     return in_memory(all_finite(camera), vmap_rays(partial(_of_pixel, camera)), columns, rows)
 
 
@@ -203,7 +206,7 @@ def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -
 
 
 def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of one ray, of arrays (groups, rays in a group)."""
+    """Maps a function of one ray over arrays (groups, rays in a group)."""
     return jax.vmap(jax.vmap(f))
 
 
@@ -214,7 +217,7 @@ def entering(
     pixel: tuple[Lanes, Lanes],
     wanted: Bool[Array, "groups rays"],
 ) -> Ray:
-    """Rays cut to the volume; those that are not wanted miss it."""
+    """Rays, cut to the volume; those that are not wanted miss it."""
     ray = vmap_rays(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(
         origin, direction, pixel
     )

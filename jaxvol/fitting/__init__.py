@@ -1,4 +1,4 @@
-"""Which parameters make rendered images agree with given ones?"""
+"""Fits parameters so that rendered images match reference images."""
 
 from .bijections import (
     Bijection as Bijection,

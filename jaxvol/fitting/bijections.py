@@ -1,7 +1,7 @@
-"""Which numbers may a parameter take? Smooth one-to-one maps from all real numbers onto those.
+"""Smooth bijections from unconstrained real numbers onto the values that a parameter may take.
 
-A fit moves freely in real numbers, `free`; what is rendered is `forward(free)`, so no step can leave what is
-allowed. Free numbers are of order 1 whatever the units, which a damped step wants.
+A solver moves the free variables, `free`; what is rendered is `forward(free)`, so no step can leave the
+allowed range. Free variables are of order 1 whatever the parameter's units, which suits a damped step.
 """
 
 from abc import abstractmethod
@@ -18,44 +18,44 @@ from ..camera import Camera
 
 
 MARGIN = 1e-3
-"""A start nearer than this to an end that is never quite reached (as part of the scale) begins so far away:
-at the end itself the map is flat, and a fit could never leave it."""
+"""A start closer than this to an open end of the range (relative to the scale) is moved to this distance from
+it: at the end itself the map is flat, and a fit could never leave it."""
 
 
 class Bijection(eqx.Module):
-    """A smooth map from free real numbers onto the values that are allowed."""
+    """A smooth map from free variables, any real numbers, onto the allowed values."""
 
     whole: bool = eqx.field(static=True, default=False, init=False)
-    """Whether it maps a whole object, such as a camera, and not each array on its own."""
+    """Whether it maps a whole object, such as a camera, rather than each array separately."""
 
     @abstractmethod
     def forward(self, free: Any) -> Any:
-        """The value that these free numbers stand for."""
+        """Value for these free variables."""
 
     @abstractmethod
     def inverse(self, value: Any, name: str = "value") -> Any:
-        """The free numbers that stand for a value.
+        """Free variables for a value.
 
         **Raises:** `ValueError`, naming `name`, for a value that is not allowed.
         """
 
     def moved(self, value: Any) -> Any:
-        """The parts of a value that the free numbers change."""
+        """Parts of a value that the free variables change."""
         return value
 
 
 class Fixed(Bijection):
-    """No free numbers at all: the value stays what it was at the start."""
+    """No free variables: the value stays as it was at the start."""
 
     def forward(self, free: Any) -> Any:
-        raise ValueError("Fixed has no free numbers: the value is kept by whoever holds it.")
+        raise ValueError("Fixed has no free variables: the caller keeps the value.")
 
     def inverse(self, value: Any, name: str = "value") -> None:
         return None
 
 
 class Unconstrained(Bijection):
-    """Any real number: the value is the free number."""
+    """Any real number: the value is the free variable itself."""
 
     def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         return free
@@ -69,12 +69,12 @@ class Positive(Bijection):
 
     **Arguments:**
 
-    - `scale`: a typical value, in the value's unit, > 0. Far above it the map is linear, far below
-      exponential.
+    - `scale`: a typical value, in the value's unit, > 0. The map is linear far above it and exponential far
+      below.
 
-    A start at 0, or below `scale` / 1000, begins at `scale` / 1000.
+    A start at 0, or below `scale` / 1000, is raised to `scale` / 1000.
 
-    **Raises:** `ValueError` for a scale that is not positive, and for starts that are negative.
+    **Raises:** `ValueError` for a scale that is not positive, and for negative starts.
     """
 
     scale: Float[Array, ""]
@@ -96,7 +96,7 @@ class Positive(Bijection):
 class UnitInterval(Bijection):
     """Numbers between 0 and 1: 1 / (1 + exp(-free)).
 
-    A start within 1/1000 of an end begins that far from it.
+    A start within 1/1000 of an end is moved to that distance from it.
 
     **Raises:** `ValueError` for starts outside [0, 1].
     """
@@ -115,14 +115,14 @@ class UnitInterval(Bijection):
 
 
 class Pose(Bijection):
-    """Where a camera stands and how it is turned, as a rigid motion of the camera `start`.
+    """Position and orientation of a camera, as a rigid motion of the camera `start`.
 
-    The free numbers are `rotation` (3,), the rotation vector (exponential map) in radians, about the
-    camera's focal point, and `translation` (3,), of camera and focal point alike, in units of the distance
-    between the two. All else (field of view, size) stays. About the focal point, rather than the camera
-    itself, turning and shifting do not stand for one another.
+    The free variables are `rotation` (3,), the rotation vector (exponential map) in radians, about the
+    camera's focal point, and `translation` (3,), of both camera and focal point, in units of the distance
+    between the two. Everything else (field of view, size) stays fixed. Rotating about the focal point, rather
+    than about the camera itself, keeps rotation and translation from imitating each other.
 
-    **Raises:** `ValueError` for a camera that no rigid motion of `start` yields.
+    **Raises:** `ValueError` for a camera that is not a rigid motion of `start`.
     """
 
     whole: bool = eqx.field(static=True, default=True, init=False)
@@ -143,22 +143,22 @@ class Pose(Bijection):
         )
 
     def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
-        from scipy.spatial.transform import Rotation  # here: a first image need not wait for it
+        from scipy.spatial.transform import Rotation  # here, so that a first image does not wait for it
 
         start = self.start
-        kept = [(c.view_angle, c.parallel_scale, c.window, _distance(c)) for c in (start, value)]
+        invariants = [(c.view_angle, c.parallel_scale, c.window, _distance(c)) for c in (start, value)]
         same = jax.tree.structure(value) == jax.tree.structure(start) and all(
-            np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, kept), strict=True)
+            np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, invariants), strict=True)
         )
         if not same:
             raise ValueError(
-                f"{name} must be a camera that differs from the pose's start in position and orientation "
-                f"alone, and stands as far from its focal point; got {value}, and started from {start}."
+                f"{name} must be a camera that differs from the pose's start only in position and "
+                f"orientation, at the same distance from its focal point; got {value} for the start {start}."
             )
         axes = [np.stack([np.asarray(axis, float) for axis in c._axes()], axis=1) for c in (start, value)]
-        turned = Rotation.from_matrix(axes[1] @ axes[0].T).as_rotvec()
+        rotation = Rotation.from_matrix(axes[1] @ axes[0].T).as_rotvec()
         shift = (value.focal_point - start.focal_point) / _distance(start)
-        return {"rotation": jnp.asarray(turned, shift.dtype), "translation": shift}
+        return {"rotation": jnp.asarray(rotation, shift.dtype), "translation": shift}
 
     def moved(self, value: Camera) -> dict[str, Float[Array, "3"]]:
         return dict(zip(("position", "focal_point", "view_up"), _moved(value), strict=True))
@@ -173,10 +173,10 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A vector, turned about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0."""
+    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0."""
     square = jnp.sum(turn**2)
     small = square < 1e-6
-    angle = jnp.sqrt(jnp.where(small, 1, square))  # its slope at 0 is infinite, and not used there
+    angle = jnp.sqrt(jnp.where(small, 1, square))  # never at 0, where the slope of sqrt is infinite
     first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
     second = jnp.where(small, 0.5 - square / 24, 2 * (jnp.sin(angle / 2) / angle) ** 2)
     across = jnp.cross(turn, vector)

@@ -1,7 +1,7 @@
-"""How does a fit survive being killed? By a file that is whole at every moment, and says what it belongs to.
+"""Checkpoints, so that a fit survives being killed: the file is complete at all times and identifies its fit.
 
-Arrays as NumPy's .npz, never pickled, with a checksum over all of them. A new file is written beside the old
-one and put in its place in one operation; the old one is kept as `NAME.before`.
+Arrays are stored as NumPy's .npz, never pickled, with a checksum over all of them. A new file is written
+beside the old one and moved into its place in one operation; the old one is kept as `NAME.before`.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def save(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
-    """Write arrays, and what they belong to, in place of what `path` held before."""
+    """Write the arrays, and the description `about` of their fit, to `path`, replacing its content."""
     content = {**arrays, "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, checksum=_checksum(content), **content)
@@ -40,35 +40,35 @@ def save(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
 
 
 def load(path: Path, about: dict[str, Any]) -> Arrays | None:
-    """What was saved, or None where nothing was. A file that is damaged is named in a warning, and the one
-    before it is used.
+    """The saved arrays, or None if there are none. A damaged file is named in a warning, and the previous one
+    is used.
 
-    **Raises:** `ValueError` for a checkpoint that belongs to something else than `about`.
+    **Raises:** `ValueError` for a checkpoint of another fit than `about` describes.
     """
     for candidate in (path, before(path)):
         if not candidate.exists():
             continue
         try:
-            arrays, found = _read(candidate)
+            arrays, saved = _read(candidate)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as fault:
             warnings.warn(
-                f"checkpoint {candidate} is damaged and not used ({fault}); the fit goes on from the one "
-                "before it, or where there is none, from the start.",
+                f"checkpoint {candidate} is damaged and ignored ({fault}); the fit continues from the "
+                "previous one, or from the start if there is none.",
                 stacklevel=4,
             )
             continue
-        for what, here in about.items():
-            if not _agree(found.get(what), here):
+        for key, expected in about.items():
+            if not _agree(saved.get(key), expected):
                 raise ValueError(
-                    f"checkpoint {candidate} belongs to another fit: its {what} is {found.get(what)}, "
-                    f"that of this fit is {here}. Give another file, or delete this one."
+                    f"checkpoint {candidate} belongs to another fit: its {key} is {saved.get(key)}, "
+                    f"that of this fit is {expected}. Choose another file, or delete this one."
                 )
         return arrays
     return None
 
 
 def before(path: Path) -> Path:
-    """Where the checkpoint before the last one is kept."""
+    """Path of the previous checkpoint."""
     return path.with_name(path.name + ".before")
 
 
@@ -77,7 +77,7 @@ def _read(path: Path) -> tuple[Arrays, dict[str, Any]]:
         content = {name: file[name] for name in file.files}
     checksum = content.pop("checksum")
     if not np.array_equal(checksum, _checksum(content)):
-        raise ValueError("its checksum is another")
+        raise ValueError("its checksum does not match")
     return content, json.loads(content.pop("about").tobytes())
 
 
@@ -90,8 +90,8 @@ def _checksum(content: Arrays) -> np.ndarray:
     return np.frombuffer(digest.digest(), np.uint8)
 
 
-def _agree(found: Any, here: Any) -> bool:
-    """Floats may differ by what another machine rounds otherwise."""
-    if isinstance(here, float) and isinstance(found, float):
-        return bool(np.isclose(found, here, rtol=1e-4))
-    return found == here
+def _agree(saved: Any, expected: Any) -> bool:
+    """Whether two entries agree; floats may differ, since another machine may round differently."""
+    if isinstance(expected, float) and isinstance(saved, float):
+        return bool(np.isclose(saved, expected, rtol=1e-4))
+    return saved == expected

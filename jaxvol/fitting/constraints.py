@@ -1,4 +1,4 @@
-"""Which parameters are free, and within which bounds? A bijection for each of them."""
+"""Which parameters are free, and within which bounds? Assigns a bijection to each."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Where = Callable[[Any], Any]
 
 
 class Free(eqx.Module):
-    """Parameters as the free numbers that a solver moves: one entry for each bijection, None where fixed."""
+    """Parameters as the free variables that a solver moves: one entry per bijection, None where fixed."""
 
     bijections: list[Bijection]
     held: list[Any]
@@ -31,33 +31,33 @@ class Free(eqx.Module):
 
     @classmethod
     def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", tuple]:
-        """The free numbers' meaning, and those that stand for `parameters`.
+        """The mapping from free variables to parameters, and the free variables for `parameters`.
 
-        **Raises:** `ValueError` for constraints that do not fit the parameters, a `where` that does
-        not either, parameters outside their bounds or not finite, and if nothing is free."""
+        **Raises:** `ValueError` for constraints or a `where` that do not match the parameters, parameters
+        outside their bounds or not finite, and if nothing is free."""
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
-        tree = _chosen(_resolved(parameters, constraints), where)
+        tree = _select(_resolve(parameters, constraints), where)
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
         bijections = [bijection for _, bijection in found]
         nodes = structure.flatten_up_to(parameters)
         places = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
         start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, places, strict=True))
         if not jax.tree.leaves(start):
-            raise ValueError("parameters must hold a float array that is free; all that came is fixed.")
+            raise ValueError("parameters must hold a float array that is free; everything given is fixed.")
         held = [n if isinstance(b, Fixed) else None for b, n in zip(bijections, nodes, strict=True)]
         return cls(bijections, held, places, structure), start
 
     def forward(self, free: tuple) -> PyTree:
-        """The parameters that these free numbers stand for."""
+        """Parameters for these free variables."""
         return jax.tree.unflatten(self.structure, self._nodes(free))
 
     def moved(self, free: tuple) -> list[Any]:
-        """The parts of the parameters that are fitted."""
+        """Parts of the parameters that are fitted."""
         nodes = zip(self.bijections, self._nodes(free), strict=True)
         return [None if isinstance(b, Fixed) else b.moved(node) for b, node in nodes]
 
     def names(self, free: tuple) -> list[str]:
-        """The name of every number in `moved`, such as `.extinction[3]`."""
+        """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []
         for place, node in zip(self.places, self.moved(free), strict=True):
             for path, leaf in jax.tree_util.tree_flatten_with_path(node)[0]:
@@ -71,7 +71,7 @@ class Free(eqx.Module):
 
 
 def size(free: tuple) -> int:
-    """How many free numbers there are."""
+    """Number of free variables."""
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(free))
 
 
@@ -79,12 +79,12 @@ def _is_bijection(node: Any) -> bool:
     return isinstance(node, Bijection)
 
 
-def _resolved(parameters: PyTree, constraints: PyTree) -> PyTree:
+def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
     """A bijection for every leaf, and for every object that is fitted as a whole."""
 
-    def meant(constraint: Any, node: Any) -> PyTree:
+    def expand(constraint: Any, node: Any) -> PyTree:
         if constraint is None:
-            return jax.tree.map(_usual, node, is_leaf=lambda n: isinstance(n, tuple(_USUAL)))
+            return jax.tree.map(_default, node, is_leaf=lambda n: isinstance(n, tuple(_DEFAULTS)))
         if not _is_bijection(constraint):
             raise ValueError(f"constraints must hold bijections, such as Positive(); got {constraint!r}.")
         if constraint.whole:
@@ -95,18 +95,18 @@ def _resolved(parameters: PyTree, constraints: PyTree) -> PyTree:
         return node is None or _is_bijection(node)
 
     try:
-        return jax.tree.map(meant, constraints, parameters, is_leaf=is_leaf)
+        return jax.tree.map(expand, constraints, parameters, is_leaf=is_leaf)
     except (ValueError, TypeError, KeyError) as fault:
         if "constraints" in str(fault):
             raise
         raise ValueError(
-            "constraints must be a tree like the parameters, or the beginning of one, with a bijection, or "
-            f"None for the usual one, at each end: {jax.tree.structure(parameters)}; got {constraints!r}."
+            "constraints must be a tree like the parameters, or a prefix of one, with a bijection, or None "
+            f"for the default, at each leaf: {jax.tree.structure(parameters)}; got {constraints!r}."
         ) from fault
 
 
-def _usual(node: Any) -> PyTree:
-    for kind, constraint in _USUAL.items():
+def _default(node: Any) -> PyTree:
+    for kind, constraint in _DEFAULTS.items():
         if isinstance(node, kind):
             return constraint(node)
     return Unconstrained() if eqx.is_inexact_array(node) else Fixed()
@@ -131,18 +131,18 @@ def _fixed(node: Any) -> PyTree:
     return jax.tree.map(lambda _: Fixed(), node)
 
 
-_USUAL: dict[type, Callable[[Any], PyTree]] = {
+_DEFAULTS: dict[type, Callable[[Any], PyTree]] = {
     TransferFunction: _of_transfer,
     Camera: Pose,
     Volume: _of_volume,
     March: _fixed,
     Material: _of_material,
 }
-"""How things are fitted unless one says otherwise."""
+"""Default constraints of each type."""
 
 
-def _chosen(tree: PyTree, where: Where | None) -> PyTree:
-    """All fixed but what `where` chooses."""
+def _select(tree: PyTree, where: Where | None) -> PyTree:
+    """Fix everything except what `where` selects."""
     if where is None:
         return tree
     leaves, structure = jax.tree.flatten(tree, is_leaf=_is_bijection)
@@ -150,8 +150,8 @@ def _chosen(tree: PyTree, where: Where | None) -> PyTree:
         chosen = set(jax.tree.leaves(where(jax.tree.unflatten(structure, range(len(leaves))))))
     except (AttributeError, KeyError, IndexError, TypeError) as fault:
         raise ValueError(
-            "where must choose parts of the parameters, as lambda p: p.extinction does (a camera that is "
-            f"fitted as a pose is one part); it failed on them with {fault!r}."
+            "where must choose parts of the parameters, such as lambda p: p.extinction (a camera that is "
+            f"fitted as a pose is a single part); it failed with {fault!r}."
         ) from fault
     if not chosen <= set(range(len(leaves))):
         raise ValueError(f"where must return parts of the parameters, unchanged; got {sorted(chosen)}.")

@@ -1,8 +1,8 @@
-"""How far does a Levenberg–Marquardt step go? As far in each parameter as the Jacobian says something of it.
+"""Levenberg–Marquardt steps that are damped in each parameter in proportion to its column of the Jacobian.
 
 Optimistix damps by λ |d|², which depends on the units of the residual and of every parameter: where
-residuals are small, as those of images are, steps are damped to a standstill. Marquardt (1963) damps by
-λ Σ Dᵢ² dᵢ² with Dᵢ² = (JᵀJ)ᵢᵢ, which no unit changes. It is Optimistix's step in the parameters D d.
+residuals are small, as for images, steps are damped to a standstill. Marquardt (1963) damps by
+λ Σ Dᵢ² dᵢ² with Dᵢ² = (JᵀJ)ᵢᵢ, which does not depend on units. It is Optimistix's step in the parameters D d.
 """
 
 from collections.abc import Callable
@@ -17,12 +17,13 @@ from jaxtyping import Array, Float, PyTree
 
 
 FLOOR = 0.1
-"""Least Dᵢ, as part of the greatest: a parameter of which next to nothing shows must not run away. (A
-transfer function is recovered from two images of a head to rounding at 0.1, to a wrong minimum at 0.001.)"""
+"""Smallest Dᵢ relative to the largest, so that a parameter with almost no effect on the residual cannot run
+away. (From two images of a head, a transfer function is recovered to rounding at 0.1; at 0.001, the fit ends
+in a wrong minimum.)"""
 
 
 class ScaledDescent(optx.AbstractDescent):
-    """The step d that makes |J d + r|² + λ |D d|² least, with λ = 1 / step size."""
+    """The step d that minimises |J d + r|² + λ |D d|², with λ = 1 / step size."""
 
     damped: optx.DampedNewtonDescent = optx.DampedNewtonDescent(lx.QR())
 
@@ -33,13 +34,13 @@ class ScaledDescent(optx.AbstractDescent):
         return self.damped.query(y, f_info, state)
 
     def step(self, step_size: Float[Array, ""], state: Any) -> tuple[PyTree, optx.RESULTS]:
-        known = state.f_info
-        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), known.jac.in_structure())
-        scale = jnp.linalg.norm(known.jac.as_matrix(), axis=0)
+        info = state.f_info
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), info.jac.in_structure())
+        scale = jnp.linalg.norm(info.jac.as_matrix(), axis=0)
         scale = jnp.maximum(scale, FLOOR * jnp.max(scale))
         unit = ravel_pytree(zeros)[1](1 / jnp.where(scale > 0, scale, 1))
-        jac = known.jac @ lx.DiagonalLinearOperator(unit)
-        scaled = self.damped.query(zeros, optx.FunctionInfo.ResidualJac(known.residual, jac), state)
+        jac = info.jac @ lx.DiagonalLinearOperator(unit)
+        scaled = self.damped.query(zeros, optx.FunctionInfo.ResidualJac(info.residual, jac), state)
         step, result = self.damped.step(step_size, scaled)
         return jax.tree.map(jnp.multiply, unit, step), result
 

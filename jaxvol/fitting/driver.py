@@ -1,4 +1,4 @@
-"""How are parameters found that make a residual small? By a solver of Optimistix, step by step."""
+"""Fits parameters by minimising a residual, step by step, with a solver of Optimistix."""
 
 import math
 import numbers
@@ -29,25 +29,25 @@ from .uncertainty import Uncertainty, uncertainty
 Solver: TypeAlias = Literal["levenberg_marquardt", "gauss_newton", "bfgs", "adam"]
 
 LEARNING_RATE = 0.03
-"""Of `"adam"`, in free numbers, which are of order 1."""
+"""Learning rate of `"adam"`, in free variables, which are of order 1."""
 
 
 class Outcome(optx.RESULTS):  # pyright: ignore
-    """How a fit ended: Optimistix's results, and one more."""
+    """How a fit ended: Optimistix's results, and `stalled`."""
 
     stalled = (
-        "No step lowered the loss any more by more than rtol: a minimum, as far as the float type can tell, "
-        "or a place where the derivative does not say how the loss changes."
+        "No step lowered the loss by more than rtol any more: either a minimum, to the precision of the "
+        "float type, or a point where the derivative does not predict how the loss changes."
     )
 
 
 class Fit(eqx.Module):
-    """What a fit found.
+    """Result of a fit.
 
-    - `parameters`: the best ones seen, as the tree that was given.
-    - `solution`: Optimistix's: `value` (the free numbers), `result`, `state` and `stats`.
+    - `parameters`: the best ones found, as a tree like the starting parameters.
+    - `solution`: Optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
     - `losses`: half the sum of squared residuals at the solver's point after each step.
-    - `uncertainty`: `covariance`, `names`, `standard_errors` and `undetermined` directions, from a
+    - `uncertainty`: `covariance`, `names`, `standard_errors` and `undetermined` directions, for a
       least-squares solver; else None.
     """
 
@@ -71,8 +71,9 @@ class Fit(eqx.Module):
         """How the fit ended, in words."""
         if self.success:
             return "The solver converged."
-        if self.solution.result == Outcome.nonlinear_max_steps_reached:  # Optimistix fears for other problems
-            return "The fit took the maximum number of steps, max_steps, before it converged."
+        # Optimistix's text for this names causes that do not apply to fits
+        if self.solution.result == Outcome.nonlinear_max_steps_reached:
+            return "The fit reached the maximum number of steps, max_steps, before it converged."
         return Outcome[self.solution.result]
 
 
@@ -93,52 +94,51 @@ def fit(
     checkpoint: str | PathLike[str] | None = None,
     checkpoint_seconds: float = 60.0,
 ) -> Fit:
-    """Parameters that make a residual small: half the sum of its squares is the loss.
+    """Fit parameters to make a residual small: the loss is half the sum of its squares.
 
     **Arguments:**
 
     - `residual`: an `ImageResidual`, or a function from parameters to arrays. A function that renders
-      must do so by `adjoint="forward"` for the first two solvers, by `"replay"` for the others.
-    - `parameters`: where to start: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
+      must use `adjoint="forward"` for the first two solvers and `"replay"` for the others.
+    - `parameters`: the starting point: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
       float arrays are fitted.
     - `solver`:
-        - `"levenberg_marquardt"`, `"gauss_newton"`: least squares, by forward Jacobians. The first
-          is the one to try first, up to some hundred parameters.
-        - `"bfgs"`: the gradient alone, and a matrix of parameters × parameters.
-        - `"adam"`: gradient descent through Optax (`pip install "jaxvol[fit]"`), for large arrays.
+        - `"levenberg_marquardt"`, `"gauss_newton"`: least squares, with forward-mode Jacobians. Start
+          with the first, up to a few hundred parameters.
+        - `"bfgs"`: needs only the gradient, and a matrix of parameters × parameters.
+        - `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays.
         - any least-squares solver or minimiser of Optimistix, or a transformation of Optax; `rtol` and
           `atol` are then the solver's own where it has them.
-    - `constraints`: a tree like the parameters, or the beginning of one, with a bijection at each end: None
-      for what is usual, `Fixed()`, `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`. Usual
-      are, for a transfer function, positive extinction, colours in [0, 1] and fixed values; for a
-      camera, its pose; for a volume, unconstrained data where they are float; for a material, a positive mean
-      free path, and all else fixed; a march stays fixed; any other float array is unconstrained.
-    - `where`: the parts that are free, `where(parameters)` as for `equinox.tree_at`: all else stays
-      fixed. `lambda transfer: transfer.extinction`, or a tuple of parts.
-    - `rtol`, `atol`: a fit has converged when in a step neither the free numbers nor the residual change by
-      more than this.
-    - `max_steps`: the most steps. Each is an evaluation with derivative, also where the step is rejected.
-    - `patience`: steps in which the loss does not fall by more than `rtol`, relatively, after which a fit
-      has stalled: 10, or 100 for Optax, by default.
-    - `max_jacobian`: bytes. With a least-squares solver, only as many rows of the Jacobian are held at once
-      as fit (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image. The
-      result does not depend on it, but for rounding.
-    - `callback`: `callback(step, parameters, loss)` after each step but the first, which looks at the start.
-    - `progress`: shows a progress bar (`pip install "jaxvol[fit]"`).
+    - `constraints`: a tree like the parameters, or a prefix of one, with a bijection at each leaf: None for
+      the default, `Fixed()`, `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`. The defaults
+      are, for a transfer function, positive extinction, colours in [0, 1] and fixed values; for a camera, its
+      pose; for a volume, unconstrained data if they are float; for a material, a positive mean free path,
+      and all else fixed; for a march, all fixed; any other float array is unconstrained.
+    - `where`: the free parts, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
+      example `lambda transfer: transfer.extinction`, or a tuple of parts.
+    - `rtol`, `atol`: a fit has converged when neither the free variables nor the residual change by more
+      than this in a step.
+    - `max_steps`: maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
+    - `patience`: number of steps after which a fit has stalled if the loss has not fallen by more than
+      `rtol`, relatively; by default 10, or 100 for Optax.
+    - `max_jacobian`: bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
+      (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image. The result does
+      not depend on it, except for rounding.
+    - `callback`: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.
+    - `progress`: show a progress bar (`pip install "jaxvol[fit]"`).
     - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, at the end, and when the
-      fit is interrupted after its first step (Ctrl-C; `KeyboardInterrupt` is raised again, and says so).
-      Whether it can be written is tried first. If it exists, the fit goes on from there, and ends with the
-      same parameters, to the bit, as if it had never stopped (on the same machine). A damaged file is told
-      by a warning, and the one before it used.
+      fit is interrupted after its first step (Ctrl-C; `KeyboardInterrupt` is raised again, with a note).
+      Before the fit, it is checked that the file can be written. If it exists, the fit continues from it and
+      ends with the same parameters, bit for bit, as an uninterrupted fit (on the same machine). A damaged
+      file is reported in a warning, and the previous one is used.
 
-    **Returns:** a `Fit`. A solver that fails, stalls or runs out of steps is told by `Fit.success`,
-    `Fit.message` and `Fit.solution.result`; the parameters are then the best ones that were seen. Directions
-    that the residual does not determine are named in a warning.
+    **Returns:** a `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success`, `Fit.message` and
+    `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
+    the residual does not determine.
 
-    **Raises:** `ValueError` for arguments that do not fit together, parameters that are not finite or
-    out of bounds, a residual that is not finite at the start, a checkpoint of another fit, and one that
-    cannot be written;
-    `ImportError` where Optax or the progress bar is asked for and missing.
+    **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
+    residual that is not finite at the start, a checkpoint of another fit, and one that cannot be written;
+    `ImportError` if Optax or the progress bar is requested but not installed.
     """
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
         if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
@@ -146,8 +146,8 @@ def fit(
     check_residual(residual)
     file = None if checkpoint is None else output_file("checkpoint", checkpoint)
     max_steps, max_jacobian = integer("max_steps", max_steps, 1), integer("max_jacobian", max_jacobian, 1)
-    solver, patient = _solver(solver, rtol, atol)
-    patience = patient if patience is None else integer("patience", patience, 1)
+    solver, default_patience = _solver(solver, rtol, atol)
+    patience = default_patience if patience is None else integer("patience", patience, 1)
     free, y = Free.of(parameters, constraints, where)
     if not isinstance(residual, Residual):
         residual = OwnResidual.of(residual, free.forward(y))
@@ -155,9 +155,9 @@ def fit(
     problem = Problem(residual, free, tile_entries(residual, y, max_jacobian, least_squares))
 
     run = _Run.begin(solver, problem, y)
-    keeper = None if file is None else _Keeper(file, _about(solver, problem, run))
-    if keeper is not None:
-        run = keeper.resumed(run)
+    checkpointer = None if file is None else _Checkpointer(file, _about(solver, problem, run))
+    if checkpointer is not None:
+        run = checkpointer.resumed(run)
     try:
         with _bar(progress, max_steps) as show:
             while run.ended(max_steps, patience, rtol) is None:
@@ -165,23 +165,23 @@ def fit(
                 show(run)
                 if callback is not None:
                     callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
-                if keeper is not None:
-                    keeper.save(run, checkpoint_seconds)
+                if checkpointer is not None:
+                    checkpointer.save(run, checkpoint_seconds)
     except KeyboardInterrupt as stop:
-        if keeper is not None:
-            keeper.save(run)
+        if checkpointer is not None:
+            checkpointer.save(run)
             stop.add_note(
-                f"fit: stopped after {len(run.losses)} steps, which {file} holds; the same call goes on from "
+                f"fit: stopped after {len(run.losses)} steps, saved in {file}; the same call continues from "
                 "there."
             )
         raise
-    if keeper is not None:
-        keeper.save(run)
-    return _told(run, problem, run.ended(max_steps, patience, rtol), max_steps)
+    if checkpointer is not None:
+        checkpointer.save(run)
+    return _report(run, problem, run.ended(max_steps, patience, rtol), max_steps)
 
 
 def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
-    """The solver, and the patience that it wants."""
+    """The solver, and its default patience."""
     if isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         return solver, 100 if isinstance(solver, optx.OptaxMinimiser) else 10
     if solver == "levenberg_marquardt":
@@ -204,12 +204,12 @@ def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
 
 
 class _Run(eqx.Module):
-    """Where a fit is: everything that the next step depends on."""
+    """State of a fit: everything that the next step depends on."""
 
     y: tuple
     state: Any
     seen: tuple
-    """The solver's point, of which the loss is known."""
+    """The solver's point whose loss is known."""
     best: tuple
     triangle: Array | None
     """At the best point."""
@@ -219,10 +219,10 @@ class _Run(eqx.Module):
 
     @classmethod
     def begin(cls, solver: Any, problem: Problem, y: tuple) -> "_Run":
-        """After the first step, which finds the loss at the start."""
-        state = _begun(solver, problem, y)
-        nothing = jnp.zeros((), bool)
-        run = cls(y, state, y, y, None, nothing, optx.RESULTS.successful, [])
+        """State after the first step, which evaluates the loss at the start."""
+        state = _init_state(solver, problem, y)
+        done = jnp.zeros((), bool)
+        run = cls(y, state, y, y, None, done, optx.RESULTS.successful, [])
         run = run.step(solver, problem)
         if not math.isfinite(run.losses[0]):
             raise ValueError(
@@ -232,14 +232,14 @@ class _Run(eqx.Module):
         return run
 
     def step(self, solver: Any, problem: Problem) -> "_Run":
-        y, state, (loss, seen, triangle), done, result = _advanced(solver, problem, self.y, self.state)
+        y, state, (loss, seen, triangle), done, result = _advance(solver, problem, self.y, self.state)
         loss = float(loss)
         better = loss < min(self.losses, default=math.inf)
         best, triangle = (seen, triangle) if better else (self.best, self.triangle)
         return _Run(y, state, seen, best, triangle, done, result, [*self.losses, loss])
 
     def ended(self, max_steps: int, patience: int, rtol: float) -> Any:
-        """The result, once the fit has ended."""
+        """The result if the fit has ended, else None."""
         finite = all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(self.y))
         if not finite or not math.isfinite(self.losses[-1]):
             return Outcome.nonfinite
@@ -268,13 +268,13 @@ class _Run(eqx.Module):
 
 
 def _squares(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, Array]]:
-    """What a least-squares solver makes small; beside it the loss, where it was taken, and the triangle."""
+    """Residual for a least-squares solver, with auxiliary output: the loss, its point, and the triangle."""
     triangle = problem.condensed(y)
     return triangle[:, -1], (jnp.sum(triangle[:, -1] ** 2) / 2, y, triangle)
 
 
 def _loss(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, None]]:
-    """What a minimiser makes small; the same beside it."""
+    """Objective of a minimiser, with the same auxiliary output but no triangle."""
     loss = problem.loss(y)
     return loss, (loss, y, None)
 
@@ -284,39 +284,39 @@ def _function(solver: Any) -> Callable[..., Any]:
 
 
 @eqx.filter_jit
-def _begun(solver: Any, problem: Problem, y: tuple) -> Any:
+def _init_state(solver: Any, problem: Problem, y: tuple) -> Any:
     function = _function(solver)
-    with _lenient():
+    with _allow_promotion():
         out, aux = eqx.filter_eval_shape(function, y, problem)
         return solver.init(function, y, problem, {}, out, aux, frozenset())
 
 
 @eqx.filter_jit
-def _advanced(solver: Any, problem: Problem, y: tuple, state: Any) -> Any:
+def _advance(solver: Any, problem: Problem, y: tuple, state: Any) -> Any:
     function = _function(solver)
-    with _lenient():
-        y, state, before = solver.step(function, y, problem, {}, state, frozenset())
+    with _allow_promotion():
+        y, state, previous_aux = solver.step(function, y, problem, {}, state, frozenset())
         done, result = solver.terminate(function, y, problem, {}, state, frozenset())
-    # solvers that try points tell of the one they stood at before; they keep what they know of the new one
-    return y, state, getattr(state, "aux", before), done, result
+    # `previous_aux` is that of the previous point in solvers with trial points; their state has the new one's
+    return y, state, getattr(state, "aux", previous_aux), done, result
 
 
 @contextmanager
-def _lenient() -> Iterator[None]:
-    """Solvers count on JAX's promotion of types and ranks, also where a user has forbidden it."""
+def _allow_promotion() -> Iterator[None]:
+    """Allow JAX's promotion of types and ranks, which solvers need, even if the user has forbidden it."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
-class _Keeper:
-    """Who writes checkpoints, and knows which step was written when."""
+class _Checkpointer:
+    """Writes checkpoints, and remembers which step was written when."""
 
     def __init__(self, file: Path, about: dict[str, Any]):
         self.file, self.about = file, about
         self.step, self.time = 0, time.monotonic()
 
     def resumed(self, run: _Run) -> _Run:
-        """The run that was saved; this one, where none was."""
+        """The saved run, or `run` if none was saved."""
         arrays = checkpoints.load(self.file, self.about)
         if arrays is None:
             return run
@@ -325,14 +325,14 @@ class _Keeper:
         return run
 
     def save(self, run: _Run, seconds: float = 0) -> None:
-        """Save the run, unless it is as it was, or so many seconds have not yet passed."""
+        """Save the run, unless it has not advanced or the last save was less than `seconds` ago."""
         if len(run.losses) > self.step and time.monotonic() - self.time >= seconds:
             checkpoints.save(self.file, run.arrays(), self.about)
             self.step, self.time = len(run.losses), time.monotonic()
 
 
 def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
-    """What tells one fit from another."""
+    """What distinguishes one fit from another."""
     free = problem.free
     kinds = [type(b).__name__ for b in free.bijections]
     return {
@@ -344,26 +344,26 @@ def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
     }
 
 
-def _told(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
-    known = None
+def _report(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
+    estimate = None
     if run.triangle is not None:
         residual, triangle = problem.residual, np.asarray(run.triangle)
-        known = uncertainty(triangle, residual.count(), problem.free, run.best, residual.scale())
-        if known.undetermined:
-            moved = "; ".join(", ".join(names[:6]) or "none" for names in known.undetermined[:6])
+        estimate = uncertainty(triangle, residual.count(), problem.free, run.best, residual.scale())
+        if estimate.undetermined:
+            moved = "; ".join(", ".join(names[:6]) or "none" for names in estimate.undetermined[:6])
             warnings.warn(
-                f"{len(known.undetermined)} of {run.triangle.shape[0] - 1} directions are not determined by "
-                f"the residual; most moved by them: {moved}.",
+                f"{len(estimate.undetermined)} of {run.triangle.shape[0] - 1} directions are not determined "
+                f"by the residual; parameters they change most: {moved}.",
                 stacklevel=3,
             )
     stats = {"num_steps": len(run.losses), "max_steps": max_steps}
     solution = optx.Solution(run.best, result, None, stats, run.state)
-    return Fit(problem.free.forward(run.best), solution, np.asarray(run.losses), known)
+    return Fit(problem.free.forward(run.best), solution, np.asarray(run.losses), estimate)
 
 
 @contextmanager
 def _bar(progress: bool, max_steps: int) -> Iterator[Callable[[_Run], None]]:
-    """A progress bar, and how to move it."""
+    """A progress bar; yields the function that updates it."""
     if not progress:
         yield lambda run: None
         return

@@ -1,4 +1,4 @@
-"""How do images, their cameras and transfer functions come from files? Pictures, and JSON."""
+"""Reads views (pictures with their cameras) and transfer functions from picture and JSON files."""
 
 import json
 from collections.abc import Sequence
@@ -24,35 +24,35 @@ File = str | PathLike[str]
 
 
 def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Float[Array, "h w 3"]]]:
-    """Pictures with their cameras, as `ImageResidual` takes them.
+    """Read pictures and their cameras, as `ImageResidual` takes them.
 
     **Arguments:**
 
-    - `images`: pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They become linear RGB.
-    - `cameras`: a JSON file: a list of one object for each image, in the same order, with the fields
+    - `images`: pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They are converted to linear RGB.
+    - `cameras`: a JSON file with a list of one object per image, in the same order, with the fields
       `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`, as
       `Camera` takes them.
 
-    **Raises:** `ValueError`, naming the file, for one that is not there, or does not hold this.
+    **Raises:** `ValueError`, naming the file, if it is missing or holds anything else.
     """
-    found = _json(cameras)
-    if not isinstance(found, list):
-        raise ValueError(f"{cameras} must hold a list of cameras; got {type(found).__name__}.")
-    if len(found) != len(images):
+    entries = _json(cameras)
+    if not isinstance(entries, list):
+        raise ValueError(f"{cameras} must hold a list of cameras; got {type(entries).__name__}.")
+    if len(entries) != len(images):
         raise ValueError(
-            f"{cameras} must hold one camera for each of {len(images)} images; got {len(found)}."
+            f"{cameras} must hold one camera for each of {len(images)} images; got {len(entries)}."
         )
     pictures = [_picture(path) for path in images]
     return [
         (_camera(f"{cameras}: camera {number}", fields, picture.shape[1::-1]), picture)
-        for number, (fields, picture) in enumerate(zip(found, pictures, strict=True))
+        for number, (fields, picture) in enumerate(zip(entries, pictures, strict=True))
     ]
 
 
 def read_transfer(path: File) -> TransferFunction:
-    """The transfer function in a JSON file with the fields `values`, `colors` and `extinction`.
+    """Read a transfer function from a JSON file with the fields `values`, `colors` and `extinction`.
 
-    **Raises:** `ValueError`, naming the file, for one that is not there, or does not hold this."""
+    **Raises:** `ValueError`, naming the file, if it is missing or holds anything else."""
     fields = _fields(str(path), _json(path), TRANSFER, TRANSFER)
     try:
         return TransferFunction(**fields)
@@ -61,7 +61,7 @@ def read_transfer(path: File) -> TransferFunction:
 
 
 def write_transfer(path: File, transfer: TransferFunction) -> Path:
-    """Write a transfer function as `read_transfer` reads it."""
+    """Write a transfer function in the format that `read_transfer` reads."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     fields = {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}
@@ -78,17 +78,17 @@ def _json(path: File) -> Any:
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 
-def _fields(what: str, found: Any, allowed: Sequence[str], needed: Sequence[str]) -> dict[str, Any]:
-    if not isinstance(found, dict) or not set(needed) <= set(found) <= set(allowed):
-        got = ", ".join(found) if isinstance(found, dict) else type(found).__name__
+def _fields(what: str, content: Any, allowed: Sequence[str], needed: Sequence[str]) -> dict[str, Any]:
+    if not isinstance(content, dict) or not set(needed) <= set(content) <= set(allowed):
+        got = ", ".join(content) if isinstance(content, dict) else type(content).__name__
         raise ValueError(
             f"{what} must be an object with {', '.join(needed)} (of {', '.join(allowed)}); got {got}."
         )
-    return found
+    return content
 
 
-def _camera(what: str, found: Any, size: tuple[int, ...]) -> Camera:
-    fields = _fields(what, found, CAMERA, CAMERA[:2])
+def _camera(what: str, content: Any, size: tuple[int, ...]) -> Camera:
+    fields = _fields(what, content, CAMERA, CAMERA[:2])
     try:
         return Camera(**fields, size=size)
     except ValueError as fault:
@@ -103,11 +103,11 @@ def _picture(path: File) -> Float[Array, "h w 3"]:
         raise ValueError(f"there is no file {path}.")
     try:
         picture = imread(path)
-    except Exception as fault:  # each of many readers fails in its own way
+    except Exception as fault:  # each of the many readers raises errors of its own
         raise ValueError(f"{path} cannot be read as a picture: {fault}") from fault
     if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype not in (np.uint8, np.uint16):
         raise ValueError(
-            f"{path} must be an RGB picture of 8 or 16 bits without transparency; got shape {picture.shape} "
+            f"{path} must be an RGB picture of 8 or 16 bits, without transparency; got shape {picture.shape} "
             f"of {picture.dtype}."
         )
     return from_srgb(jnp.asarray(img_as_float32(picture)))

@@ -1,13 +1,13 @@
-"""What is to become small? Residuals, in tiles that memory holds, and what a solver needs of them.
+"""Residuals of a fit, in tiles that fit into memory, and the QR factor that a least-squares solver needs.
 
-A least-squares solver asks for the residual r (m,) and its Jacobian J (m, n). With millions of pixels J is
-too large to hold, and all that a Gauss–Newton or Levenberg–Marquardt step needs of both is the triangle of
+A least-squares solver uses the residual r (m,) and its Jacobian J (m, n). With millions of pixels J is too
+large to hold, but a Gauss–Newton or Levenberg–Marquardt step needs only the triangle of
 
     [J r] = Q [R c; 0 ρ]      with      |J d + r|² = |R d + c|² + ρ²   for every step d,
 
-which is (n + 1, n + 1) and is made tile by tile, by QR of the triangle so far and the tile's rows (TSQR,
-Demmel et al. 2012). So a residual of n + 1 numbers with the Jacobian [R; 0] stands for that of all pixels, to
-any solver, exactly; and unlike JᵀJ it does not square the condition.
+which is (n + 1, n + 1) and is computed tile by tile, by QR of the triangle so far and the tile's rows (TSQR,
+Demmel et al. 2012). A residual of n + 1 numbers with the Jacobian [R; 0] thus replaces that of all pixels
+exactly, for any solver; unlike JᵀJ, it does not square the condition number.
 """
 
 import math
@@ -33,11 +33,11 @@ from .constraints import Free, size
 
 
 TANGENTS = 64
-"""Columns of the Jacobian that are computed at once: a march keeps its state for each of them."""
+"""Columns of the Jacobian computed at once: a march keeps its state for each of them."""
 
 
 class Tiles(NamedTuple):
-    """Pieces of a residual, of one shape: `of(parameters, item, adjoint)` for each of the stacked items."""
+    """Pieces of a residual, of equal shape: `of(parameters, item, adjoint)` for each of the stacked items."""
 
     of: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
     items: PyTree
@@ -45,24 +45,23 @@ class Tiles(NamedTuple):
 
 
 class Residual(eqx.Module):
-    """What is to become small: the loss is half the sum of its squares."""
+    """What a fit minimises: the loss is half the sum of its squares."""
 
     @abstractmethod
     def tiles(self, most: int) -> list[Tiles]:
-        """The residual in pieces of at most so many entries."""
+        """The residual in pieces of at most `most` entries."""
 
     @abstractmethod
     def count(self) -> int:
-        """Entries of the whole."""
+        """Total number of entries."""
 
     def scale(self) -> float:
-        """Norm of what is compared: a change of the residual within its rounding tells nothing. 0 where it is
-        not known."""
+        """Norm of the compared data: changes within its rounding carry no information. 0 if unknown."""
         return 0.0
 
 
 def check_residual(residual: Any) -> None:
-    """Refuse what is no residual: a transfer function is a function, too."""
+    """Reject what is not a residual, including a transfer function, which is callable, too."""
     if isinstance(residual, Transfer) or not (callable(residual) or isinstance(residual, Residual)):
         raise ValueError(
             "residual must be an ImageResidual, or a function from parameters to arrays; "
@@ -71,7 +70,7 @@ def check_residual(residual: Any) -> None:
 
 
 class OwnResidual(Residual):
-    """A function from parameters to arrays, in one piece."""
+    """A residual given as a function from parameters to arrays, in one piece."""
 
     function: Callable[[PyTree], PyTree]
     length: int
@@ -91,7 +90,7 @@ class OwnResidual(Residual):
         if self.length > most:
             raise ValueError(
                 f"max_jacobian leaves room for {most} of the residual's {self.length} entries, and a "
-                "function of one's own is not taken apart. Raise max_jacobian, or use an ImageResidual."
+                "custom function is not split into tiles. Raise max_jacobian, or use an ImageResidual."
             )
 
         def of(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
@@ -101,7 +100,7 @@ class OwnResidual(Residual):
 
 
 class _Group(eqx.Module):
-    """Views that agree in size and kind, stacked."""
+    """Stacked views of the same size and kind."""
 
     cameras: Camera
     images: Float[Array, "views height width channels"]
@@ -116,20 +115,20 @@ class ImageResidual(Residual):
 
     **Arguments:**
 
-    - `scene`: `scene(parameters, camera)` returns what is to be rendered, `(volume, transfer, camera,
-      march)` and, if it is lit, `lighting` as a fifth, from the parameters and a view's camera. The solver
-      decides by which adjoint it is differentiated.
+    - `scene`: `scene(parameters, camera)` returns what to render for the parameters and a view's camera:
+      `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit. The solver chooses
+      the adjoint.
     - `views`: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
       `background`, or (height, width, 4), as `Rendering.rgba`.
-    - `background`: linear RGB behind the volume, for images of three channels.
+    - `background`: linear RGB behind the volume, for three-channel images.
 
     The residual is divided by the square root of the number of its entries, so that the loss, half the
-    sum of squares, is half the mean square error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
+    sum of squares, is half the mean squared error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
 
-    A Jacobian that is too large is made in tiles of whole rows of an image.
+    A Jacobian that is too large is computed in tiles of whole image rows.
 
-    **Raises:** `ValueError` for no views, an image of another size than its camera's or of integers, NaN or
-    infinite pixels, and a scene that returns something else.
+    **Raises:** `ValueError` for no views, an image that differs in size from its camera or holds integers,
+    NaN or infinite pixels, and a scene that returns something else.
     """
 
     scene: Scene
@@ -146,15 +145,15 @@ class ImageResidual(Residual):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
         self.scene = cast(Scene, scene)
         self.background = finite_array("background", background, (3,))
-        alike: dict[Any, list[tuple[Camera, Array]]] = {}
+        by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
         for number, view in enumerate(_pairs(views)):
             camera, image = _view(number, *view)
-            alike.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
+            by_kind.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
         self.groups = [
             _Group(
                 *(jax.tree.map(lambda *leaves: jnp.stack(leaves), *part) for part in zip(*group, strict=True))
             )
-            for group in alike.values()
+            for group in by_kind.values()
         ]
 
     def count(self) -> int:
@@ -186,12 +185,12 @@ class ImageResidual(Residual):
             rendering = render(
                 volume, transfer, camera, march, lighting=lighting, outputs="rgba", adjoint=adjoint
             )
-            seen = rendering.rgba if channels == 4 else rendering.image(self.background)
+            rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
-            wanted = group.images[view, jnp.minimum(row, height - 1)]
+            reference = group.images[view, jnp.minimum(row, height - 1)]
             # the last piece may reach past the image
             inside = (row < height)[:, None, None]
-            return jnp.where(inside, (seen - wanted) * weight, 0).reshape(-1)
+            return jnp.where(inside, (rendered - reference) * weight, 0).reshape(-1)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return Tiles(of, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
@@ -200,25 +199,27 @@ class ImageResidual(Residual):
         self, parameters: PyTree, group: _Group, view: Int[Array, ""]
     ) -> tuple[Volume, Transfer, Camera, March, Lighting | None]:
         of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
-        made = self.scene(parameters, of_view)
+        result = self.scene(parameters, of_view)
         kinds = Volume, Transfer, Camera, March, Lighting | None
         if not (
-            isinstance(made, tuple)
-            and len(made) in (4, 5)
-            and all(isinstance(thing, kind) for thing, kind in zip(made, kinds, strict=False))
+            isinstance(result, tuple)
+            and len(result) in (4, 5)
+            and all(isinstance(thing, kind) for thing, kind in zip(result, kinds, strict=False))
         ):
             found = (
-                [type(thing).__name__ for thing in made] if isinstance(made, tuple) else type(made).__name__
+                [type(thing).__name__ for thing in result]
+                if isinstance(result, tuple)
+                else type(result).__name__
             )
             raise ValueError(
                 "scene must return (volume, transfer, camera, march), and lighting if it is lit; "
                 f"got {found}."
             )
-        if made[2].size != of_view.size:
+        if result[2].size != of_view.size:
             raise ValueError(
-                f"scene must return a camera of its view's size {of_view.size}; got {made[2].size}."
+                f"scene must return a camera of its view's size {of_view.size}; got {result[2].size}."
             )
-        return (*made, None) if len(made) == 4 else made
+        return (*result, None) if len(result) == 4 else result
 
 
 def _pairs(views: Any) -> list[tuple[Any, Any]]:
@@ -238,16 +239,16 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
         )
     width, height = camera.size
     image = np.asarray(image)
-    if image.dtype.kind not in "fV":  # V: JAX's own short floats
+    if image.dtype.kind not in "fV":  # V: JAX's own 8- and 16-bit floats
         raise ValueError(
-            f"views[{number}]: the image must be linear RGB, floats in [0, 1]; got {image.dtype}. Pixels of "
-            "a picture file become that by jv.read_views, or by jv.from_srgb(image / 255)."
+            f"views[{number}]: the image must be linear RGB, floats in [0, 1]; got {image.dtype}. Convert a "
+            "picture file with jv.read_views, or its pixels with jv.from_srgb(image / 255)."
         )
     image = image.astype(np.float32)
     if image.shape not in ((height, width, 3), (height, width, 4)):
         raise ValueError(
             f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, "
-            f"as its camera of size {camera.size} has; got {image.shape}."
+            f"to match its camera of size {camera.size}; got {image.shape}."
         )
     if not np.all(finite(image)):
         bad = int(np.sum(~finite(image)))
@@ -258,8 +259,7 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
 
 
 def _rows_of(camera: Camera, first: Int[Array, ""], rows: int) -> Camera:
-    """`Camera.crop` to whole rows from one that is known only when the program runs; they may reach past
-    the image."""
+    """`Camera.crop` to `rows` whole rows from a traced row `first` on; they may reach past the image."""
     left, right, bottom, top = camera.window
     width, height = camera.size
     edges = jnp.stack([first + rows, first]).astype(top.dtype) / height
@@ -269,15 +269,15 @@ def _rows_of(camera: Camera, first: Int[Array, ""], rows: int) -> Camera:
 
 
 class Problem(eqx.Module):
-    """A residual of free numbers, and what solvers ask of it."""
+    """A residual as a function of the free variables, in the forms that solvers need."""
 
     residual: Residual
     free: Free
     tile: int = eqx.field(static=True)
-    """Entries of the residual that are differentiated at once."""
+    """Entries of the residual differentiated at once."""
 
     def loss(self, free: tuple) -> Float[Array, ""]:
-        """Half the sum of squares. Its gradient is summed tile by tile, by reverse mode."""
+        """Half the sum of squares. Its gradient is summed tile by tile, in reverse mode."""
 
         def add(tiles: Tiles, total: Array, item: Any) -> Array:
             return total + self._loss_of(tiles, item, free)
@@ -287,11 +287,11 @@ class Problem(eqx.Module):
                 one = jax.value_and_grad(lambda free: self._loss_of(tiles, item, free))(free)
                 return jax.tree.map(jnp.add, total, one)
 
-            return self._over(add, (self._nothing, jax.tree.map(jnp.zeros_like, free)))
+            return self._accumulate(add, (self._zero, jax.tree.map(jnp.zeros_like, free)))
 
         @jax.custom_jvp
         def loss(free: tuple) -> Array:
-            return self._over(add, self._nothing)
+            return self._accumulate(add, self._zero)
 
         @loss.defjvp
         def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
@@ -302,8 +302,8 @@ class Problem(eqx.Module):
         return loss(free)
 
     def condensed(self, free: tuple) -> Float[Array, "numbers numbers"]:
-        """The triangle, of which the last column is n + 1 numbers that stand for the residual, in value and
-        in derivative. Forward mode."""
+        """The triangle, whose last column of n + 1 numbers replaces the residual, in value and derivative.
+        Forward mode."""
 
         @jax.custom_jvp
         def condensed(free: tuple) -> Array:
@@ -318,7 +318,7 @@ class Problem(eqx.Module):
         return condensed(free)
 
     def _triangle(self, free: tuple) -> Float[Array, "numbers numbers"]:
-        """The triangle R c; 0 ρ of the QR factors of [J r], with a diagonal that is not negative."""
+        """The triangle [R c; 0 ρ] of the QR factorisation of [J r], with a non-negative diagonal."""
         flat, unravel = ravel_pytree(free)
         n = flat.size
 
@@ -329,19 +329,19 @@ class Problem(eqx.Module):
             rows = jnp.concatenate([triangle, _jacobian(residual, flat)])
             return jnp.linalg.qr(rows, mode="r")
 
-        triangle = self._over(add, jnp.zeros((n + 1, n + 1), flat.dtype))
-        # the signs of QR's rows are arbitrary, and must not jump from step to step
+        triangle = self._accumulate(add, jnp.zeros((n + 1, n + 1), flat.dtype))
+        # QR's row signs are arbitrary; fixed here, so that they do not jump from step to step
         return triangle * jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
 
     @property
-    def _nothing(self) -> Float[Array, ""]:
+    def _zero(self) -> Float[Array, ""]:
         return jnp.zeros(())
 
     def _loss_of(self, tiles: Tiles, item: Any, free: tuple) -> Float[Array, ""]:
         return jnp.sum(tiles.of(self.free.forward(free), item, "replay") ** 2) / 2
 
-    def _over(self, add: Callable[[Tiles, Any, Any], Any], total: Any) -> Any:
-        """The sum of what each tile adds."""
+    def _accumulate(self, add: Callable[[Tiles, Any, Any], Any], total: Any) -> Any:
+        """Accumulate `add` over all tiles, starting from `total`."""
         for tiles in self.residual.tiles(self.tile):
             total, _ = jax.lax.scan(
                 lambda total, item, tiles=tiles: (add(tiles, total, item), None), total, tiles.items
@@ -350,7 +350,7 @@ class Problem(eqx.Module):
 
 
 def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Array, "entries numbers"]:
-    """[J r] by forward mode, a number of columns at a time."""
+    """[J r] by forward mode, at most `TANGENTS` columns at a time."""
     n = at.size
     chunk = min(n, TANGENTS)
     chunks = math.ceil(n / chunk)
@@ -362,8 +362,8 @@ def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Arra
 
 
 def tile_entries(residual: Residual, free: tuple, max_jacobian: int, least_squares: bool) -> int:
-    """How many entries of the residual are differentiated at once: so many that their rows [J r] fit into
-    `max_jacobian` bytes; all, where no Jacobian is made."""
+    """Number of residual entries differentiated at once: as many as have rows [J r] that fit into
+    `max_jacobian` bytes; all of them if no Jacobian is computed."""
     if not least_squares:
         return residual.count()
     bytes_of_row = (size(free) + 1) * 4

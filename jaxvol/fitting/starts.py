@@ -1,4 +1,4 @@
-"""Where does a fit begin that knows nothing yet?"""
+"""Where does a fit start when nothing is known yet?"""
 
 from typing import Any
 
@@ -11,16 +11,15 @@ from ..volume import Volume
 
 
 def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = None) -> TransferFunction:
-    """A transfer function to start a fit from: middle grey, and the same extinction everywhere.
+    """A transfer function to start a fit from: middle grey, with the same extinction everywhere.
 
     **Arguments:**
 
-    - `volume`: the optical depth across it is about 1: what lies behind is seen, and so is what is in
-      front.
-    - `points`: how many control points, at least 2, evenly spaced.
-    - `clim`: their range (low, high), value units; by default that of the volume's values.
+    - `volume`: its optical depth becomes about 1, so that the back is visible as well as the front.
+    - `points`: number of control points, at least 2, evenly spaced.
+    - `clim`: their range (low, high), in value units; by default that of the volume's values.
 
-    **Raises:** `ValueError` for fewer than two points, and a range that does not increase.
+    **Raises:** `ValueError` for fewer than two points, and for a range that does not increase.
     """
     points = integer("points", points, 2)
     clim = (float(volume.data.min()), float(volume.data.max())) if clim is None else clim

@@ -1,6 +1,6 @@
-"""Which volume is in a medical image, along the axes of the patient? SimpleITK reads it.
+"""Reads medical images with SimpleITK, as volumes along the axes of the patient.
 
-MetaImage without compression and NRRD are left to SimpleITK, which takes what their header says.
+Uncompressed MetaImage and NRRD files are left to SimpleITK, which trusts their headers.
 """
 
 import gzip
@@ -15,13 +15,13 @@ from .._util.files import MOST_VOXELS, Header, as_array, check_size, chunks, dec
 
 
 def read_medical(path: Path, header: Header) -> dict[str, Any]:
-    """Reader of `.nii`, `.nii.gz`, `.mha`, `.mhd` and `.nrrd`."""
+    """Reader for `.nii`, `.nii.gz`, `.mha`, `.mhd` and `.nrrd`."""
     header.refuse(path)
-    held = file_size(path)
+    n_bytes = file_size(path)
     try:
         import SimpleITK as sitk
     except ImportError as fault:
-        raise ImportError(f"{path} needs SimpleITK to be read: pip install jaxvol[io]") from fault
+        raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     with decoding(path):
@@ -29,41 +29,41 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
         size, parts = reader.GetSize(), reader.GetNumberOfComponents()
         if len(size) != 3 or parts != 1 or not 0 < math.prod(size) <= MOST_VOXELS:
             raise ValueError(
-                f"path: {path} must be a 3-D image of one value a voxel and fewer than 2**31 voxels; "
-                f"got size {size} and {parts} values a voxel."
+                f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; "
+                f"got size {size} and {parts} values per voxel."
             )
-        # ITK returns garbage, and no error, for NIfTI cut short and for MetaImage that fails to inflate
+        # for truncated NIfTI and for MetaImage that fails to inflate, ITK returns garbage without an error
         if path.name.lower().endswith((".nii", ".nii.gz")):
-            _check_nifti(path, reader, held)
+            _check_nifti(path, reader, n_bytes)
         image = _inflated_metaimage(path, reader) or reader.Execute()
     image = sitk.DICOMOrient(image, "LPS")
     direction = np.reshape(image.GetDirection(), (3, 3))
     if not np.allclose(direction, np.eye(3), rtol=0, atol=1e-3):
         raise ValueError(
-            f"path: {path} is oblique, which is not supported: its axes, turned as near to LPS as they go, "
-            f"are {direction.round(3).tolist()}. Resample it on a grid along the patient's axes."
+            f"path: {path} is oblique, which is not supported: its axes, reoriented as close to LPS as "
+            f"possible, are {direction.round(3).tolist()}. Resample it on a grid along the patient's axes."
         )
-    # a copy: the view dies with the image
+    # copied, because the view is invalid once the image is freed
     data = np.array(sitk.GetArrayViewFromImage(image).T, order="C")
     if data.dtype == np.float64:
         data = data.astype(np.float32)
     return {"data": data, "spacing": image.GetSpacing(), "origin": image.GetOrigin()}
 
 
-def _check_nifti(path: Path, reader: Any, held: int) -> None:
+def _check_nifti(path: Path, reader: Any, n_bytes: int) -> None:
     voxels = math.prod(reader.GetSize()) * int(reader.GetMetaData("bitpix")) // 8
     expected = int(float(reader.GetMetaData("vox_offset"))) + voxels
     if path.name.lower().endswith(".gz"):
         with gzip.open(path) as stream:
-            held = sum(map(len, chunks(stream, expected + 1)))
-    check_size(path, min(held, expected), expected)  # NIfTI may be followed by other data
+            n_bytes = sum(map(len, chunks(stream, expected + 1)))
+    check_size(path, min(n_bytes, expected), expected)  # other data may follow the voxels
 
 
 def _inflated_metaimage(path: Path, reader: Any) -> Any | None:
-    """The image of a compressed MetaImage; None for every other file.
+    """The image in a compressed MetaImage; None for any other file.
 
-    Its header may say how many compressed bytes there are. ITK believes that and leaves the rest of
-    the volume unset where it is too few; here the compressed stream itself says where it ends.
+    The header may state the number of compressed bytes. If that is too small, ITK still trusts it and leaves
+    the rest of the volume unset; here the end is that of the compressed stream itself.
     """
     import SimpleITK as sitk
 
@@ -83,7 +83,7 @@ def _inflated_metaimage(path: Path, reader: Any) -> Any | None:
     msb = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "")).lower().startswith("t")
     voxel = sitk.GetArrayViewFromImage(sitk.Image([1, 1, 1], reader.GetPixelIDValue())).dtype
     expected = math.prod(reader.GetSize()) * voxel.itemsize
-    content = zlib.decompressobj(wbits=47).decompress(packed, expected + 1)  # 47: a zlib or a gzip header
+    content = zlib.decompressobj(wbits=47).decompress(packed, expected + 1)  # 47: a zlib or gzip header
     check_size(path, len(content), expected)
     array = as_array(content, reader.GetSize()[::-1], voxel.newbyteorder(">" if msb else "<"), "C")
     image = sitk.GetImageFromArray(array)

@@ -1,6 +1,6 @@
-"""Which array is in a file that has no header of its own?
+"""Reads arrays from files without a header.
 
-Its shape and type are told by the caller, by a JSON beside it, or by its name.
+Shape and type are given by the caller, by a JSON file beside the file, or by its name.
 """
 
 import gzip
@@ -22,27 +22,27 @@ RAW_DTYPE = re.compile(r"(u?int8|u?int16|float16|float32|float64)(le|be)?", re.I
 
 
 def read_raw(path: Path, header: Header) -> dict[str, Any]:
-    """Reader of `.raw` and `.raw.gz`, x fastest."""
-    held = file_size(path)
-    given = {name: said for name, said in header._asdict().items() if said is not None}
-    said = _name_header(path) | _json_header(path) | given
-    if not {"shape", "dtype"} <= said.keys():
+    """Reader for `.raw` and `.raw.gz`, x fastest."""
+    size = file_size(path)
+    given = {name: value for name, value in header._asdict().items() if value is not None}
+    fields = _name_header(path) | _json_header(path) | given
+    if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
-            f"path: nothing says which shape and dtype {path} has. Give load(path, shape=(nx, ny, nz), "
-            f'dtype="uint8"), or call it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
+            f"path: the shape and dtype of {path} are unknown. Use load(path, shape=(nx, ny, nz), "
+            f'dtype="uint8"), or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
             '{"size": [nx, ny, nz], "type": "uint8"}.'
         )
-    shape, dtype = _raw_shape(path, said.pop("shape")), _raw_dtype(path, said.pop("dtype"))
+    shape, dtype = _raw_shape(path, fields.pop("shape")), _raw_dtype(path, fields.pop("dtype"))
     expected = math.prod(shape) * dtype.itemsize
     if path.name.lower().endswith(".gz"):
-        # the size in gzip's trailer is the writer's claim, and modulo 2**32: only reading tells
+        # the size in gzip's trailer is unverified and modulo 2**32: only decompressing tells
         with decoding(path), gzip.open(path) as stream:
             content = read_all(path, stream, expected)
     else:
-        check_size(path, held, expected)
+        check_size(path, size, expected)
         with path.open("rb") as stream:
             content = read_all(path, stream, expected)
-    return {"data": as_array(content, shape, dtype, "F"), **said}
+    return {"data": as_array(content, shape, dtype, "F"), **fields}
 
 
 def _name_header(path: Path) -> dict[str, Any]:
@@ -51,20 +51,20 @@ def _name_header(path: Path) -> dict[str, Any]:
 
 
 def _json_header(path: Path) -> dict[str, Any]:
-    bare = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    beside = [file for name in (path.name, bare) if (file := path.with_name(f"{name}.json")).is_file()]
-    if not beside:
+    stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+    candidates = [file for name in (path.name, stem) if (file := path.with_name(f"{name}.json")).is_file()]
+    if not candidates:
         return {}
     try:
-        said = json.loads(beside[0].read_text(encoding="utf-8"))
+        fields = json.loads(candidates[0].read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as fault:
-        raise ValueError(f"path: the header {beside[0]} is not JSON ({fault}).") from fault
-    if not isinstance(said, dict):
+        raise ValueError(f"path: the header {candidates[0]} is not JSON ({fault}).") from fault
+    if not isinstance(fields, dict):
         raise ValueError(
-            f"path: the header {beside[0]} must be a JSON object with the keys {', '.join(JSON_KEYS)}; "
-            f"got {type(said).__name__}."
+            f"path: the header {candidates[0]} must be a JSON object with the keys {', '.join(JSON_KEYS)}; "
+            f"got {type(fields).__name__}."
         )
-    return {name: said[key] for key, name in JSON_KEYS.items() if key in said}
+    return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
 
 
 def _raw_shape(path: Path, shape: Any) -> tuple[int, ...]:
@@ -81,11 +81,11 @@ def _raw_shape(path: Path, shape: Any) -> tuple[int, ...]:
 
 
 def _raw_dtype(path: Path, dtype: Any) -> np.dtype:
-    match = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8 is called "uint8"
+    match = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
     if match is None:
         raise ValueError(
-            "dtype must be uint8, int8, uint16, int16, float16, float32 or float64, with le or be appended "
-            f"for its byte order; got {dtype!r} for {path}."
+            "dtype must be uint8, int8, uint16, int16, float16, float32 or float64, optionally with le or be "
+            f"appended for the byte order; got {dtype!r} for {path}."
         )
     name, order = match[1].lower(), (match[2] or "le").lower()
     return np.dtype(name).newbyteorder("<" if order == "le" else ">")

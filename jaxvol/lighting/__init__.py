@@ -1,4 +1,4 @@
-"""How does light fall on what is seen? Lights, and the materials that scatter it."""
+"""Lighting of samples: light sources, and the materials that scatter their light."""
 
 from .deferred import Deferred as Deferred
 from .lights import (

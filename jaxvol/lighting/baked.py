@@ -1,7 +1,7 @@
-"""What if the light at each place were known already? Computed once, in a volume of its own.
+"""Baked lighting: computed once on a grid of its own, then fetched.
 
-What a light does to a sample, but for what depends on the view, is the ratio of its colour as lit to its
-colour: three numbers, which vary more slowly than the colour does. They are computed on a grid, and fetched.
+Apart from what depends on the view, the effect of light on a sample is the ratio of its lit colour to its
+colour: three numbers, which vary more slowly than the colour does. They are computed on a grid and fetched.
 """
 
 from typing import Any
@@ -19,28 +19,28 @@ from .shading import Lighting, Sample, Shading, Surroundings, lit
 
 
 LEVELS = 2**10 - 1
-"""Steps from 0 to the highest ratio: 10 bits for each of the colours."""
+"""Quantization steps from 0 to the highest ratio: 10 bits per colour channel."""
 
 DARKEST = 1 / 64
-"""A colour below this counts as this: its ratio would have no bound."""
+"""Colours are clamped to at least this before dividing by them, since ratios would be unbounded otherwise."""
 
-GROWN = 2
-"""Nodes, around those where anything is seen, to which light is spread: samples lie between nodes."""
+DILATION = 2
+"""Nodes by which the ratios are extended around the visible nodes, since samples lie between nodes."""
 
 
-BYTES = 96
-"""Memory that a node takes while its light is computed: its ratios, whether they are known, and the sums over
-the nodes around."""
+BYTES_PER_NODE = 96
+"""Memory per node while its light is computed: its ratios, whether they are known, and the sums over the
+neighbouring nodes."""
 
 
 class BakedLighting(Lighting):
-    """Light that was computed before, by `bake`.
+    """Lighting computed in advance by `bake`.
 
-    - `words`: for each node of a grid that spans the volume's, the ratios of colours as lit to colours, 10
-      bits for each of red, green and blue.
-    - `highest`: the ratios that the highest of these numbers stands for.
+    - `words`: the ratios of lit colour to colour, 10 bits for each of red, green and blue, at each node of a
+      grid that spans the volume's grid.
+    - `highest`: for each channel, the ratio that the largest 10-bit number stands for.
 
-    It is as it was: it has no gradient, and neither does it follow the volume or the transfer function.
+    It is a snapshot: it has no gradient, and does not follow changes of the volume or the transfer function.
     """
 
     words: UInt32[Array, " nodes"]
@@ -59,12 +59,12 @@ class BakedLighting(Lighting):
 
 
 class BakedShading(Shading):
-    """Baked light ready for one image."""
+    """Baked lighting prepared for one image."""
 
     light: BakedLighting
 
     def about(self, around: Surroundings, sample: Sample) -> Vec3:
-        """The ratios at the sample, trilinear."""
+        """Ratios at the sample, by trilinear interpolation."""
         coordinate = around.space.coordinate(sample.point)
         ends = zip(coordinate, self.light.shape, around.volume.shape, strict=True)
         x, y, z = (c * ((n - 1) / (whole - 1)) for c, n, whole in ends)
@@ -77,7 +77,7 @@ class BakedShading(Shading):
             for side, fraction in zip(corner, fractions, strict=True):
                 weight = weight * (fraction if side else 1 - fraction)
             place = ((i + corner[0]) * ny + j + corner[1]) * nz + k + corner[2]
-            # signed, since conversion from those is one instruction
+            # int32, since signed integers are converted to float in one instruction
             word = self.light.words.at[place].get(mode="promise_in_bounds").astype(jnp.int32)
             r, g, b = (
                 total + weight * (word >> shift & LEVELS).astype(x.dtype)
@@ -92,20 +92,20 @@ class BakedShading(Shading):
 
 
 def nodes_for(volume: Volume, resolution: int) -> tuple[int, int, int]:
-    """The shape of a grid with so many nodes along the volume's longest side, and as many in proportion along
-    the others.
+    """Shape of a grid with `resolution` nodes along the volume's longest side, and the others in proportion.
 
-    **Raises:** `ValueError` where light on it would not fit into memory."""
+    **Raises:** `ValueError` if computing light on it would not fit into memory."""
     longest = max(volume.shape)
     nx, ny, nz = (max(2, round(resolution * n / longest)) for n in volume.shape)
     require_room(
-        nx * ny * nz * BYTES, f"a grid of {nx} x {ny} x {nz} nodes for baked={resolution}; take a coarser one"
+        nx * ny * nz * BYTES_PER_NODE,
+        f"a grid of {nx} x {ny} x {nz} nodes for baked={resolution}; use a coarser one",
     )
     return nx, ny, nz
 
 
 def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) -> BakedLighting:
-    """The light on a grid of nodes. NaN in what it is made of makes all of it NaN."""
+    """Compute the light on a grid of nodes. NaN in any of its inputs makes all of it NaN."""
     shading, around = jax.lax.stop_gradient((shading, around))
     nx, ny, nz = nodes
     classification = around.transfer.over(around.volume)
@@ -118,47 +118,49 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
         )
         measured = classification.searched(classification.measure((x, y, z)))
         color, extinction = classification.classify(measured)
-        still, one = jnp.zeros_like(extinction), jnp.ones_like(extinction)
-        none = jnp.zeros((), jnp.int32)
+        zero, one = jnp.zeros_like(extinction), jnp.ones_like(extinction)
+        column = row = jnp.zeros((), jnp.int32)
         point = around.space.point((x, y, z))
-        return Sample(point, (still, still, still), measured, color, extinction, one, (none, none))
+        return Sample(point, (zero, zero, zero), measured, color, extinction, one, (column, row))
 
     def ratio(number: Int[Array, ""]) -> Vec3:
         sample = node(number)
         r, g, b = (
-            new / jnp.maximum(old, DARKEST)
-            for new, old in zip(lit(shading, around, sample)[0], sample.color, strict=True)
+            lit_color / jnp.maximum(color, DARKEST)
+            for lit_color, color in zip(lit(shading, around, sample)[0], sample.color, strict=True)
         )
         return r, g, b
 
     count = nx * ny * nz
-    seen = jax.lax.map(lambda i: node(i).extinction != 0, jnp.arange(count), batch_size=min(count, 2**14))
-    chosen = Chosen.of([seen.reshape(1, -1)])
-    none = jnp.zeros(count, around.volume.spacing.dtype)
+    visible = jax.lax.map(lambda i: node(i).extinction != 0, jnp.arange(count), batch_size=min(count, 2**14))
+    chosen = Chosen.of([visible.reshape(1, -1)])
+    zeros = jnp.zeros(count, around.volume.spacing.dtype)
 
-    def chunk(places: Int[Array, " chunk"], found: Vec3) -> Vec3:
-        return chosen.put(found, places, jax.vmap(ratio)(jnp.minimum(places, count - 1)))
+    def chunk(places: Int[Array, " chunk"], channels: Vec3) -> Vec3:
+        return chosen.put(channels, places, jax.vmap(ratio)(jnp.minimum(places, count - 1)))
 
-    ratios = jnp.stack(chosen.over(chunk, (none, none, none)), axis=-1).reshape(nx, ny, nz, 3)
-    ratios = _spread(ratios, seen.reshape(nx, ny, nz))
+    ratios = jnp.stack(chosen.over(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
+    ratios = _dilate(ratios, visible.reshape(nx, ny, nz))
     highest = jnp.maximum(ratios.max((0, 1, 2)), 1e-6)
     steps = jnp.round(ratios.reshape(-1, 3) / highest[None] * LEVELS).astype(jnp.uint32)
     words = steps[:, 0] | steps[:, 1] << 10 | steps[:, 2] << 20
     return BakedLighting(words, highest, (nx, ny, nz))
 
 
-def _spread(ratios: Float[Array, "nx ny nz 3"], seen: Bool[Array, "nx ny nz"]) -> Float[Array, "nx ny nz 3"]:
-    """Each node beside some that are known gets their mean."""
-    known = seen.astype(ratios.dtype)[..., None]
-    for _ in range(GROWN):
-        total, count = _around(ratios * known), _around(known)
+def _dilate(
+    ratios: Float[Array, "nx ny nz 3"], visible: Bool[Array, "nx ny nz"]
+) -> Float[Array, "nx ny nz 3"]:
+    """Give each node that borders known ones the mean of their ratios."""
+    known = visible.astype(ratios.dtype)[..., None]
+    for _ in range(DILATION):
+        total, count = _sum_neighbors(ratios * known), _sum_neighbors(known)
         ratios = jnp.where(known > 0, ratios, total / jnp.maximum(count, 1))
         known = (count > 0).astype(ratios.dtype)
     return ratios
 
 
-def _around(values: Float[Array, "nx ny nz c"]) -> Float[Array, "nx ny nz c"]:
-    """The sum over each node and its 26 neighbours."""
+def _sum_neighbors(values: Float[Array, "nx ny nz c"]) -> Float[Array, "nx ny nz c"]:
+    """Sum over each node and its 26 neighbours."""
     for axis in range(3):
         padded = jnp.pad(values, [(1, 1) if i == axis else (0, 0) for i in range(4)])
         n = values.shape[axis]

@@ -1,7 +1,7 @@
-"""Where does light come from, and how much of it arrives? With Mitsuba's names and units.
+"""Light sources, and how much of their light arrives at a point. Names and units are Mitsuba's.
 
 Irradiance is power per area, radiance power per area and solid angle, each in linear RGB. Images by
-`path_trace`, and by `ScattererTemplates` wherever there is a material, are in radiance of the same unit.
+`path_trace`, and by `ScattererTemplates` wherever there is a material, are radiance in the same unit.
 """
 
 from abc import abstractmethod
@@ -18,8 +18,9 @@ from .._util.vec3 import Scalar, Vec3, apart
 class Arriving(NamedTuple):
     """Light that arrives at a point from one direction.
 
-    - `toward`: unit direction to the light. `distance`: to it, world length; infinite for parallel light.
-    - `irradiance`: (r, g, b) on a plane that faces the light, were nothing in between.
+    - `toward`: unit direction to the light. `distance`: to the light, world length; infinite for parallel
+      light.
+    - `irradiance`: (r, g, b) on a plane that faces the light, without occlusion.
     """
 
     toward: Vec3
@@ -28,23 +29,23 @@ class Arriving(NamedTuple):
 
 
 class Light(eqx.Module):
-    """A source of light outside the volume, or anywhere in it."""
+    """A light source outside the volume or anywhere inside it."""
 
 
 class LocatedLight(Light):
-    """Light that comes from a single direction at each point."""
+    """Light that reaches each point from a single direction."""
 
     @abstractmethod
     def at(self, point: Vec3) -> Arriving:
-        """What arrives at a world point."""
+        """Light that arrives at a world point."""
 
 
 class DirectionalLight(LocatedLight):
-    """Parallel light, as from a sun.
+    """Parallel light, such as sunlight.
 
     **Arguments:**
 
-    - `direction`: (3,) in which the light travels; of any length but 0.
+    - `direction`: (3,), in which the light travels; any length except 0.
     - `irradiance`: (3,) linear RGB, power per area on a plane that faces the light, ≥ 0.
 
     **Raises:** `ValueError` for other shapes, NaN or infinity, a direction of length 0, negative irradiance.
@@ -63,18 +64,18 @@ class DirectionalLight(LocatedLight):
 
     def at(self, point: Vec3) -> Arriving:
         x, y, z = apart(-self.direction / jnp.linalg.norm(self.direction))
-        like = jnp.zeros_like(point[0])
+        zero = jnp.zeros_like(point[0])
         r, g, b = apart(self.irradiance)
-        return Arriving((x + like, y + like, z + like), like + jnp.inf, (r + like, g + like, b + like))
+        return Arriving((x + zero, y + zero, z + zero), zero + jnp.inf, (r + zero, g + zero, b + zero))
 
 
 class PointLight(LocatedLight):
-    """Light from a point, alike in all directions. Its irradiance falls with the square of the distance.
+    """Isotropic point light. Its irradiance falls with the square of the distance.
 
     **Arguments:**
 
     - `position`: (3,) world point.
-    - `intensity`: (3,) linear RGB, power per solid angle, ≥ 0. At a distance r it makes an irradiance of
+    - `intensity`: (3,) linear RGB, power per solid angle, ≥ 0. The irradiance at distance r is
       intensity / r².
 
     **Raises:** `ValueError` for other shapes, NaN or infinity, and negative intensity.
@@ -89,7 +90,7 @@ class PointLight(LocatedLight):
 
     def at(self, point: Vec3) -> Arriving:
         dx, dy, dz = (p - x for p, x in zip(apart(self.position), point, strict=True))
-        # never 0, and neither is its derivative infinite, at the light itself
+        # bounded away from 0 at the light itself, where the derivative would be infinite
         squared = jnp.maximum(dx * dx + dy * dy + dz * dz, jnp.finfo(dx.dtype).tiny ** 0.5)
         distance = jnp.sqrt(squared)
         r, g, b = (i / squared for i in apart(self.intensity))
@@ -97,7 +98,7 @@ class PointLight(LocatedLight):
 
 
 class ConstantLight(Light):
-    """The same light from all directions: a white room, an overcast sky.
+    """The same radiance from all directions, as in a white room or under an overcast sky.
 
     **Arguments:**
 
@@ -113,10 +114,10 @@ class ConstantLight(Light):
 
 
 def lights_of(lights: Light | tuple[Light, ...] | Any) -> tuple[Light, ...]:
-    """One or several lights as a tuple. **Raises** `ValueError` for none, and for what is no light."""
+    """One or several lights as a tuple. **Raises** `ValueError` for no lights and for other objects."""
     several = (lights,) if isinstance(lights, Light) else lights
     if not isinstance(several, tuple | list) or not several:
-        raise ValueError(f"lights must be a light, or a tuple of some; got {lights!r}.")
+        raise ValueError(f"lights must be a light or a tuple of lights; got {lights!r}.")
     for light in several:
         if not isinstance(light, LocatedLight | ConstantLight):
             raise ValueError(f"lights must hold jaxvol lights, such as DirectionalLight; got {light!r}.")

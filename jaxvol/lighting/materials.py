@@ -1,4 +1,4 @@
-"""What does a material do to light inside it, and where in a volume is it?"""
+"""Materials: how they scatter light, and where in a volume they are."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from ..volume import Volume
 
 
 class Optics(NamedTuple):
-    """What a material does to light, wherever it is; of several materials, arrays."""
+    """Optical properties of a material; arrays for several materials."""
 
     opacity: Float[Array, "..."]
     mean_free_path: Float[Array, "..."]
@@ -22,41 +22,41 @@ class Optics(NamedTuple):
 
     @property
     def optics(self) -> "Optics":
-        """Itself, so that it may stand where a `Material` does."""
+        """Itself, so that it can be used in place of a `Material`."""
         return self
 
     @property
     def reflectance(self) -> Float[Array, "..."]:
-        """R, the share of light from all sides that a half-space of the material sends back, were it white:
-        of the single-scattering albedo ω = 1 - opacity, alike in all directions.
+        """Reflectance R of a half-space of the material under light from all sides, if its colour is white:
+        isotropic scattering with single-scattering albedo ω = 1 - opacity.
 
-        `R = r (1 - γ / (3 (1 + γ)))`, `r = (1 - γ) / (1 + γ)`, `γ = √(1 - ω)`; off by at most 0.0014 from the
-        integral over Chandrasekhar's function H. Source: Hapke, Theory of Reflectance and Emittance
-        Spectroscopy, 1993.
+        `R = r (1 - γ / (3 (1 + γ)))`, `r = (1 - γ) / (1 + γ)`, `γ = √(1 - ω)`; within 0.0014 of the integral
+        over Chandrasekhar's H function. Source: Hapke, Theory of Reflectance and Emittance Spectroscopy,
+        1993.
         """
-        # never 0, where its derivative is infinite
+        # bounded away from 0, where the derivative of the square root is infinite
         gamma = jnp.sqrt(jnp.maximum(self.opacity, jnp.finfo(self.opacity.dtype).tiny ** 0.5))
         return (1 - gamma) / (1 + gamma) * (1 - gamma / (3 * (1 + gamma)))
 
 
 class Material(eqx.Module):
-    """Something that scatters light: skin, muscle, bone.
+    """A material that scatters light, such as skin, muscle or bone.
 
     **Arguments:**
 
-    - `opacity`: α, the share of light that is absorbed where it is scattered, in [0, 1]: 1 minus the
-      transparency of Lee, Kwon and Shin (2016), and, in white matter, 1 minus the single-scattering albedo of
-      path tracing. Templates ask for one above 0, see their `threshold`.
-    - `mean_free_path`: λ, the mean distance from one scattering to the next, world length, > 0.
+    - `opacity`: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
+      Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
+      tracing. Scatterer templates need an opacity above 0, see their `threshold`.
+    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0.
       `from_scatterers` computes it.
     - `refractive_index`: > 0; 1 in air.
-    - `values`: (low, high), the values of the volume that are of this material, low < high; or
-    - `label`: the label of the volume that is. One of the two says where the material is;
-      neither: everywhere.
+    - `values`: (low, high), the range of volume values that are this material, low < high; or
+    - `label`: the volume's label for this material. Give one of the two to say where the material is;
+      without either, it is everywhere.
 
     All but `values` and `label` are differentiable.
 
-    **Raises:** `ValueError` for numbers out of these ranges, and for both `values` and `label`.
+    **Raises:** `ValueError` for numbers out of these ranges, and if both `values` and `label` are given.
     """
 
     opacity: Float[Array, ""]
@@ -102,13 +102,13 @@ class Material(eqx.Module):
         *rest: Arrayable,
         **where: Arrayable,
     ) -> "Material":
-        """A material of so many scatterers.
+        """A material whose mean free path follows from the density and size of its scatterers.
 
         **Arguments:**
 
         - `density`: n, scatterers per volume, > 0. `cross_section`: σ, the effective area of each, > 0.
           The mean free path is `1 / (√2 n σ)`, as between the particles of a Maxwell–Boltzmann gas.
-        - All else as for the class.
+        - All other arguments: as for the class.
         """
         density, cross_section = (
             number("density", density, above=0),
@@ -118,9 +118,9 @@ class Material(eqx.Module):
 
 
 PRESETS = {"skin": (0.5, 0.7, 1.39), "muscle": (0.6, 1.4, 1.37), "bone": (0.8, 0.6, 1.55)}
-"""Opacity, mean free path in mm, refractive index. The paths are those between two scatterings after which
-light has lost its direction (1 / μs′ of soft tissue and bone in red light); the opacities are chosen for
-pictures: tissue absorbs far less of each scattering than templates of a few dozen photons can follow."""
+"""Opacity, mean free path in mm, refractive index. The lengths are transport mean free paths, after which
+light has lost its direction (1 / μs′ of soft tissue and bone in red light). The opacities are chosen for
+appearance: tissue absorbs far less at each scattering than templates of a few dozen photons can represent."""
 
 
 def material(name: str, *, millimetre: float = 1.0, **where: Arrayable) -> Material:
@@ -128,10 +128,10 @@ def material(name: str, *, millimetre: float = 1.0, **where: Arrayable) -> Mater
 
     **Arguments:**
 
-    - `millimetre`: its length in world units, where these are not mm.
+    - `millimetre`: length of 1 mm in world units, if these are not mm.
     - `values` or `label`: as for `Material`.
 
-    **Raises:** `ValueError` for another name, and as `Material` does.
+    **Raises:** `ValueError` for any other name, and as `Material` does.
     """
     if name not in PRESETS:
         raise ValueError(f"name must be one of {', '.join(PRESETS)}; got {name!r}.")
@@ -140,10 +140,10 @@ def material(name: str, *, millimetre: float = 1.0, **where: Arrayable) -> Mater
 
 
 def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
-    """One or several materials as a tuple. **Raises** `ValueError` for none, and for what is no material."""
+    """One or several materials as a tuple. **Raises** `ValueError` for no materials and for other objects."""
     several = (materials,) if isinstance(materials, Material) else tuple(materials)
     if not several:
-        raise ValueError("materials must hold a Material at least; got none.")
+        raise ValueError("materials must hold at least one Material; got none.")
     for each in several:
         if not isinstance(each, Material):
             raise ValueError(f"materials must hold jaxvol materials; got {each!r}.")
@@ -153,40 +153,40 @@ def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
 def shares(
     materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
 ) -> tuple[Scalar, ...]:
-    """How much of a place each material has: 1 for the first that is there and 0 for all others; or, where
-    they meet, shares that sum to at most 1.
+    """Share of each material at a point: 1 for the first that is present and 0 for all others; or, where
+    materials meet softly, shares that sum to at most 1.
 
     **Arguments:**
 
     - `value`: of the volume at the grid coordinate.
-    - `edge`: 0 for a sharp choice. Above 0, the part of its range of values over which a material comes and
-      goes, and the label is looked up trilinearly, so that shares are continuous, and differentiable.
+    - `edge`: 0 for sharp edges. Above 0, the fraction of its value range over which a material fades in and
+      out; labels are then looked up trilinearly. So shares are continuous and differentiable.
     """
-    left, each = jnp.ones_like(value), []
+    remaining, each = jnp.ones_like(value), []
     for one in materials:
         if one.label is not None:
             sharp = volume.label(coordinate) == one.label if edge == 0 else None
-            there = volume.label_share(coordinate, one.label) if sharp is None else sharp.astype(value.dtype)
+            share = volume.label_share(coordinate, one.label) if sharp is None else sharp.astype(value.dtype)
         elif one.values is None:
-            there = jnp.ones_like(value)
+            share = jnp.ones_like(value)
         else:
             low, high = jax.lax.stop_gradient(one.values)
             if edge == 0:
-                there = step(value - low) * step(high - value)
+                share = step(value - low) * step(high - value)
             else:
                 width = edge * (high - low)
-                there = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
-        each.append(left * there)
-        left = left * (1 - there)
+                share = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
+        each.append(remaining * share)
+        remaining = remaining * (1 - share)
     return tuple(each)
 
 
 def step(x: Scalar, at_0: float = 1.0) -> Scalar:
-    """0 below 0, and 1 above. Of NaN NaN, which a comparison would make a 0."""
+    """0 below 0, `at_0` at 0, and 1 above. NaN stays NaN, where a comparison would give 0."""
     return jnp.where(x == 0, at_0, (jnp.sign(x) + 1) / 2)
 
 
 def smoothstep(x: Scalar) -> Scalar:
-    """From 0 at 0 to 1 at 1, smoothly."""
+    """Smooth ramp from 0 at 0 to 1 at 1."""
     x = jnp.clip(x, 0, 1)
     return x * x * (3 - 2 * x)

@@ -1,7 +1,7 @@
-"""How do scatterers light a sample? By the photons of a template, laid around it.
+"""Lighting by scatterer templates: the photons of a template, placed around a sample, light it.
 
-Each photon tells where light comes from that is scattered on to the sample: those on the lit side, and not
-hidden, make it bright; those inside matter give it their colour.
+Each photon marks a place from which light is scattered to the sample: photons on the lit side that are not
+hidden make the sample bright, photons inside matter add the colour found there.
 
 Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
 volume rendering (2016), sections 3.3 and 3.4.
@@ -43,92 +43,96 @@ from .template import (
 Occlusion = Literal["soft", "hard"]
 
 EDGE = 0.1
-"""Under soft occlusion a material comes and goes over this part of its range of values."""
+"""With soft occlusion, a material fades in and out over this fraction of its value range."""
 
 TWILIGHT = 0.25
-"""Under soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
+"""With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
 
 
 WHITE = 4 / (3 * math.pi)
-"""What makes radiance of irradiance, so that opaque white matter that absorbs nothing is as bright as the
-light around it. Of the photons around a sample in a flat face, half are outside, from where light comes,
-and half are inside, and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c, in light of
+"""Factor from irradiance to radiance, by which opaque white matter that absorbs nothing is as bright as the
+light around it. Of the photons around a sample on a flat face, half are outside, where the light comes from,
+and half are inside and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c in light of
 radiance L."""
 
 
 class ScattererTemplates(Lighting):
     """Light scattered inside materials, by templates.
 
-    A sample x of a material has around it the photons of one of the material's templates, photon j at x + p_j
-    with intensity a_j. Under lights of irradiance E, a sample of colour c gets the radiance
+    A sample at x in a material is surrounded by the photons of one of the material's templates: photon j lies
+    at x + p_j and has intensity a_j. Under lights of irradiance E, a sample of colour c gets the radiance
 
         k R Σ_lights E b (c + s)    b = Σ_lit side a_j v_j    s = Σ_in matter a_j c(x + p_j)
 
-    1. On the lit side are photons nearer to the light than x. Constant light has an irradiance of π times its
-       radiance, and comes from all sides.
-    2. v_j is 0 for a photon that is hidden, 1 for others, tested at x + p_j and at its multiples `reach`.
-    3. b, the brightness, grows with the intensities of photons that are not hidden.
-    4. s, the colour that shines through from inside, comes from photons in the same material,
+    1. The lit side consists of the photons nearer to the light than x. Constant light has an irradiance of π
+       times its radiance, and comes from all sides.
+    2. The visibility v_j is 0 for a hidden photon and 1 for others, tested at x + p_j and at the multiples
+       `reach` of p_j.
+    3. b, the brightness, grows with the intensities of the photons that are not hidden.
+    4. s, the inner colour that shines through, comes from photons in the same material,
     5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
-       times its intensity, n being refractive indices, α opacities, and those of its material primed.
-    6. Photons are left out where the ray's transmittance times their intensity is below `cutoff`.
+       times its intensity. Here n is the refractive index, α the opacity, and primes mark the photon's
+       material.
+    6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
-    What belongs to no material keeps its colour. Where a material comes in softly, half of it is there at its
-    edge; all that is within is lit as matter of it, and keeps nothing of its own colour.
+    A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
+    inwards, a sample is lit entirely as that material, and keeps nothing of its own colour.
 
-    **Scale.** The paper's sum is E b (c + s), in no unit. Here the intensities of a template sum to 1 (but
-    for `given` ones, and printed energy, which are taken as they are), and k R makes it radiance, on the
-    scale of `path_trace`: k = 4 / (3π) is a constant, and R = `Optics.reflectance` that of the sample's
-    material, which falls from 1 to 0 as its opacity rises. So ratios between pixels of one material are
-    the paper's where its template held all energy before it was scaled; where the threshold cut some off, s
-    counts for more here. To have the paper's sum, divide by k R. A flat face of white matter, of which
-    nothing is seen but its surface, has a radiance of R L under a `ConstantLight` of radiance L.
+    **Scale.** The paper's sum is E b (c + s), without a unit. Here the intensities of a template sum to 1
+    (except for `given` templates and printed energy, which are used as they are), and k R turns the sum into
+    radiance on the scale of `path_trace`: k = 4 / (3π) is a constant, and R is the `Optics.reflectance` of
+    the sample's material, which falls from 1 to 0 as its opacity rises. So ratios between pixels of one
+    material are the paper's if its template held all energy before it was scaled; if the threshold cut some
+    off, s weighs more here. To get the paper's sum, divide by k R. A flat face of white matter, of which only
+    the surface is visible, has a radiance of R L under a `ConstantLight` of radiance L.
 
-    Measured on white half-spaces of opacities from 0.05 to 0.9, seen along the normal, against the exact
-    radiance of multiple scattering: 0.91 to 1.13 times as bright in constant light, 0.88 to 1.27 in
-    parallel light along the normal, and 1.05 to 1.55 at an incidence of 60°, where light from beside the
-    face is not yet hidden; of each the lower half where extinction is 1/λ, the upper where it is 10/λ.
-    Of a white sphere of opacities 0.1 to 0.7, seen whole, templates had 0.67 to 0.76 of the radiance in
-    constant light, and 0.67 to 0.92 in parallel light (in samples an optical depth of 2 apart; a fifth of
-    the step made 0.74 of 0.72).
-    Where colours are darker than white, templates are too bright: in path tracing a colour darkens each of
-    many scatterings, and in templates the whole once.
+    Measured relative to the exact radiance of multiple scattering, on white half-spaces of opacities from
+    0.05 to 0.9, seen along the normal: 0.91 to 1.13 in constant light, 0.88 to 1.27 in parallel light along
+    the normal, and 1.05 to 1.55 at an incidence of 60°, where light from beside the face is not yet hidden.
+    The lower half of each range is for an extinction of 1/λ, the upper for 10/λ.
+    For a white sphere of opacities 0.1 to 0.7, seen whole, 0.67 to 0.76 of the radiance in constant light,
+    and 0.67 to 0.92 in parallel light (with steps of optical depth 2; a fifth of the step turned 0.72 into
+    0.74).
+    For colours darker than white, templates are too bright: in path tracing the colour darkens each of many
+    scatterings, in templates it darkens the sum once.
 
     **Arguments:**
 
-    - `materials`: one or several. Where a place belongs to two, the first counts.
+    - `materials`: one or several. Where two overlap, the first counts.
     - `lights`: one or several.
-    - `templates`: for each material. `blend`: use all of them for every sample, rather than one, chosen at
-      random for each pixel (our choice: the paper does not say which sample takes which): less noise, at as
-      many times the cost.
-    - `photons`: of each template keep so many of the brightest, which hold the energy of all. By default all.
-    - `occlusion`: `"soft"`: v_j is the transmittance of the way to x + p_j and on through `reach`, were each
-      stretch of it like its far end; materials meet in ramps, the lit side ends in one, and the image is
-      differentiable. `"hard"`: as published: a photon is hidden where anything is seen at one of these
-      places. Its gradient with respect to λ, the light and the camera is wrong, since it does not see
-      photons that become hidden, or change their material.
-    - `reach`: multiples of a photon's offset, above 1 and increasing, against thin parts before others.
-    - `cutoff`: by default 0.02 under hard occlusion, as published, and 0 under soft. Above 0 the gradient
-      does not see photons that are left out.
-    - `seed`: of templates, and of their choice for each pixel.
+    - `templates`: number per material. `blend`: use all of them for every sample, instead of one per pixel,
+      chosen at random (our choice: the paper does not say which sample uses which template). This has less
+      noise, and its cost grows with the number of templates.
+    - `photons`: keep this many of each template's brightest photons, scaled to the energy of all. By default
+      all.
+    - `occlusion`: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
+      each segment taken at its far end; materials and the lit side have soft edges, and the image is
+      differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
+      points. The gradient with respect to λ, the light and the camera is then wrong, since it misses photons
+      that become hidden or change their material.
+    - `reach`: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
+      for thin parts in front of others.
+    - `cutoff`: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
+      misses the photons that are skipped.
+    - `seed`: of the templates, and of their choice for each pixel.
     - `packets`, `threshold`, `energy`, `critical_angle`: of the templates, see `scatterer_template`.
-    - `baked`: False, or how many nodes a grid has along the volume's longest side on which the light is
-      computed once, and fetched from then on: for a volume, a transfer function and a lighting as they are.
-      All templates are blended there, and nothing is left out for the ray's transmittance. It carries no
-      gradient. Where lighting, volume or transfer function are traced, it is computed in each image.
-    - `levels`: of their trees; needed where an opacity is traced.
-    - `given`: templates to be used instead of grown ones, with leading axes (materials, templates); lengths
-      stay as they are, so that nothing depends on the materials' mean free paths, and so do intensities.
+    - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light is
+      computed once and then fetched, as long as volume, transfer function and lighting stay the same. All
+      templates are blended there, and no photon is skipped for the ray's transmittance. It carries no
+      gradient. If lighting, volume or transfer function is traced, it is computed for each image.
+    - `levels`: of the templates' trees; required if an opacity is traced.
+    - `given`: templates to use instead of grown ones, with leading axes (materials, templates). Their lengths
+      and intensities are used as they are, so that nothing depends on the materials' mean free paths.
 
-    Templates are grown anew in each image, from the materials' numbers as they are, so that these have
+    Templates are grown anew for each image from the materials' current parameters, so that these have
     gradients.
 
-    The gradient of extinction lacks, at places where the extinction is 0, what light they would show: nothing
-    is lit that is not seen.
+    At points of extinction 0, the gradient of the extinction lacks the light that the points would show,
+    since invisible points are not lit.
 
-    **Raises:** `ValueError` for arguments of other kinds, where `levels` are needed, for a material of
-    which the threshold leaves no photon (where its opacity is traced, the image is NaN), and for templates
-    or a grid that do not fit into memory.
+    **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
+    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for templates or
+    a grid that do not fit into memory.
     """
 
     materials: tuple[Material, ...]
@@ -176,7 +180,7 @@ class ScattererTemplates(Lighting):
         except TypeError:
             grows = False
         if not grows:
-            raise ValueError(f"reach must be multiples above 1 that increase; got {reach!r}.")
+            raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
         if cutoff is None:
             cutoff = 0.02 if occlusion == "hard" else 0.0
         self.cutoff = None
@@ -186,34 +190,34 @@ class ScattererTemplates(Lighting):
         if critical_angle is not None:
             self.critical_angle = number("critical_angle", critical_angle, above=0, below=90.001)
         packets, threshold, energy = settings(packets, threshold, energy)
-        # True: fine enough for what scatters over several voxels
+        # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
         self.given = given
         if not isinstance(given, ScattererTemplate | None):
             raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")
         if given is not None:
-            whole = given.intensity.shape[-1]
+            available = given.intensity.shape[-1]
             if given.intensity.ndim != 3 or given.intensity.shape[0] != len(self.materials):
                 raise ValueError(
                     f"given must hold templates of {len(self.materials)} materials, "
-                    f"(materials, templates, n); got {given.intensity.shape}."
+                    f"with intensities of shape (materials, templates, n); got {given.intensity.shape}."
                 )
             self.templates, levels = given.intensity.shape[1], 0
         else:
             require_photons(self.materials, packets, threshold)
-            how: Any = {"packets": packets, "threshold": threshold, "energy": energy}
+            growth: Any = {"packets": packets, "threshold": threshold, "energy": energy}
             opacities = [each.opacity for each in self.materials]
             if levels is None:
-                levels = max(template_levels(each, **how) for each in self.materials)
+                levels = max(template_levels(each, **growth) for each in self.materials)
             if is_traced(opacities):
-                whole = packets * (2**levels - 1)
+                available = packets * (2**levels - 1)
             else:
-                whole = max(photons_above(each, **how) for each in self.materials)
+                available = max(photons_above(each, **growth) for each in self.materials)
         self.growth = (packets, threshold, energy, levels)
-        self.photons = whole if photons is None else min(whole, integer("photons", photons, 1))
+        self.photons = available if photons is None else min(available, integer("photons", photons, 1))
 
     def grown(self, *, blend: bool) -> ScattererTemplate:
-        """The templates as they are used: (materials, templates or 1, photons)."""
+        """The templates that are used, of shape (materials, templates or 1, photons)."""
         packets, threshold, energy, levels = self.growth
         if self.given is not None:
             templates = self.given
@@ -228,7 +232,7 @@ class ScattererTemplates(Lighting):
                 critical_angle=self.critical_angle,
                 levels=levels,
             )
-            if energy == "conserving":  # with what the threshold has cut off
+            if energy == "conserving":  # restores the energy that the threshold has cut off
                 templates = templates.normalized()
         if blend:
             templates = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
@@ -237,19 +241,19 @@ class ScattererTemplates(Lighting):
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
         if not self.baked:
             return self
-        # of a march, light depends on how places are found alone
+        # of the march, only the transforms that locate points affect the light
         spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
         leaves, tree = jax.tree.flatten((self, without_voxels(volume), transfer, spaces))
         if is_traced(leaves, volume.data):
             return self
-        memory = kept(volume.data, _memory)
-        known = memory.get(tree)
-        if known is None or not all(_same(a, b) for a, b in zip(known[0], leaves, strict=True)):
-            memory.clear()
-            with jax.ensure_compile_time_eval():  # what is kept must outlive a `jax.jit` around
+        cache = kept(volume.data, _bake_cache)
+        entry = cache.get(tree)
+        if entry is None or not all(_same(a, b) for a, b in zip(entry[0], leaves, strict=True)):
+            cache.clear()
+            with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
                 around = Surroundings(volume, transfer, march.locate(volume))
-                memory[tree] = known = leaves, _baked(self, around)
-        return known[1]
+                cache[tree] = entry = leaves, _baked(self, around)
+        return entry[1]
 
     def over(self, around: Surroundings) -> Shading:
         if self.baked:
@@ -261,17 +265,17 @@ class ScattererTemplates(Lighting):
         return jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
 
     def _bake(self, around: Surroundings) -> BakedLighting:
-        nodes = nodes_for(around.volume, self.baked)  # before templates are grown
+        nodes = nodes_for(around.volume, self.baked)  # checks the memory before templates are grown
         return bake(TemplateShading(self, self.grown(blend=True), self._optics, None), around, nodes)
 
 
-def _memory(_: Array) -> dict:
-    """Light baked for a volume: the last one, under what else it was made of."""
+def _bake_cache(_: Array) -> dict:
+    """Cache of a volume's baked light: the last one only, keyed by its other inputs."""
     return {}
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether two leaves are known to be equal: large ones, such as labels, only if they are one array."""
+    """Whether two leaves are certainly equal; large ones, such as labels, only if they are the same array."""
     return a is b or (np.size(a) <= 2**16 and np.array_equal(np.asarray(a), np.asarray(b)))
 
 
@@ -281,19 +285,19 @@ def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
 
 
 class _Notes(NamedTuple):
-    """What all photons of a sample have in common."""
+    """What is common to all photons of a sample."""
 
     shares: tuple[Scalar, ...]
     parts: tuple[Scalar, ...]
-    """The shares, made to sum to 1 if there are any."""
+    """The shares, normalized to sum to 1 if any is above 0."""
     optics: Optics
     template: Int[Array, ""]
     lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
-    """Of each: the direction to it and the distance, and the irradiance. No direction: from all sides."""
+    """For each light: direction to it, distance and irradiance. Direction None: from all sides."""
 
 
 class TemplateShading(Shading):
-    """Templates ready for one image."""
+    """Templates prepared for one image."""
 
     how: ScattererTemplates
     templates: ScattererTemplate
@@ -313,7 +317,7 @@ class TemplateShading(Shading):
         return shares(self.how.materials, around.volume, coordinate, value, edge=edge)
 
     def about(self, around: Surroundings, sample: Sample) -> _Notes:
-        found = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
+        material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
         choice = jnp.zeros((), jnp.int32)
         if (count := self.templates.intensity.shape[1]) > 1:
             u, _, _ = hashed_uniforms(*sample.pixel, jnp.uint32(self.how.seed), jnp.float32)
@@ -325,33 +329,33 @@ class TemplateShading(Shading):
                 lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
             elif isinstance(light, LocatedLight):
                 lights.append(tuple(light.at(sample.point)))
-        whole = sum(found)
-        parts = tuple(share / jnp.where(whole > 0, whole, 1) for share in found)
-        none = Optics(*(jnp.ones_like(whole),) * 3)
-        return _Notes(found, parts, _blend(self.optics, parts, none), choice, tuple(lights))
+        total = sum(material_shares)
+        parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
+        default = Optics(*(jnp.ones_like(total),) * 3)
+        return _Notes(material_shares, parts, _blend(self.optics, parts, default), choice, tuple(lights))
 
     def term(self, around: Surroundings, sample: Sample, notes: _Notes, number: Int[Array, ""]) -> Any:
         offset, intensity = self._photon(notes, number)
         if self.cutoff is not None:
-            alone = intensity * (self.how.templates if self.how.blend else 1)
-            intensity = jnp.where(sample.transmittance * alone < self.cutoff, 0, intensity)
+            unblended = intensity * (self.how.templates if self.how.blend else 1)
+            intensity = jnp.where(sample.transmittance * unblended < self.cutoff, 0, intensity)
         place = around.at(_beside(sample, offset))
-        there = self._shares(around, place.coordinate, place.value)
-        there = tuple(place.inside * share for share in there)
-        optics, scale = _blend(self.optics, there, notes.optics), intensity
+        place_shares = self._shares(around, place.coordinate, place.value)
+        place_shares = tuple(place.inside * share for share in place_shares)
+        optics, scale = _blend(self.optics, place_shares, notes.optics), intensity
         if len(self.how.materials) > 1:
-            # another material bends light, and stretches the template with it
-            speed = notes.optics.refractive_index / optics.refractive_index
+            # refraction into another material stretches the template by the ratio of the speeds of light
+            speed_ratio = notes.optics.refractive_index / optics.refractive_index
             x, y, z = offset
-            offset = x * speed, y * speed, z * speed
+            offset = x * speed_ratio, y * speed_ratio, z * speed_ratio
             place = around.at(_beside(sample, offset))
             own = notes.optics.opacity
             scale = intensity * jnp.where(own == 0, 0, optics.opacity / jnp.where(own == 0, 1, own))
-        if self._soft:  # as much as is there over the distance from one scattering to the next
+        if self._soft:  # the opacity of one mean free path there
             matter = -jnp.expm1(-place.extinction * optics.mean_free_path)
         else:
             matter = step(place.extinction, 0.0)
-        r, g, b = (scale * sum(there) * matter * c for c in place.color)
+        r, g, b = (scale * sum(place_shares) * matter * c for c in place.color)
 
         seen = intensity * self._visible(around, sample, offset, place.extinction)
         brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in notes.lights)
@@ -359,7 +363,7 @@ class TemplateShading(Shading):
 
     def color(self, sample: Sample, notes: _Notes, sums: Any) -> Vec3:
         brightness, inner = sums
-        # all of what is at a material's edge: were a part left, it would shine by itself
+        # 1 from a material's soft edge inwards: an unlit part of the colour would look like emission
         matter = jnp.minimum(2 * sum(notes.shares), 1)
         scale = matter * WHITE * notes.optics.reflectance
         red, green, blue = (
@@ -372,7 +376,7 @@ class TemplateShading(Shading):
         return red, green, blue
 
     def _photon(self, notes: _Notes, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
-        """Offset and intensity of a photon, of the sample's material; or between those of several."""
+        """Offset and intensity of a photon of the sample's material, or of several blended by their parts."""
         x = y = z = intensity = jnp.zeros_like(notes.parts[0])
         for m, part in enumerate(notes.parts):
             offset = self.templates.offset[m, notes.template, number]
@@ -381,7 +385,7 @@ class TemplateShading(Shading):
         return (x, y, z), intensity
 
     def _visible(self, around: Surroundings, sample: Sample, offset: Vec3, first: Scalar) -> Scalar:
-        """How much of a photon is seen from the sample, of which extinction it has itself being known."""
+        """Visibility of a photon from the sample; `first` is the extinction at the photon itself."""
         further = [around.extinction(_beside(sample, offset, k)) for k in self.how.reach]
         places = [first, *further]
         if not self._soft:
@@ -392,12 +396,12 @@ class TemplateShading(Shading):
         return jnp.exp(-depth * _norm(offset))
 
     def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
-        """Whether a photon is nearer to the light than the sample is."""
+        """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
         if toward is None:
             return jnp.ones_like(offset[0])
         length = _norm(offset)
         closer = sum(p * d for p, d in zip(offset, toward, strict=True))
-        # of a light at a finite distance r, r - |r d - p|, in a form that loses no digits
+        # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
         near = closer - length**2 / (2 * distance)
         if not self._soft:
             return step(near, 0.0)
@@ -414,10 +418,10 @@ def _norm(offset: Vec3) -> Scalar:
 
 
 def _blend(optics: Optics, shares: tuple[Scalar, ...], rest: Optics) -> Optics:
-    """The optics of a place by the shares of materials there; what no material has is like the rest."""
-    left = 1 - sum(shares)
+    """Optics averaged over the materials at a point, weighted by their shares; `rest` fills up to 1."""
+    remaining = 1 - sum(shares)
     blended = (
-        sum(share * each[m] for m, share in enumerate(shares)) + left * other
+        sum(share * each[m] for m, share in enumerate(shares)) + remaining * other
         for each, other in zip(optics, rest, strict=True)
     )
     return Optics(*blended)

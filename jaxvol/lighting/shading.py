@@ -1,34 +1,34 @@
-"""How is a classified sample lit? By looking around it, place after place, and summing up.
+"""How is a classified sample shaded? The interface of lightings.
 
-This is the seam between the transfer function and the compositor. A `Lighting` is what a user gives;
-a `Shading` is what it becomes for one image; and `lit` is what every engine asks of it.
+Shading comes between the transfer function and compositing. A user passes a `Lighting`; it makes a `Shading`
+for each image; and engines call `lit`, which looks at places around a sample, one by one, and sums up.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._util.fetching import Recording
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..march import March
-from ..space import Space
+from ..space import Line, Space
 from ..transfer import Classification, Measured, Transfer
 from ..volume import Volume, with_fetch
 
 
 class Sample(NamedTuple):
-    """A sample that is to be lit.
+    """A sample to be shaded.
 
     - `point`: in the world. `direction`: of the ray, a unit vector.
-    - `measured`, `color`, `extinction`: what the volume and the transfer function say there.
-    - `transmittance`: how much of it reaches the camera.
-    - `pixel`: (column, row), the key of everything random.
+    - `measured`, `color`, `extinction`: from the volume and the transfer function.
+    - `transmittance`: between the sample and the camera.
+    - `pixel`: (column, row), which keys random numbers.
     """
 
     point: Vec3
@@ -43,8 +43,8 @@ class Sample(NamedTuple):
 class Place(NamedTuple):
     """What is at a point of the world.
 
-    - `inside`: how much of it: 1 in the volume, and falling to 0 at one voxel outside, so that no light
-      changes at once where the volume ends. `extinction` falls with it.
+    - `inside`: 1 in the volume, falling to 0 at one voxel outside, so that light does not jump at the
+      volume's faces. `extinction` is multiplied by it.
     """
 
     inside: Scalar
@@ -55,17 +55,17 @@ class Place(NamedTuple):
 
 
 class Surroundings(eqx.Module):
-    """What can be seen from a sample."""
+    """The scene, as seen from a sample."""
 
     volume: Volume
     transfer: Transfer
     space: Space
     live: Bool[Array, ""] | None = None
-    """True, which XLA must not know: see `compiled.in_memory`. None: no branches, out of which a volume could
-    not tell what it was asked for."""
+    """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
+    recorded inside one."""
 
     def at(self, point: Vec3) -> Place:
-        """What is at a point."""
+        """What is at a world point."""
         inside, coordinate, measured = self._measured(point)
 
         def found(measured: Measured) -> tuple[Vec3, Scalar]:
@@ -75,7 +75,7 @@ class Surroundings(eqx.Module):
         return Place(inside, coordinate, measured[0], color, inside * extinction)
 
     def extinction(self, point: Vec3) -> Scalar:
-        """The extinction at a point, and no more."""
+        """The extinction at a world point."""
         inside, _, measured = self._measured(point)
         return inside * self.transfer.over(self.volume).classify(measured)[1]
 
@@ -96,45 +96,55 @@ class Surroundings(eqx.Module):
 
 
 class Shading(eqx.Module):
-    """A lighting made ready for one image. All methods see one sample.
+    """A lighting, made ready for one image. All methods see one sample.
 
-    A sample's light is a sum over places around it, of which only `term` looks at the volume's values.
+    A sample's light is a sum of `terms` over places around it. Only `term` looks at the volume.
     """
 
     @property
     def terms(self) -> int:
-        """How many places are looked at."""
+        """The number of terms."""
         return 0
 
     @abstractmethod
     def about(self, around: Surroundings, sample: Sample) -> PyTree:
-        """What all terms want to know of the sample itself."""
+        """What all terms need to know about the sample itself."""
 
     def term(self, around: Surroundings, sample: Sample, notes: PyTree, number: Int[Array, ""]) -> PyTree:
-        """What one place adds: arrays, which are summed up over all. Not asked where `terms` is 0."""
+        """One term: arrays, which are summed over all terms. Not called where `terms` is 0."""
         return ()
 
     @abstractmethod
     def color(self, sample: Sample, notes: PyTree, sums: PyTree) -> Vec3:
-        """The colour as lit."""
+        """The shaded colour."""
 
 
 class Lighting(eqx.Module):
-    """How samples are lit."""
+    """How samples are shaded; or, where `shades_pixels`, finished pixels."""
+
+    shades_pixels: ClassVar[bool] = False
+    """Whether rays are marched without light, and `shade_pixel` is called once for each of them."""
 
     @abstractmethod
     def over(self, around: Surroundings) -> Shading:
-        """Ready for one image. What does not depend on the sample is computed here, once."""
+        """The shading of one image. What does not depend on the sample is computed here, once."""
 
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> "Lighting":
-        """What is worth being computed once for several images, where nothing is traced."""
+        """This lighting with what is worth computing once for several images, where nothing is traced."""
         return self
+
+    def shade_pixel(
+        self, seen: Classification, space: Space, line: Line, rgba: Float[Array, "4"], depth: Scalar
+    ) -> Float[Array, "4"]:
+        """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
+        depth. `seen.light` shades samples."""
+        return rgba
 
 
 def classification(
     volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None
 ) -> Classification:
-    """What transfer function and lighting make of the places of a volume."""
+    """Measuring, classifying and shading the places of a volume."""
     seen = transfer.over(volume)
     if lighting is None:
         return seen

@@ -1,4 +1,4 @@
-"""What does light make of a volume when it is scattered any number of times? Unbiased, by tracing paths."""
+"""Unbiased path tracing of light that a volume scatters any number of times."""
 
 from .path_trace import path_trace as path_trace
 from .result import PathTraced as PathTraced

@@ -1,4 +1,4 @@
-"""What does light meet at a place in a volume? An extinction, and an albedo."""
+"""The medium at a point of a volume: its extinction and albedo."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,10 +12,10 @@ from ..volume import Volume
 
 
 class Medium(NamedTuple):
-    """A volume as something that scatters and absorbs.
+    """A volume as a medium that scatters and absorbs light.
 
-    - `measure`: what is read from memory at a grid coordinate.
-    - `meet`: from that to extinction (1/length) and single-scattering albedo (r, g, b) in [0, 1].
+    - `measure`: reads from memory what is needed at a grid coordinate.
+    - `meet`: maps that to extinction (1/length) and single-scattering albedo (r, g, b) in [0, 1].
     """
 
     measure: Callable[[Vec3], Measured]
@@ -23,22 +23,22 @@ class Medium(NamedTuple):
 
     @classmethod
     def of(cls, volume: Volume, transfer: Transfer, materials: tuple[Material, ...] = ()) -> "Medium":
-        """Extinction is the transfer function's, at the trilinear value, and albedo its colour.
+        """Medium with the transfer function's extinction, at the trilinear value, and its colour as albedo.
 
-        What the transfer function shows of a material has an extinction of 1/λ in place of its own, and an
-        albedo of colour · (1 - opacity). Where materials overlap, the first counts.
+        Where the transfer function shows a material, the extinction is 1/λ instead, and the albedo is
+        colour · (1 - opacity). Where materials overlap, the first counts.
         """
-        seen = transfer.over(volume)
+        classification = transfer.over(volume)
 
         def measure(coordinate: Vec3) -> Measured:
-            measured = seen.measure(coordinate)
+            measured = classification.measure(coordinate)
             if not materials:
                 return measured
             return (*shares(materials, volume, coordinate, measured[0]), *measured)
 
         def meet(measured: Measured) -> tuple[Scalar, Vec3]:
             share, measured = measured[: len(materials)], measured[len(materials) :]
-            color, extinction = seen.classify(seen.searched(measured))
+            color, extinction = classification.classify(classification.searched(measured))
             kept = jnp.ones_like(extinction)
             visible = extinction > 0
             for part, material in zip(share, materials, strict=True):

@@ -1,4 +1,4 @@
-"""In which direction does light go on from a scattering? The phase function of Henyey and Greenstein."""
+"""The Henyey–Greenstein phase function: the direction of light after a scattering."""
 
 import math
 
@@ -8,10 +8,10 @@ from .._util.vec3 import Scalar, Vec3
 
 
 def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
-    """Density, per solid angle, of the direction after a scattering; its integral over the sphere is 1.
+    """Density, per solid angle, of the direction after a scattering; it integrates to 1 over the sphere.
 
-    - `cosine`: of the angle between the directions in which light travels before and after.
-    - `anisotropy`: g in (-1, 1), the mean cosine: 0 alike in all directions, above 0 forward.
+    - `cosine`: of the angle between the directions of travel before and after.
+    - `anisotropy`: g in (-1, 1), the mean cosine: 0 for isotropic, above 0 for forward scattering.
 
     Source: Henyey and Greenstein 1941.
     """
@@ -22,10 +22,10 @@ def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
 
 
 def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
-    """A cosine drawn from `phase`, by inversion, from a number in [0, 1).
+    """Draw a cosine from `phase` by inversion, from a uniform number in [0, 1).
 
-    The inverse in its usual form, `(1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g`, multiplied out: this one
-    keeps its digits as g goes to 0, where the other divides rounding by it.
+    This is the usual inverse, `(1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g`, multiplied out. It stays
+    accurate as g goes to 0, where the usual form divides rounding errors by g.
     """
     g, x = anisotropy, 2 * uniform - 1
     numerator = x + g * ((3 + x * x) / 2 + g * (x - g * (1 - x * x) / 2))
@@ -33,7 +33,7 @@ def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
 
 
 def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
-    """A unit direction drawn from `phase` around the z axis, from two numbers in [0, 1)."""
+    """Draw a unit direction from `phase` around the z axis, from two uniform numbers in [0, 1)."""
     cosine = scattered_cosine(anisotropy, first)
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0))
     angle = 2 * math.pi * second
@@ -41,14 +41,14 @@ def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
 
 
 def turned(around_z: Vec3, direction: Vec3) -> Vec3:
-    """A unit direction that lies around another one as `around_z` does around the z axis."""
+    """Rotate a unit direction around the z axis to one that lies in the same way around `direction`."""
     (x, y, cosine), (dx, dy, dz) = around_z, direction
-    (a, b, c), (d, e, f) = _beside(direction)
+    (a, b, c), (d, e, f) = _orthonormal(direction)
     return _unit((x * a + y * d + cosine * dx, x * b + y * e + cosine * dy, x * c + y * f + cosine * dz))
 
 
-def _beside(direction: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit directions at right angles to a unit direction, and to each other.
+def _orthonormal(direction: Vec3) -> tuple[Vec3, Vec3]:
+    """Two unit vectors orthogonal to a unit direction and to each other.
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
     """
@@ -60,7 +60,7 @@ def _beside(direction: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def _unit(direction: Vec3) -> Vec3:
-    """A direction that is of unit length but for rounding, which would add up over many scatterings."""
+    """Restore unit length up to first order; rounding errors would add up over many scatterings."""
     x, y, z = direction
     scale = (3 - (x * x + y * y + z * z)) / 2  # 1 / sqrt(n), to first order around 1
     return x * scale, y * scale, z * scale

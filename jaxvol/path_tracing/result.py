@@ -1,4 +1,4 @@
-"""What does path tracing give back?"""
+"""The result of path tracing: an image with its standard error."""
 
 from typing import Any
 
@@ -8,16 +8,16 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 
 class PathTraced(eqx.Module):
-    """An image by path tracing, so far.
+    """A path-traced image, from the paths traced so far.
 
     - `radiance`: linear RGB of the light that the volume scatters into the camera, mean over all paths,
-      without what is seen behind it.
-    - `opacity`: the share of camera rays that met anything.
+      without the background.
+    - `opacity`: the fraction of camera rays that met anything.
     - `deviations`: sums of the squared deviations of each path's radiance from the mean.
-    - `scatterings`: how often a path was scattered, on average.
-    - `exhausted`: whether any path was cut off by `max_scatterings`: the pixel lacks what it would have
-      brought.
-    - `paths`: for each pixel. `seed`: of all that was random.
+    - `scatterings`: mean number of scatterings of a path.
+    - `exhausted`: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
+      contributed.
+    - `paths`: per pixel. `seed`: of all random numbers.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -30,9 +30,9 @@ class PathTraced(eqx.Module):
 
     @property
     def standard_error(self) -> Float[Array, "height width 3"]:
-        """Of `radiance`, from the variance of the pixel's paths; infinite for a single path.
+        """Standard error of `radiance`, from the variance of the pixel's paths; infinite for a single path.
 
-        A pixel in whose few paths a rare bright one is missing is too dark, and tells too small an error.
+        If a pixel's few paths miss a rare bright one, the pixel is too dark and its error too small.
         """
         return jnp.sqrt(self._variance(self.deviations))
 
@@ -41,14 +41,14 @@ class PathTraced(eqx.Module):
         return self.radiance + (1 - self.opacity[..., None]) * self._background(background)
 
     def image_error(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
-        """Standard error of `image`, to which the noise of `opacity` contributes."""
+        """Standard error of `image`, including the noise of `opacity`."""
         background, met = self._background(background), self.opacity[..., None]
-        # a path that meets nothing brings no radiance: their means tell how the two are correlated
+        # a path that meets nothing has radiance 0, so the means determine the covariance of the two
         mixed = background * (1 - met) * (background * met - 2 * self.radiance)
         return jnp.sqrt(jnp.maximum(self._variance(self.deviations + self.paths * mixed), 0))
 
     def joined(self, other: "PathTraced") -> "PathTraced":
-        """All paths of this result and of another one, with other paths of the same scene.
+        """Combine this result with another one, of other paths of the same scene.
 
         Source: Chan, Golub and LeVeque 1983.
         """
@@ -58,11 +58,11 @@ class PathTraced(eqx.Module):
         def mean(a: Array, b: Array) -> Array:
             return a + (b - a) * part
 
-        apart = jnp.square(other.radiance - self.radiance) * (self.paths * part)
+        between = jnp.square(other.radiance - self.radiance) * (self.paths * part)
         return PathTraced(
             radiance=mean(self.radiance, other.radiance),
             opacity=mean(self.opacity, other.opacity),
-            deviations=self.deviations + other.deviations + apart,
+            deviations=self.deviations + other.deviations + between,
             scatterings=mean(self.scatterings, other.scatterings),
             exhausted=self.exhausted | other.exhausted,
             seed=self.seed,
@@ -70,7 +70,7 @@ class PathTraced(eqx.Module):
         )
 
     def _variance(self, deviations: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
-        """Of a mean, from the squared deviations of all paths."""
+        """Variance of a mean, from the squared deviations of all paths."""
         if self.paths < 2:
             return jnp.full_like(deviations, jnp.inf)
         return deviations / (self.paths * (self.paths - 1))

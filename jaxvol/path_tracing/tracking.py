@@ -1,11 +1,11 @@
-"""Where does light meet something on its way? Woodcock tracking, from block to block of a volume.
+"""Woodcock tracking of collisions along a flight, block by block of a volume.
 
-Within a block, candidates for a collision lie at exponential distances under the block's majorant. A
-candidate is one for the caller to decide: real with the probability extinction / majorant, by which a path
-is sampled (delta tracking); or else to be passed with what is left, 1 - extinction / majorant, whose
-product is an unbiased estimate of the transmittance (ratio tracking). At the border of a block the distance
-is drawn anew: an exponential distribution has no memory. Blocks are counted in whole numbers, so that a
-flight always arrives, however its coordinates are rounded.
+Within a block, collision candidates lie at exponentially distributed distances under the block's majorant.
+The caller decides what to do with a candidate: to accept it with probability extinction / majorant, which
+samples a path (delta tracking); or to pass it with the weight 1 - extinction / majorant, and the product of
+these weights is an unbiased estimate of the transmittance (ratio tracking). At the border of a block the
+distance is drawn anew, since the exponential distribution is memoryless. Blocks have integer indices, so that
+a flight always arrives, however its coordinates are rounded.
 
 Sources: Woodcock et al. 1965; Novák et al., "Monte Carlo Methods for Volumetric Light Transport
 Simulation", 2018; Amanatides and Woo 1987 (from block to block).
@@ -22,19 +22,19 @@ from .majorants import Block, Majorants
 
 
 CROSSINGS = 2
-"""Borders that a flight may cross before the next look into memory: those who arrive earlier wait."""
+"""Block borders that a flight may cross between two fetches of voxels; flights that arrive earlier wait."""
 
 
 TINY = 1e-20
-"""Grid coordinates per world length that count as none."""
+"""Rates below this (grid coordinates per world length) count as 0."""
 
 
 class Flight(eqx.Module):
-    """A straight way through the grid.
+    """A straight segment through the grid, travelled up to `depth`.
 
-    - `start`: grid coordinate. `rate`: its change per world length, nowhere 0.
-    - `depth`: world length past the start, so far. `end`: that at which the flight is over.
-    - `block`: where it is. `entry`: that block's in the table of majorants.
+    - `start`: grid coordinate. `rate`: its change per world length; no component is 0.
+    - `depth`: world length from the start, so far. `end`: the depth at which the flight ends.
+    - `block`: the current block. `entry`: its entry in the table of majorants.
     """
 
     start: Vec3
@@ -48,8 +48,8 @@ class Flight(eqx.Module):
     def to(
         cls, majorants: Majorants, start: Vec3, direction: Vec3, spacing: Vec3, distance: Scalar
     ) -> "Flight":
-        """From a grid coordinate in a world direction, over this distance, or to the border of the grid."""
-        x, y, z = (_not_0(d / step) for d, step in zip(direction, spacing, strict=True))
+        """Flight from a grid coordinate in a world direction, over `distance` or to the grid's border."""
+        x, y, z = (_nonzero(d / step) for d, step in zip(direction, spacing, strict=True))
         end = distance
         for rate, at, last in zip((x, y, z), start, majorants.last, strict=True):
             end = jnp.minimum(end, (jnp.where(rate > 0, last, 0) - at) / rate)
@@ -58,10 +58,10 @@ class Flight(eqx.Module):
 
 
 class Candidate(eqx.Module):
-    """Where a flight has come to.
+    """Where a flight has stopped.
 
-    - `found`: at a candidate for a collision, at the grid coordinate `place`, under this `majorant`.
-    - `over`: at its end. Neither of the two: on its way.
+    - `found`: at a collision candidate, at the grid coordinate `place`, under this `majorant`.
+    - `over`: at its end. If neither holds, the flight is still on its way.
     """
 
     found: Bool[Array, "..."]
@@ -71,7 +71,7 @@ class Candidate(eqx.Module):
 
 
 def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, Candidate]:
-    """On to the next candidate of a flight, to its end, or across CROSSINGS borders of blocks.
+    """Advance a flight to its next candidate, to its end, or across CROSSINGS block borders.
 
     `uniform`: a random number in [0, 1).
     """
@@ -91,9 +91,9 @@ def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, 
 
 
 def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Flight, Scalar, Array, Array]:
-    """To where a flight has come through this optical depth; or to the border of the box in which the
-    majorant holds, a block's, or that of empty space around it. With what is left of the optical depth;
-    whether it is spent; and whether the flight is over."""
+    """Advance a flight by an optical depth, or to the border of the box in which its majorant holds: a block,
+    or the empty space around it. Also returns the remaining optical depth, whether it is used up (a
+    candidate), and whether the flight ends."""
     majorant, reach = jnp.maximum(flight.entry, 0), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
     axes = list(zip(flight.start, flight.rate, majorants.indices(flight.block), majorants.shape, strict=True))
     walls = [_wall(start, rate, index, reach, count) for start, rate, index, count in axes]
@@ -101,8 +101,8 @@ def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Fligh
     stop = jnp.minimum(border, flight.end)
     thickness = majorant * jnp.maximum(stop - flight.depth, 0)
     collides, ends = optical < thickness, flight.end <= border
-    on = flight.depth + optical / jnp.where(collides, majorant, 1)
-    depth = jnp.where(collides, jnp.minimum(on, stop), jnp.maximum(stop, flight.depth))
+    collision = flight.depth + optical / jnp.where(collides, majorant, 1)
+    depth = jnp.where(collides, jnp.minimum(collision, stop), jnp.maximum(stop, flight.depth))
     behind = majorants.block(
         *(
             _next(start + depth * rate, rate, index, reach, count, wall <= border)
@@ -115,17 +115,17 @@ def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Fligh
 
 
 def _wall(start: Scalar, rate: Scalar, index: Array, reach: Array, count: int) -> Scalar:
-    """The depth at which a flight meets the side of the box around its block, along one axis. The sides of
-    the grid are none: there flights end."""
+    """Depth at which a flight reaches the side of the box around its block, along one axis. Infinite for the
+    sides of the grid, where flights end."""
     side = jnp.where(rate > 0, index + reach + 1, index - reach)
     inner = (side > 0) & (side < count)
     return jnp.where(inner, (BLOCK * side.astype(start.dtype) - start) / rate, jnp.inf)
 
 
 def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: int, leaves: Array) -> Array:
-    """The index, along one axis, of the block behind the side of the box; or, where another side is nearer,
-    of that in which the flight has arrived. It never turns back, so that rounding cannot keep it where it
-    is."""
+    """Index, along one axis, of the flight's next block: the one behind the box if the flight `leaves` it on
+    this side, else the one that holds `coordinate`. It never turns back along the flight, so that rounding
+    cannot hold a flight where it is."""
     ahead = rate > 0
     first, last = index - jnp.where(ahead, 0, reach), index + jnp.where(ahead, reach, 0)
     arrived = jnp.floor(coordinate / BLOCK).astype(jnp.int32)
@@ -133,6 +133,6 @@ def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: i
     return jnp.where(leaves, jnp.where(ahead, last + 1, first - 1), inside)
 
 
-def _not_0(rate: Scalar) -> Scalar:
-    """The rate, or one too small to matter whose inverse is still a number."""
+def _nonzero(rate: Scalar) -> Scalar:
+    """The rate, or, if it is near 0, a negligible one with a finite inverse."""
     return jnp.where(jnp.abs(rate) < TINY, TINY, rate)

@@ -1,8 +1,8 @@
-"""What happens to light on its way from the eye? It flies, is scattered, looks for a light, and flies on.
+"""Random walks of light, traced backwards from the camera: flights, scatterings and next-event estimation.
 
-A walk is one path, traced backwards from the camera. It is always on one flight: its own, or one from its
-last scattering towards a light, by which it learns how much of that light arrives. Both ask the same of a
-volume, so that walks at different stages run side by side, a step at a time, without waiting for each other.
+A walk is one path. It is always on one flight: its own, or one from its last scattering towards a light,
+which estimates how much of that light arrives. Both query the volume in the same way, so that walks at
+different stages run side by side, a step at a time, without waiting for each other.
 """
 
 from typing import NamedTuple, TypeAlias
@@ -24,30 +24,30 @@ from .tracking import Candidate, Flight, fly
 
 
 ROULETTE = 0.25
-"""What a walk may still bring, or a light still sends, relative to its start. Below it chance decides whether
-to follow it: with a probability in proportion, and then as if it were this much."""
+"""Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light. A value
+below it survives with a probability in proportion, and is then raised to the threshold."""
 
-MOST_STEPS = 2**24
+MAX_STEPS = 2**24
 """Steps after which a walk counts as exhausted, against walks that never end."""
 
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
-"""The key of all that is random along a path: pixel, path, seed."""
+"""Key of all random numbers along a path: pixel, path, seed."""
 
 Uniforms: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
-"""Random numbers in [0, 1)."""
+"""Uniform random numbers in [0, 1)."""
 
 
 class Walk(eqx.Module):
-    """One path, as far as it has come.
+    """The state of one path.
 
-    - `words`: the key of all that is random along it. `steps`: taken so far.
-    - `flight`: that which it is on, towards a light if `to_light`; else its own.
-    - `direction`: of its own flight, world, unit; the next one while it looks for a light.
-    - `throughput`: the share of light at its end that arrives at the camera; (r, g, b).
-    - `promised`: what the light will add if nothing stands between, of which `clear` is left so far.
-    - `radiance`: gathered.
-    - `met`: whether the camera's ray met anything. `scatterings`: so far.
-    - `alive`: whether it goes on. `exhausted`: whether it was cut off.
+    - `words`: key of all its random numbers. `steps`: number of steps so far.
+    - `flight`: the current flight: towards a light if `to_light`, else its own.
+    - `direction`: of its own flight, world, unit; on the way to a light, that of its next own flight.
+    - `throughput`: fraction of the light at its end that arrives at the camera; (r, g, b).
+    - `unoccluded`: what the light adds without occlusion; `transmittance`: towards the light, so far.
+    - `radiance`: gathered so far.
+    - `met`: whether the camera ray met anything. `scatterings`: number so far.
+    - `alive`: whether it continues. `exhausted`: whether it was cut off.
     """
 
     words: Words
@@ -56,8 +56,8 @@ class Walk(eqx.Module):
     to_light: Bool[Array, ""]
     direction: Vec3
     throughput: Vec3
-    promised: Vec3
-    clear: Scalar
+    unoccluded: Vec3
+    transmittance: Scalar
     radiance: Vec3
     met: Bool[Array, ""]
     scatterings: Int[Array, ""]
@@ -72,30 +72,30 @@ class Walk(eqx.Module):
         direction: Vec3,
         alive: Bool[Array, ""],
     ) -> "Walk":
-        """From the camera's side of the volume."""
-        no, none, nothing = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros_like(flight.depth)
-        black, one = (nothing, nothing, nothing), nothing + 1
+        """A walk on its first flight, from where the camera's ray enters the volume."""
+        no, zero_count, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros_like(flight.depth)
+        black, one = (zero, zero, zero), zero + 1
         return cls(
             words,
-            steps=none,
+            steps=zero_count,
             flight=flight,
             to_light=no,
             direction=direction,
             throughput=(one, one, one),
-            promised=black,
-            clear=nothing,
+            unoccluded=black,
+            transmittance=zero,
             radiance=black,
             met=no,
-            scatterings=none,
+            scatterings=zero_count,
             alive=alive,
             exhausted=no,
         )
 
 
 class Scene(NamedTuple):
-    """What walks walk through.
+    """The scene that walks travel through.
 
-    - `most`: scatterings that a walk may have.
+    - `max_scatterings`: scatterings that a walk may have.
     """
 
     volume: Volume
@@ -103,7 +103,7 @@ class Scene(NamedTuple):
     majorants: Majorants
     lights: tuple[Light, ...]
     anisotropy: Scalar
-    most: Int[Array, ""]
+    max_scatterings: Int[Array, ""]
 
     @property
     def located(self) -> tuple[LocatedLight, ...]:
@@ -111,7 +111,7 @@ class Scene(NamedTuple):
 
     @property
     def surroundings(self) -> Vec3:
-        """Radiance from all around."""
+        """Radiance of all constant lights."""
         constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
         return apart(sum(constant, jnp.zeros(3, jnp.float32)))
 
@@ -120,12 +120,12 @@ class Scene(NamedTuple):
         return apart(self.volume.spacing)
 
     def flight(self, start: Vec3, direction: Vec3, end: Scalar) -> Flight:
-        """From a grid coordinate in a world direction."""
+        """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
         return Flight.to(self.majorants, start, direction, self.spacing, end)
 
     def light(self, place: Vec3, uniform: Scalar) -> Arriving:
-        """What arrives at a grid coordinate from one of the located lights, chosen at random, on average
-        from all of them."""
+        """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
+        weighted to give that of all of them on average."""
         x, y, z = (o + c * s for o, c, s in zip(apart(self.volume.origin), place, self.spacing, strict=True))
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -136,24 +136,24 @@ class Scene(NamedTuple):
 
 
 class Scattering(NamedTuple):
-    """What a scattering makes of a walk: where it goes on to, as `Walk` has it, and where it looks first.
+    """The outcome of a scattering: new values for fields of `Walk`, and the next flight.
 
-    - `toward`, `end`: world direction, and length, of its next flight.
+    - `toward`, `end`: world direction and length of the next flight.
     """
 
     direction: Vec3
     throughput: Vec3
-    promised: Vec3
+    unoccluded: Vec3
     to_light: Bool[Array, ""]
     toward: Vec3
     end: Scalar
 
 
 def step(scene: Scene, walks: Walk) -> Walk:
-    """The next step of many walks, arrays of one length: a part of a flight, and what comes of it.
+    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome.
 
-    XLA computes anew what several results are made of, for each of them; but not what a branch has put in
-    memory. So everything dear is behind one.
+    XLA recomputes a shared intermediate for each of its uses, unless a branch has put it in memory. So every
+    expensive computation is behind a branch.
     """
     live = jnp.any(walks.alive)
     first, second = (in_memory(live, jax.vmap(lambda w, i=i: _uniforms(w, i)), walks) for i in (0, 1))
@@ -169,7 +169,7 @@ def step(scene: Scene, walks: Walk) -> Walk:
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
     scattering = in_memory(
         live,
-        jax.vmap(lambda *of_one: _scattering(scene, *of_one)),
+        jax.vmap(lambda *of_one: _scatter(scene, *of_one)),
         walks,
         candidate.place,
         albedo,
@@ -180,63 +180,62 @@ def step(scene: Scene, walks: Walk) -> Walk:
     found, over = candidate.found & walks.alive, candidate.over & walks.alive
     candidate = eqx.tree_at(lambda c: (c.found, c.over), candidate, (found, over))
     walks = eqx.tree_at(lambda w: (w.flight, w.steps), walks, (flight, walks.steps + 1))
-    return jax.vmap(lambda *of_one: _onward(scene, *of_one))(walks, candidate, share, scattering, decide)
+    return jax.vmap(lambda *of_one: _advance(scene, *of_one))(walks, candidate, share, scattering, decide)
 
 
-def _onward(
+def _advance(
     scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
-    """What becomes of a walk at a candidate, where a share of the majorant is extinction; or at the end of
-    its flight."""
-    onward = _walked(scene, walk, candidate, share, scattering, decide)
+    """The walk after a candidate, where `share` is extinction / majorant; or after the end of its flight."""
+    advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
     if scene.located:
-        looking = _looked(scene, walk, candidate, share, decide)
-        onward = jax.tree.map(lambda a, b: jnp.where(walk.to_light, a, b), looking, onward)
-    spent = onward.alive & (onward.steps >= MOST_STEPS)
+        to_light = _ratio_tracking(scene, walk, candidate, share, decide)
+        advanced = jax.tree.map(lambda a, b: jnp.where(walk.to_light, a, b), to_light, advanced)
+    cut_off = advanced.alive & (advanced.steps >= MAX_STEPS)
     return eqx.tree_at(
-        lambda w: (w.alive, w.exhausted), onward, (onward.alive & ~spent, onward.exhausted | spent)
+        lambda w: (w.alive, w.exhausted), advanced, (advanced.alive & ~cut_off, advanced.exhausted | cut_off)
     )
 
 
-def _scattering(
+def _scatter(
     scene: Scene, walk: Walk, place: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
 ) -> Scattering:
-    """What comes of a walk if it is scattered here, by this turn."""
-    before = _times(walk.throughput, albedo)
-    throughput = _after_roulette(before, survive)
+    """The outcome for a walk if it is scattered at `place`, with `turn` as direction around the z axis."""
+    before_roulette = _times(walk.throughput, albedo)
+    throughput = _after_roulette(before_roulette, survive)
     direction = turned(turn, walk.direction)
     endless = jnp.full_like(survive, jnp.inf)
     if not scene.located:
         no = jnp.zeros(survive.shape, bool)
-        return Scattering(direction, throughput, walk.promised, no, direction, endless)
+        return Scattering(direction, throughput, walk.unoccluded, no, direction, endless)
     light = scene.light(place, choose)
     density = phase(_dot(walk.direction, light.toward), scene.anisotropy)
-    promised = _scaled(_times(before, light.irradiance), density)
-    to_light = _greatest(promised) > 0
+    unoccluded = _scaled(_times(before_roulette, light.irradiance), density)
+    to_light = _greatest(unoccluded) > 0
     toward, end = _where(to_light, light.toward, direction), jnp.where(to_light, light.distance, endless)
-    return Scattering(direction, throughput, promised, to_light, toward, end)
+    return Scattering(direction, throughput, unoccluded, to_light, toward, end)
 
 
-def _walked(
+def _delta_tracking(
     scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
-    """A walk on its own flight: delta tracking. Its end is the light all around; a collision scatters it."""
+    """Advance a walk on its own flight. A collision scatters it; at the end it gathers the constant light."""
     collides = candidate.found & (decide < share)
-    capped = collides & (walk.scatterings >= scene.most)
+    capped = collides & (walk.scatterings >= scene.max_scatterings)
     scatters = collides & ~capped
     gathered = _times(walk.throughput, scene.surroundings)
     gathered = _scaled(gathered, (candidate.over & walk.met).astype(share.dtype))
-    onward = scene.flight(candidate.place, scattering.toward, scattering.end)
+    next_flight = scene.flight(candidate.place, scattering.toward, scattering.end)
     goes_on = scattering.to_light | (_greatest(scattering.throughput) > 0)
     return Walk(
         walk.words,
         walk.steps,
-        jax.tree.map(lambda new, old: jnp.where(scatters, new, old), onward, walk.flight),
+        jax.tree.map(lambda new, old: jnp.where(scatters, new, old), next_flight, walk.flight),
         scatters & scattering.to_light,
         _where(scatters, scattering.direction, walk.direction),
         _where(scatters, scattering.throughput, walk.throughput),
-        _where(scatters, scattering.promised, walk.promised),
-        jnp.ones_like(walk.clear),
+        _where(scatters, scattering.unoccluded, walk.unoccluded),
+        jnp.ones_like(walk.transmittance),
         _plus(walk.radiance, gathered),
         walk.met | collides,
         walk.scatterings + scatters.astype(jnp.int32),
@@ -245,21 +244,21 @@ def _walked(
     )
 
 
-def _looked(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar) -> Walk:
-    """A walk on its way to a light: ratio tracking. At its end it goes on from where it was scattered."""
-    left = walk.clear * jnp.where(candidate.found, jnp.maximum(1 - share, 0), 1)
-    kept = jnp.where(survive * ROULETTE < left, ROULETTE, 0)
-    left = jnp.where(candidate.found & (left < ROULETTE), kept, left)
-    done = candidate.over | (left == 0)
-    gathered = _scaled(walk.promised, jnp.where(candidate.over, left, 0))
-    onward = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
+def _ratio_tracking(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar) -> Walk:
+    """Advance a walk on its way to a light. At the end it continues from where it was scattered."""
+    transmittance = walk.transmittance * jnp.where(candidate.found, jnp.maximum(1 - share, 0), 1)
+    survivor = jnp.where(survive * ROULETTE < transmittance, ROULETTE, 0)
+    transmittance = jnp.where(candidate.found & (transmittance < ROULETTE), survivor, transmittance)
+    done = candidate.over | (transmittance == 0)
+    gathered = _scaled(walk.unoccluded, jnp.where(candidate.over, transmittance, 0))
+    own_flight = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
     return eqx.tree_at(
-        lambda w: (w.flight, w.to_light, w.clear, w.radiance, w.alive),
+        lambda w: (w.flight, w.to_light, w.transmittance, w.radiance, w.alive),
         walk,
         (
-            jax.tree.map(lambda new, old: jnp.where(done, new, old), onward, walk.flight),
+            jax.tree.map(lambda new, old: jnp.where(done, new, old), own_flight, walk.flight),
             ~done,
-            left,
+            transmittance,
             _plus(walk.radiance, gathered),
             walk.alive & (~done | (_greatest(walk.throughput) > 0)),
         ),
@@ -267,16 +266,16 @@ def _looked(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survi
 
 
 def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:
-    """The throughput, where it is small either 0 or as much larger as this is rare."""
+    """Russian roulette: a small throughput becomes 0, or is divided by the probability of survival."""
     greatest = _greatest(throughput)
     small = greatest < ROULETTE
-    followed = uniform * ROULETTE < greatest
-    more = ROULETTE / jnp.where(greatest > 0, greatest, 1)
-    return _scaled(throughput, jnp.where(small, jnp.where(followed, more, 0), 1))
+    survives = uniform * ROULETTE < greatest
+    weight = ROULETTE / jnp.where(greatest > 0, greatest, 1)
+    return _scaled(throughput, jnp.where(small, jnp.where(survives, weight, 0), 1))
 
 
 def _uniforms(walk: Walk, stage: int) -> Uniforms:
-    """Four numbers in [0, 1) for one of the two stages of a walk's next step."""
+    """Four uniform random numbers for stage 0 or 1 of a walk's next step."""
     pixel, path, seed = walk.words
     return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
 

@@ -1,9 +1,9 @@
-"""Which scenes are there without data?
+"""Synthetic scenes that need no data files.
 
-Every phantom spans the world cube [-1, 1]³ with its nodes on the cube's faces, and is the same
-scene at every resolution: shapes are signed distances and textures are waves, both in world
-units, and a voxel is covered by a shape over a ramp of a fixed number of voxels. Each scene has
-a file that makes it; the files share a kit of shapes, a canvas they are drawn on, and waves.
+Every phantom spans the world cube [-1, 1]³, with nodes on the cube's faces, and is the same scene at every
+resolution: shapes are signed distances and textures are waves, both in world units, and a shape's coverage
+falls off over a ramp of a fixed number of voxels. Each scene has its own file; they share a library of
+shapes, a canvas to draw them on, and waves.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from .colon import colon_path as colon_path
 from .toroidal import toroidal_phantom as toroidal_phantom
 
 
-# makes the voxels, and perhaps labels, of a scene from a resolution and a source of randomness
+# functions from a resolution and a random generator to a scene's voxels and, for some, labels
 PHANTOMS: dict[str, Callable[[int, np.random.Generator], np.ndarray | tuple[np.ndarray, np.ndarray]]] = {
     "head": head.make,
     "engine": engine.make,
@@ -38,9 +38,9 @@ def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> V
     """A synthetic volume on the cube [-1, 1]³, `resolution` nodes along each axis.
 
     Spacing is 2 / (resolution - 1) and the origin (-1, -1, -1). The value at a world point does not
-    depend on the resolution, but for boundaries of the uint8 phantoms, which are ramps 2 voxels
-    wide (in `labels` 0.06 world units at every resolution). `u` below stands for (world + 1) / 2, which
-    runs over the unit cube.
+    depend on the resolution, except at boundaries of the uint8 phantoms, which are ramps 2 voxels
+    wide (in `labels`, 0.06 world units at every resolution). `u` below is (world + 1) / 2, which
+    ranges over the unit cube.
 
     | name | type | what | seed |
     |---|---|---|---|
@@ -56,7 +56,7 @@ units, less than 3 % filled | the tree |
 lungs (right, left), 4 liver, 5 stomach; organs that touch share a curved face | none |
     | `plane` | float32 | inclined plane, 1 / (1 + exp(-(u_z - h) / 0.004)) with h = 0.25 + 0.35 u_x; seen \
 along +z | none |
-    | `cut_block` | float32 | 0.5 + 0.1 sin(40 u_z) for u_x < 0.5, which the box's faces cut through; \
+    | `cut_block` | float32 | 0.5 + 0.1 sin(40 u_z) for u_x < 0.5, cut by the box's faces; \
 `plane` elsewhere | none |
     | `sphere` | float32 | 1 / (1 + exp((r - 0.5) / 0.008)) | none |
     | `constant`, `linear`, `gaussian` | float32 | 1; (x + 1) / 2; exp(-r² / (2 · 0.3²)) | none |
@@ -67,6 +67,6 @@ along +z | none |
     if name not in PHANTOMS:
         raise ValueError(f"name must be one of {', '.join(PHANTOMS)}; got {name!r}.")
     resolution = integer("resolution", resolution, 8)
-    made = PHANTOMS[name](resolution, np.random.default_rng(integer("seed", seed, 0)))
-    data, labels = made if isinstance(made, tuple) else (made, None)
+    result = PHANTOMS[name](resolution, np.random.default_rng(integer("seed", seed, 0)))
+    data, labels = result if isinstance(result, tuple) else (result, None)
     return Volume(data, spacing=(2 / (resolution - 1),) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)

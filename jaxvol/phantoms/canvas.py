@@ -1,8 +1,8 @@
-"""How do shapes become values, or joined distances, at the nodes of the cube [-1, 1]³?
+"""Rasterises shapes at the nodes of the cube [-1, 1]³, as values or as signed distances.
 
-A shape is evaluated near the box it lies in only, in slabs small enough for the cache. A *field*
-is a canvas of signed distances, `FAR` where nothing is, that shapes are joined to and carved
-from; a canvas of values is painted, later layers over earlier ones.
+A shape is evaluated only near its bounding box, in slabs small enough for the cache. A *field* is a canvas
+of signed distances, `FAR` where there is nothing, that shapes are joined to and carved from; a canvas of
+values is painted, later layers over earlier ones.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +13,7 @@ from .shapes import Block, Point, Shape
 
 
 SLAB = 2**18  # nodes evaluated at once: a handful of float32 temporaries stay in the cache
-RAMP = 2.0  # voxels over which a boundary falls from full to none; less shows as terraces when shaded
+RAMP = 2.0  # voxels over which a boundary falls from full to none; narrower ones show terraces when shaded
 FAR = 10.0  # world units; more than any distance in the cube
 
 
@@ -28,7 +28,7 @@ class Canvas:
     def slabs(
         self, low: Point = (-1.0,) * 3, high: Point = (1.0,) * 3, reach: float = 0.0
     ) -> Iterator[tuple[tuple[slice, slice, slice], tuple[Block, Block, Block]]]:
-        """Index and open world coordinates of the nodes within `reach` of a box, slab by slab."""
+        """Index and world coordinates (an open mesh) of the nodes within `reach` of a box, slab by slab."""
         first = np.searchsorted(self.axis, np.array(low, np.float32) - reach)
         last = np.searchsorted(self.axis, np.array(high, np.float32) + reach, side="right")
         if np.any(last <= first):
@@ -41,7 +41,7 @@ class Canvas:
             yield where, (self.axis[start:stop, None, None], y[None, :, None], z[None, None, :])
 
     def _distances(self, shapes: Shape | Iterable[Shape], blend: float):
-        """Index and distance of every shape, slab by slab, known to 2 `blend` outside its box."""
+        """Index and distance of every shape, slab by slab, evaluated up to 2 `blend` outside its box."""
         for shape in [shapes] if isinstance(shapes, Shape) else shapes:
             for where, at in self.slabs(shape.low, shape.high, 2 * blend + 2 * self.spacing):
                 yield where, shape.distance(*at)
@@ -49,16 +49,16 @@ class Canvas:
     def join(self, shapes: Shape | Iterable[Shape], blend: float = 0.0) -> None:
         """Union with a field of distances; seams are rounded over a distance `blend`.
 
-        A shape's distance is known to 2 `blend` outside its box. What blends into it later needs it as
-        far, so the first shape of a field is given the widest blend that follows.
+        A shape's distance is evaluated up to 2 `blend` outside its box. Shapes that blend into it later need
+        it equally far out, so the first shape of a field is given the widest blend that follows.
         """
         for where, distance in self._distances(shapes, blend):
-            self.values[where] = _smaller(self.values[where], distance, blend)
+            self.values[where] = _smooth_min(self.values[where], distance, blend)
 
     def carve(self, shapes: Shape | Iterable[Shape], blend: float = 0.0) -> None:
         """Difference from a field of distances; edges are rounded over a distance `blend`."""
         for where, distance in self._distances(shapes, blend):
-            self.values[where] = -_smaller(-self.values[where], distance, blend)
+            self.values[where] = -_smooth_min(-self.values[where], distance, blend)
 
     def paint(
         self,
@@ -67,9 +67,9 @@ class Canvas:
         width: float | None = None,
         grown: float = 0.0,
     ) -> None:
-        """Lay a material over what is there, within a shape or field that is `grown` by a distance.
+        """Paint a material over the present values, within a shape or field that is `grown` by a distance.
 
-        `value`: a number or a function of (x, y, z, distance); `width`: of the ramp at its boundary.
+        `value`: a number or a function of (x, y, z, distance); `width`: of the ramp at the boundary.
         """
         width = RAMP * self.spacing if width is None else width
         field = isinstance(shape, Canvas)
@@ -84,7 +84,7 @@ class Canvas:
         return np.rint(np.clip(self.values, 0, 255, out=self.values), out=self.values).astype(np.uint8)
 
 
-def _smaller(a: Block, b: Block, blend: float) -> Block:
+def _smooth_min(a: Block, b: Block, blend: float) -> Block:
     if not blend:
         return np.minimum(a, b)
     overlap = np.maximum(blend - abs(a - b), 0)

@@ -1,4 +1,4 @@
-"""How does the `colon` wind, and what do its folds and polyps look like?"""
+"""The `colon` phantom: its centre line, folds and polyps."""
 
 from itertools import pairwise
 from typing import Any
@@ -9,17 +9,17 @@ from jaxtyping import Float
 from .._util.checks import integer
 from .canvas import FAR, Canvas
 from .shapes import ball, box, capsule, lengths, to_segment
-from .waves import RayTiles
+from .waves import PlaneWaves
 
 
 def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
     """World points evenly spaced along the centre line of the `colon` lumen, end to end.
 
-    A camera flies along it. The line is the same for every seed and resolution.
+    The path for a fly-through camera. It is the same for every seed and resolution.
 
     **Raises:** `ValueError` for fewer than 2 points.
     """
-    from scipy.interpolate import CubicSpline  # here: a first image need not wait for it
+    from scipy.interpolate import CubicSpline  # here, so that a first image does not wait for it
 
     points = integer("points", points, 2)
     turns = [(-0.6, -0.6, -0.66), (-0.64, -0.5, -0.1), (-0.6, -0.55, 0.45), (-0.3, -0.3, 0.68)]
@@ -36,7 +36,7 @@ def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
 def make(n: int, rng: np.random.Generator) -> np.ndarray:
     wall, deepest, bend = 0.035, 0.2, colon_path(161)
     length = float(lengths(bend)[-1])
-    tissue, uneven = RayTiles(rng, 0.15, 0.6), RayTiles(rng, 0.25, 0.5)
+    tissue, uneven = PlaneWaves(rng, 0.15, 0.6), PlaneWaves(rng, 0.25, 0.5)
     polyps = []
     for place in np.linspace(0.08, 0.94, 7) + rng.uniform(-0.04, 0.04, 7):
         along, out, i = rng.normal(size=3), 0.155, int(place * 160)
@@ -55,7 +55,7 @@ def make(n: int, rng: np.random.Generator) -> np.ndarray:
     for where, at in lumen.slabs():
         away, s = lumen.values[where], along.values[where]
         if away.min() < 1:
-            # pouches between crescent folds, 0.17 apart, deeper on one side than on another
+            # pouches between crescent folds, 0.17 apart, deeper on one side than on the other
             fold = np.exp(-((np.abs(np.sin(np.pi * s / 0.17)) / 0.42) ** 2))
             bumps = uneven(*at)
             radius = 0.165 + 0.012 * bumps - fold * np.clip(0.045 + 0.035 * bumps, 0, 0.09)

@@ -1,7 +1,7 @@
-"""What lies where in the `engine`?
+"""The `engine` phantom.
 
-Three cylinders in a row along x, the crankshaft below them; the block is cut open towards -y.
-Later fields cover earlier ones: pipes, the cast block, parts of steel.
+Three cylinders in a row along x, with the crankshaft below them; the block is cut open towards -y.
+Later fields cover earlier ones: pipes, the cast block, steel parts.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def _cast(n: int) -> Canvas:
     cast.join([cylinder(2, (x, y, -0.80), 0.075, 0.04) for x in (-0.62, 0.62) for y in (-0.46, 0.46)], 0.02)
     cast.carve([cylinder(2, (x, 0, 0.02), 0.17, 0.29) for x in BORES])
     cast.carve([ellipsoid((x, 0, 0.30), (0.15, 0.15, 0.07)) for x in BORES])
-    cast.carve(box((0, 0, -0.53), (0.58, 0.29, 0.24), 0.05), 0.02)  # CRANK case
+    cast.carve(box((0, 0, -0.53), (0.58, 0.29, 0.24), 0.05), 0.02)  # crankcase
     cast.carve(cylinder(0, (0, 0.22, -0.12), 0.025, 0.60))  # oil gallery
     cast.carve(PORTS)
     cast.carve(box((0.42, -0.42, 0.0), (0.175, 0.42, 0.25), 0.03), 0.02)  # the cut-away

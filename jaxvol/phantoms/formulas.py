@@ -1,4 +1,4 @@
-"""Which scenes have a closed form, so that an image of them has a known answer?"""
+"""Phantoms with a closed form, whose images have a known answer."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from .shapes import Block
 
 
 def maker(value: Callable[..., Block]) -> Callable[[int, np.random.Generator], np.ndarray]:
-    """The maker of a scene whose value at (x, y, z) is given."""
+    """The maker of a scene with the value `value(x, y, z)`."""
 
     def make(n: int, rng: np.random.Generator) -> np.ndarray:
         canvas = Canvas(n)
@@ -22,7 +22,7 @@ def maker(value: Callable[..., Block]) -> Callable[[int, np.random.Generator], n
 
 def plane(x, y, z):
     height = 0.25 + 0.35 * (x + 1) / 2
-    return _rising(((z + 1) / 2 - height) / 0.004)
+    return _logistic(((z + 1) / 2 - height) / 0.004)
 
 
 def cut_block(x, y, z):
@@ -30,7 +30,7 @@ def cut_block(x, y, z):
 
 
 def sphere(x, y, z):
-    return _rising((0.5 - np.sqrt(x * x + y * y + z * z)) / 0.008)
+    return _logistic((0.5 - np.sqrt(x * x + y * y + z * z)) / 0.008)
 
 
 def constant(x, y, z):
@@ -45,8 +45,8 @@ def gaussian(x, y, z):
     return np.exp((x * x + y * y + z * z) / (-2 * 0.3**2))
 
 
-def _rising(x: Block) -> Block:
-    """From 0 far below 0 to 1 far above."""
-    from scipy.special import expit  # here: a first image need not wait for it
+def _logistic(x: Block) -> Block:
+    """Logistic function."""
+    from scipy.special import expit  # here, so that a first image does not wait for it
 
     return expit(x)

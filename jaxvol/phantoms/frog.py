@@ -1,6 +1,6 @@
-"""What lies where in the frog of `labels`, and which organ owns a node?
+"""The `labels` phantom: a frog, and which of its organs each node belongs to.
 
-The frog faces -y, its back towards +z, so its right side is towards -x.
+The frog faces -y with its back towards +z, so its right side is towards -x.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from .canvas import FAR, Canvas
 from .shapes import Point, Shape, ball, capsule, ellipsoid, pair, tube
 
 
-SOFT = 0.06  # world units over which an intensity passes into its neighbour's
+SOFT = 0.06  # world units over which an intensity blends into its neighbour's
 ORGANS = (  # label, intensity, shape
     (2, 95, ellipsoid((-0.15, -0.15, 0.06), (0.17, 0.21, 0.13))),  # right lung
     (3, 95, ellipsoid((0.15, -0.15, 0.06), (0.17, 0.21, 0.13))),  # left lung
@@ -27,7 +27,7 @@ def make(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     for label, value, organ in ORGANS:
         canvas.paint(value, organ, SOFT)
         for where, at in canvas.slabs(organ.low, organ.high):
-            # the organ that a node is deeper in owns it, so two that overlap meet in a smooth face
+            # a node belongs to the organ it is deepest in, so overlapping organs meet in a smooth face
             distance = organ.distance(*at)
             mine = distance < deepest[where]
             np.copyto(labels[where], label, where=mine)
@@ -54,6 +54,6 @@ def _body(n: int) -> Canvas:
 
 
 def _toes(root: Point, tips: list[tuple[float, float]]) -> list[Shape]:
-    """From a foot to tips (x, y) in its plane, each with a pad."""
+    """Toes from a foot to tips (x, y) in its plane, each with a pad."""
     ends = [(*tip, root[2]) for tip in tips]
     return [part for end in ends for part in (capsule(root, end, 0.035, 0.025), ball(end, 0.036))]

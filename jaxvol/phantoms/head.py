@@ -1,14 +1,14 @@
-"""What lies where in the `head`?
+"""The `head` phantom.
 
-A CT-like head, face towards -y, crown towards +z; 1 world unit stands for about 14 cm. Skin and
-bone are fields; everything else is painted over them.
+A CT-like head, face towards -y, crown towards +z; 1 world unit is about 14 cm. Skin and bone are fields;
+everything else is painted over them.
 """
 
 import numpy as np
 
 from .canvas import FAR, Canvas
 from .shapes import Shape, ball, box, capsule, ellipsoid, lengths, pair, tube
-from .waves import RayTiles
+from .waves import PlaneWaves
 
 
 _BRAIN = (
@@ -36,8 +36,8 @@ _SEPTUM = box((0, -0.42, -0.06), (0.011, 0.24, 0.13), 0.005)
 
 
 def make(n: int, rng: np.random.Generator) -> np.ndarray:
-    tissue = RayTiles(rng, 0.12, 0.5)
-    folds = RayTiles(rng, 0.13, 0.2)
+    tissue = PlaneWaves(rng, 0.12, 0.5)
+    folds = PlaneWaves(rng, 0.13, 0.2)
     canvas = Canvas(n)
     canvas.paint(lambda x, y, z, d: 78 + (22 + 4 * tissue(x, y, z)) * np.clip(-1 - d / 0.02, 0, 1), _skin(n))
     canvas.paint(lambda x, y, z, d: 205 + 8 * tissue(x, y, z), _bones(n))
@@ -52,7 +52,7 @@ def make(n: int, rng: np.random.Generator) -> np.ndarray:
     canvas.paint(lambda x, y, z, d: 222 - 36 * np.exp(-((middle(x, y, z) / 0.012) ** 2)), vault)
 
     def brain(x, y, z, d):
-        # furrows follow the zeros of a wave, open at the surface and close inwards; grey lines both
+        # furrows follow the zeros of a wave, and narrow from the surface inwards; grey matter lines both
         wave, depth = folds(x, y, z), np.clip(-d / 0.17, 0, 1)
         furrow = np.exp(-((wave / 0.3) ** 2)) * np.clip(2 - 2.5 * depth, 0, 1)
         midline = np.exp(-((x / 0.016) ** 2)) * np.clip((z - 0.2) / 0.1, 0, 1)
@@ -111,7 +111,7 @@ def _bones(n: int) -> Canvas:
     bone.carve(pair(capsule((0.225, -0.66, 0.08), (0.12, -0.24, 0.05), 0.145, 0.035)), 0.02)  # orbits
     bone.join(capsule((0, -0.55, 0.14), (0, -0.655, 0.0), 0.045), 0.03)  # nasal bones
     bone.carve(pair(ellipsoid((0.04, -0.60, -0.085), (0.055, 0.14, 0.10))), 0.02)
-    bone.carve(capsule((0, 0.25, -0.1), (0, 0.31, -0.4), 0.08), 0.03)  # the great opening
+    bone.carve(capsule((0, 0.25, -0.1), (0, 0.31, -0.4), 0.08), 0.03)  # foramen magnum
     arch = [(x, _arch(x)) for x in (0.0, 0.07, 0.13, 0.17, 0.195)]
     bone.join(pair(*tube([(x, y + 0.015, -0.265) for x, y in arch], 0.045)), 0.03)
     bone.carve(ellipsoid((0, -0.30, -0.31), (0.13, 0.19, 0.09)), 0.02)  # palate

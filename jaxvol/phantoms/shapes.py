@@ -1,7 +1,7 @@
-"""How far is a point from the surface of a shape, and in which box does the shape lie?
+"""Shapes, as signed distances with bounding boxes.
 
-Distances are signed, negative inside, and in world units: exact for round shapes, and to first
-order at the surface for the others.
+Distances are negative inside and in world units: exact for round shapes, and to first order at the surface
+for the others.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ Distance: TypeAlias = Callable[[Block, Block, Block], Block]
 
 
 class Shape(NamedTuple):
-    """Signed distance at open (x, y, z), and two corners of the box the shape lies in."""
+    """Signed distance on an open mesh (x, y, z), and two corners of the bounding box."""
 
     distance: Distance
     low: Point
@@ -32,7 +32,7 @@ def _around(distance: Distance, center: Point, half: Point) -> Shape:
 
 
 def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
-    """`yaw` turns it about the z axis through its centre, in radians."""
+    """`yaw`: rotation about the z axis through the centre, radians."""
     (cx, cy, cz), (rx, ry, rz) = center, radii
     c, s, small = float(np.cos(yaw)), float(np.sin(yaw)), min(radii)
 
@@ -42,7 +42,7 @@ def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
             x, y = c * x + s * y, c * y - s * x
         level = np.sqrt((x / rx) ** 2 + (y / ry) ** 2 + (z / rz) ** 2)
         slope = np.sqrt((x / rx**2) ** 2 + (y / ry**2) ** 2 + (z / rz**2) ** 2)
-        # level / slope is 0 / 0 at the centre; the terms added make it the smallest radius there
+        # level / slope is 0 / 0 at the centre; the added terms make it the smallest radius there
         return (level - 1) * (level + 1e-3) / (slope + 1e-3 / small)
 
     wide = max(rx, ry)
@@ -54,7 +54,7 @@ def ball(center: Point, radius: float) -> Shape:
 
 
 def to_segment(x: Block, y: Block, z: Block, a: Point, b: Point) -> tuple[Block, Block]:
-    """Distance to the segment a b, and how far along it the nearest point is, 0 to 1."""
+    """Distance to the segment a b, and the nearest point's position along it, 0 to 1."""
     dx, dy, dz = (float(q - p) for p, q in zip(a, b, strict=True))
     x, y, z = x - float(a[0]), y - float(a[1]), z - float(a[2])
     square = dx * dx + dy * dy + dz * dz
@@ -63,7 +63,7 @@ def to_segment(x: Block, y: Block, z: Block, a: Point, b: Point) -> tuple[Block,
 
 
 def capsule(a: Point, b: Point, radius: float, end_radius: float | None = None) -> Shape:
-    """The points near the segment a b; its radius goes linearly from `radius` to `end_radius`."""
+    """A capsule along the segment a b, its radius linear from `radius` to `end_radius`."""
     end = radius if end_radius is None else end_radius
 
     def distance(x, y, z):
@@ -90,7 +90,7 @@ def box(center: Point, half: Point, rounding: float = 0.02) -> Shape:
 
 
 def cylinder(axis: int, center: Point, radius: float, half: float, sides: int = 0, wave: int = 0) -> Shape:
-    """Along a coordinate axis. `sides`: a prism instead. `wave`: this many gear teeth around it."""
+    """Along a coordinate axis. `sides`: of a prism instead. `wave`: number of gear teeth around it."""
     tooth = 0.012 if wave else 0.0
     turns = (np.arange(sides) * (2 * np.pi / max(sides, 1))).tolist()
 

@@ -1,7 +1,7 @@
-"""What does a swept ultrasound probe record of a known scene?
+"""Synthetic ultrasound volumes of known scenes, as acquired by a swept probe.
 
-The scene lies in the world, in mm, before a probe whose motor axis is the x axis and whose middle beam points
-along z. It is sampled as a probe does it, at the nodes of its beams, and speckled.
+The scene lies in the world, in mm, in front of a probe whose motor axis is the x axis and whose middle beam
+points along z. It is sampled at the nodes of the probe's beams, and speckle is applied.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,12 +14,12 @@ from jaxtyping import Float, UInt8
 from .._util.checks import integer
 from ..transforms.toroidal_map import ToroidalMap
 from ..volume import Volume
-from .canvas import SLAB, _smaller
+from .canvas import SLAB, _smooth_min
 from .shapes import Block, Shape, ball, capsule, ellipsoid, tube
 
 
 SOFT = 1.2  # mm over which a boundary falls from full to none
-GRAIN = 0.35  # mm along a beam over which speckle is correlated, half a pulse's length
+GRAIN = 0.35  # mm along a beam over which speckle is correlated: half the pulse length
 DEGREES = np.pi / 180
 
 Scene = Callable[[Block, Block, Block, Block], Block]
@@ -34,7 +34,7 @@ def toroidal_phantom(
     speckle: bool = True,
     seed: int | Any = 0,
 ) -> tuple[Volume, ToroidalMap]:
-    """A synthetic ultrasound volume as a swept probe acquires it, and the map that shows it in the world.
+    """A synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the world.
 
     | name | what | mean echo |
     |---|---|---|
@@ -45,22 +45,22 @@ tissue 60; cysts 4; targets 130, 160, 190 |
     | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
 90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
 
-    Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe, which only choose
-    where it is sampled; the speckle's grains do.
+    Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe, which only
+    determine where it is sampled; the grains of the speckle do.
 
     **Arguments:**
 
-    - `shape`: nodes along (β, σ, γ), at least 8 each. The data are kept as acquired, `data[β, σ, γ]`, depth
-      fastest in memory.
+    - `shape`: nodes along (β, σ, γ), at least 8 each. The data are stored as acquired, `data[β, σ, γ]`,
+      depth fastest in memory.
     - `probe`: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
     - `speckle`: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
       (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
     - `seed`: of the speckle.
 
-    **Returns:** a uint8 volume, whose own spacing means nothing, and the probe.
+    **Returns:** a uint8 volume, whose own spacing has no meaning, and the probe.
 
     **Raises:** `ValueError` for an unknown name, a shape that is not three integers of at least 8, a probe
-    that is no `ToroidalMap`, and a seed that is not a non-negative integer.
+    that is not a `ToroidalMap`, and a seed that is not a non-negative integer.
     """
     if name not in SCENES:
         raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")
@@ -89,7 +89,7 @@ tissue 60; cysts 4; targets 130, 160, 190 |
 
 
 def _about(half: float) -> tuple[float, float]:
-    """Angles within 90° ± `half` degrees, in radians."""
+    """The range 90° ± `half` degrees, in radians."""
     return (90 - half) * DEGREES, (90 + half) * DEGREES
 
 
@@ -100,21 +100,22 @@ def _rounded(echo: Block) -> UInt8[np.ndarray, "_ _ _"]:
 def _speckle(
     rng: np.random.Generator, shape: tuple[int, ...], grain: float
 ) -> Float[np.ndarray, "beta sigma gamma"]:
-    """Rayleigh numbers of mean 1, correlated over `grain` nodes of the last axis."""
-    from scipy.ndimage import gaussian_filter1d  # here: a first image need not wait for it
+    """Rayleigh-distributed numbers of mean 1, correlated over `grain` nodes of the last axis."""
+    from scipy.ndimage import gaussian_filter1d  # here, so that a first image does not wait for it
 
     impulse = np.zeros(shape[-1])
     impulse[shape[-1] // 2] = 1
-    left = np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2))  # of the standard deviation
+    # standard deviation of white noise of variance 1 after filtering
+    deviation = np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2))
     re, im = (
-        gaussian_filter1d(rng.standard_normal(shape, np.float32), grain, mode="wrap") / np.float32(left)
+        gaussian_filter1d(rng.standard_normal(shape, np.float32), grain, mode="wrap") / np.float32(deviation)
         for _ in range(2)
     )
     return np.sqrt(re * re + im * im) * np.float32(np.sqrt(2 / np.pi))
 
 
-def _lay(echo: Block, value: float, distance: Block) -> None:
-    """A material over what is there, where the distance to it is negative."""
+def _paint(echo: Block, value: float, distance: Block) -> None:
+    """Paint a material over the present echo, where the distance to it is negative."""
     echo += np.clip(0.5 - distance / SOFT, 0, 1) * (value - echo)
 
 
@@ -129,34 +130,35 @@ def _spheres(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     echo = np.full_like(x, 60)
     for radius, across, target in ((6, -30, 130), (9, -4, 160), (12, 28, 190)):
         for value, side in ((4, -20), (target, 20)):
-            _lay(echo, value, ball((across, side, 95), radius).distance(x, y, z))
+            _paint(echo, value, ball((across, side, 95), radius).distance(x, y, z))
     return echo
 
 
 def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
-    at = x, y, 100 - z  # around its navel: crown to rump along x, right to left along y, back to front
+    # origin at the navel; x from crown to rump, y from right to left, z from back to front
+    at = x, y, 100 - z
     either_side = x, abs(y), at[2]
     echo = np.full_like(x, 30)
-    _lay(echo, 4, ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at))
+    _paint(echo, 4, ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at))
     head, limbs = _joined(HEAD, at, 4), _joined(LIMBS, either_side, 2)
     body = _joined(TRUNK, at, 8)
-    body = _smaller(_smaller(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
-    body = _smaller(_smaller(limbs, body, 4), _joined(CORD, at, 0), 2)
-    _lay(echo, 120, body)
-    _lay(echo, 70, body + 2)
-    _lay(echo, 170, head + 2.5)
-    _lay(echo, 40, head + 4.5)
-    _lay(echo, 170, _joined(SPINE, at, 0))
-    _lay(echo, 170, _joined(BONES, either_side, 0))
+    body = _smooth_min(_smooth_min(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
+    body = _smooth_min(_smooth_min(limbs, body, 4), _joined(CORD, at, 0), 2)
+    _paint(echo, 120, body)
+    _paint(echo, 70, body + 2)
+    _paint(echo, 170, head + 2.5)
+    _paint(echo, 40, head + 4.5)
+    _paint(echo, 170, _joined(SPINE, at, 0))
+    _paint(echo, 170, _joined(BONES, either_side, 0))
     return echo
 
 
 def _joined(shapes: Iterable[Shape], at: tuple[Block, Block, Block], blend: float) -> Block:
-    """Distance to the union of shapes, its seams rounded."""
-    return reduce(lambda a, b: _smaller(a, b, blend), (shape.distance(*at) for shape in shapes))
+    """Distance to the union of shapes, with rounded seams."""
+    return reduce(lambda a, b: _smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
 
 
-# parts of the fetus; of what it has two of, the one at y > 0
+# parts of the fetus; of paired ones, that at y > 0
 SHOULDER, ELBOW, WRIST, FINGERS = (-11, 13, 0), (3, 20, 7), (-10, 13, 17), (-16, 11, 20)
 HIP, KNEE, ANKLE, TOES = (27, 8, -2), (19, 15, 19), (39, 9, 13), (43, 8, 21)
 HEAD = [ellipsoid((-33, 0, 2), (16, 13.5, 15)), ellipsoid((-27, 0, 6), (11, 9.5, 11))]

@@ -1,7 +1,7 @@
-"""Where do the branches of `vessels` go?
+"""The `vessels` phantom: a branching tree.
 
-They feed points strewn over a crown above the root. A branch goes part of the way to the points
-it feeds and parts them between two children, whose radii follow Murray's law.
+Its branches feed points scattered in a crown above the root. A branch covers part of the way to the points
+it feeds and splits them between two children, whose radii follow Murray's law.
 """
 
 from itertools import pairwise
@@ -20,7 +20,7 @@ def make(n: int, rng: np.random.Generator) -> np.ndarray:
     field = Canvas(n, FAR)
 
     def grow(start, heading, radius, cloud, generation):
-        # the last branch goes to the middle of its points, the others half of the way
+        # the last branch reaches the centroid of its points, the others go half of the way
         middle = cloud.mean(axis=0)
         end = start + (middle - start) * (0.5 if generation < GENERATIONS else 1)
         bend = start + heading * (0.45 * np.linalg.norm(end - start))

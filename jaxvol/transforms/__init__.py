@@ -1,4 +1,4 @@
-"""One idea of one paper each: the transforms of a march."""
+"""The transforms of a march: each is one idea from one paper."""
 
 from .alpha_correction import AlphaCorrection as AlphaCorrection
 from .early_termination import EarlyTermination as EarlyTermination

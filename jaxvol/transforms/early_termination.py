@@ -1,4 +1,4 @@
-"""When does a ray have nothing left to gain? Early ray termination (KISTI report 2005)."""
+"""When can a ray stop before its exit? Early ray termination (KISTI report 2005)."""
 
 from typing import Any
 
@@ -12,10 +12,10 @@ from ..march import Transform
 class EarlyTermination(Transform):
     """End a ray once its transmittance is at most `opacity_left`.
 
-    What lies behind is left out: the error of a colour channel is at most `opacity_left` times the
+    Everything behind is left out: the error of a colour channel is at most `opacity_left` times the
     brightest colour behind, that of the accumulated opacity at most `opacity_left`. The gradient with
-    respect to what was left out is taken as 0, the same order of error. Moving the sample at which
-    a ray ends makes a jump of that size in the image, which gradients do not see.
+    respect to what is left out is taken as 0, an error of the same order. If the sample at which a ray
+    ends changes, the image jumps by as much; gradients do not include these jumps.
 
     **Arguments:**
 
@@ -23,8 +23,8 @@ class EarlyTermination(Transform):
 
     **Raises:** `ValueError` outside that range.
 
-    Source: KISTI report 2005, which tests once in 16 slices since testing each one cost more than it
-    saved; here the test is part of the meaning, and how often an engine looks is its own business.
+    Source: KISTI report 2005, which tests once per 16 slices, since testing every slice cost more than it
+    saved. Here the test is part of the definition of the image, and how often to test is up to the engine.
     """
 
     opacity_left: Float[Array, ""]

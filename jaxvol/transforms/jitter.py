@@ -1,8 +1,8 @@
-"""Where does the march begin, so that its steps do not show? Jittered sampling, and empty-space jittering.
+"""Where are samples placed, so that steps do not show as rings? Jittered sampling, and empty-space jittering.
 
-Samples at the same depths in all pixels draw their distance to a surface as rings over the image: wood
-grain. Both transforms here shift the samples of each pixel by a random part ξ of a step, which turns the
-rings into noise. Neither makes the image more accurate: the energy of its error stays what it was.
+Samples at the same depths in all pixels render the distance to a surface as rings over the image: wood
+grain. Both transforms shift the samples of each pixel by a random fraction ξ of a step, which turns the
+rings into noise. Neither makes the image more accurate: the energy of its error stays the same.
 """
 
 from typing import Any, Literal
@@ -22,10 +22,10 @@ Pattern = Literal["white", "blue"]
 
 
 class Noise(eqx.Module):
-    """One random number in [0, 1) for each pixel, which depends on seed, stream and pixel alone.
+    """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel.
 
     `pattern`: `"white"`: independent from pixel to pixel. `"blue"`: low frequencies suppressed, so that
-    the eye sees less of it; a tile of 128 x 128 numbers, each once, repeated over the image from an
+    the noise is less visible; a tile of 128 x 128 distinct numbers, repeated over the image from an
     origin that the seed chooses.
     """
 
@@ -46,7 +46,7 @@ class Noise(eqx.Module):
         if self.tile is None:
             return hashed_uniforms(column, row, self.seed, dtype)[self.stream]
         side = self.tile.shape[0]
-        # where the tile begins: the same for all pixels, another for each seed and stream
+        # origin of the tile: the same for all pixels, different for each seed and stream
         here = jnp.full_like(column, self.stream)
         shift_x, shift_y, _ = hashed_uniforms(here, here, self.seed, jnp.float32)
         x = (column + (shift_x * side).astype(column.dtype)) % side
@@ -55,20 +55,20 @@ class Noise(eqx.Module):
 
 
 class Jitter(Transform):
-    """Begin each ray a random part ξ of a step past its entry.
+    """Start each ray a random fraction ξ of a step past its entry.
 
-    Breaks wood grain into noise. Where the volume's bounds cut through material it makes noise of its
-    own, since each ray leaves out the first ξ d of the material.
+    Turns wood grain into noise. Where the volume's bounds cut through material it adds noise, since each
+    ray leaves out the first ξ d of the material.
 
     **Arguments:**
 
-    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced, and mapped over. The random
-      number of a pixel depends on seed and pixel alone.
+    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over. The random
+      number of a pixel depends only on seed and pixel.
     - `pattern`: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
-    - `front_residual`: give the piece that is left out a narrow cell of its own, from the entry to ξ d,
-      sampled at the entry; the noise on cut faces then falls to that of the sample's value.
+    - `front_residual`: give the part that is left out a narrow cell of its own, from the entry to ξ d,
+      sampled at the entry. The noise on cut faces then falls to that of the sample's value.
 
-    **Raises:** `ValueError` for a seed or a pattern that is none of these.
+    **Raises:** `ValueError` for an invalid seed or pattern.
 
     Source: jittered sampling as in Kye 2013, section 2.2.
     """
@@ -94,16 +94,16 @@ class Jitter(Transform):
 
 
 class EmptySpaceJitter(Transform):
-    """At the first transparent sample of a ray move on by a random part ξ of a step, instead of a whole one.
+    """At a ray's first transparent sample, advance by a random fraction ξ of a step instead of a whole one.
 
-    A ray begins at its entry without an offset, so faces on which the volume's bounds cut material stay
-    smooth; what lies behind empty space is jittered, so wood grain breaks all the same. ξ < 1 keeps
-    the moved sample within the cell that is known to be empty. Once per ray, since every shortened step
-    costs a sample. Transparent means an extinction of exactly 0.
+    A ray starts at its entry without an offset, so faces where the volume's bounds cut material stay
+    smooth; samples behind empty space are jittered, so wood grain still turns into noise. ξ < 1 keeps the
+    shifted sample within the cell that is known to be empty. This happens once per ray, since every
+    shortened step costs a sample. Transparent means an extinction of exactly 0.
 
-    The image jumps where the sample at which a ray is first transparent changes; gradients do not see that.
+    The image jumps where a ray's first transparent sample changes; gradients do not include these jumps.
 
-    **Arguments:** `seed`, `pattern`: as in `Jitter`, whose numbers are independent of these.
+    **Arguments:** `seed`, `pattern`: as in `Jitter`; the random numbers are independent of `Jitter`'s.
 
     Source: Kye 2013, section 3.1.
     """

@@ -1,11 +1,11 @@
 """How far ahead is nothing visible? Space leaping (Chae and Shin; KISTI report 2005).
 
-All methods query the same grid of occupied cells (`Occupancy`), which follows the transfer function. They
-differ in the query, and in the rays that share its answer:
+All methods query the same grid of occupied cells (`Occupancy`), which depends on the transfer function.
+They differ in the query, and in the rays that share its result:
 
-- beams of 8 x 8 pixels, stretch by stretch, whether the box around it is empty (`"hierarchy"`);
-- rays one by one, how far away the nearest occupied cell is (`"distance"`);
-- the latter, from a distance on that cells of R x R pixels share (`"min_distance"`, `"beam"`).
+- `"hierarchy"`: for each stretch of a beam of 8 x 8 pixels, whether its bounding box is empty;
+- `"distance"`: for each ray, the distance to the nearest occupied cell;
+- `"min_distance"`, `"beam"`: the same, from a start distance that cells of R x R pixels share.
 """
 
 from collections.abc import Callable
@@ -28,44 +28,44 @@ from ..space import Ray
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
 
 LEAPS = 4
-"""Leaps from cell to cell before the next samples: rays that have arrived wait for those that have not."""
+"""Leaps from cell to cell before the next samples. Rays that have arrived wait for those that have not."""
 
 
 class SpaceLeaping(Transform):
     """Leap over regions in which the transfer function shows nothing.
 
-    Leaps are whole steps, so every sample that is taken is one of the march without leaping: the image stays
-    the same, except under `"min_distance"`. `EmptySpaceJitter` takes what is leapt over for transparent.
+    Leaps are whole steps, so every sample taken is also one of the march without leaping: the image stays
+    the same, except under `"min_distance"`. `EmptySpaceJitter` treats what is leapt over as transparent.
 
     **Arguments:**
 
     - `method`:
-        - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of the beam in whose
-          box no block of 4³ voxels holds anything visible. Tables of sums answer for boxes of any size
-          at once, where an octree would be walked from coarse to fine.
+        - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
+          bounding box holds no visible block of 4³ voxels. Summed-volume tables answer for boxes of any
+          size at once, where an octree would be traversed from coarse to fine.
         - `"distance"`: each ray leaps as far as a map of (chessboard) distances to the nearest visible
-          block proves. Short leaps where it runs along a surface.
-        - `"min_distance"`: as `"distance"`, from a start that the corners of cells of `cell` x `cell`
-          pixels share: the nearest of their four first hits. **It is not a bound**: what is thinner than
-          a cell, and nearer than what its corners hit, is leapt over. The image is wrong there, more
-          so the larger the cells.
-        - `"beam"`: as `"min_distance"`, but the start is proven from everything in the cell's beam.
-    - `cell`: pixels along a cell of the last two methods; at least 2.
+          block proves empty. Leaps are short where a ray runs along a surface.
+        - `"min_distance"`: as `"distance"`, from a start distance that each cell of `cell` x `cell` pixels
+          shares: the nearest of the first hits of its four corner rays. **It is not a bound**: whatever is
+          thinner than a cell, and nearer than what its corners hit, is leapt over. The image is wrong
+          there, more so the larger the cells.
+        - `"beam"`: as `"min_distance"`, but the start is proven for everything in the cell's beam.
+    - `cell`: side of a cell of the last two methods, in pixels; at least 2.
 
-    Which blocks are visible is found again for every image, from the transfer function as it is then.
-    What is leapt over has extinction 0, so the image loses nothing. An extinction of 0 has a gradient
-    nevertheless. `adjoint="direct"`, which marches without leaps, sees it; `"forward"` takes it as 0 wherever
-    rays leap, and `"replay"` also in front of and behind all that a ray sees. A fit that is to make visible
-    what is not begins above 0, or leaps not.
+    Visible blocks are determined for every image, from its transfer function. Regions that are leapt over
+    have extinction 0, so the image loses nothing. Yet an extinction of 0 has a gradient. `adjoint="direct"`,
+    which marches without leaps, includes it; `"forward"` takes it as 0 wherever rays leap, and `"replay"`
+    also in front of and behind everything that a ray sees. A fit that should make invisible regions visible
+    must start above 0, or not leap.
 
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
-    rendering rays of one's own.
+    rendering rays of one's own (`render_rays`).
 
     Source: `"min_distance"` is the grid of Chae and Shin, over the distance map that they start from
-    (`"distance"`). Theirs holds a distance for each voxel, ours the chessboard distance
-    for each block of 4³ voxels; theirs does not march the rays at the corners of cells again, ours does.
-    `"hierarchy"` stands for the octree of the KISTI report 2005, which designs one and does not get it to
-    work. `"beam"` is not published: it is the bound that `"min_distance"` is not.
+    (`"distance"`). Their map holds a distance per voxel, ours a chessboard distance per block of 4³ voxels;
+    they do not march the rays at the corners of cells again, we do. `"hierarchy"` replaces the octree of the
+    KISTI report 2005, which designs one and does not get it to work. `"beam"` is unpublished: it is the
+    bound that `"min_distance"` is not.
     """
 
     method: Method = eqx.field(static=True)
@@ -90,7 +90,7 @@ class SpaceLeaping(Transform):
                 'own use "hierarchy" or "distance".'
             )
         published = self.method == "min_distance"
-        starts = self._published(distances, view) if published else self._proven(occupancy, view)
+        starts = self._nearest_hits(distances, view) if published else self._beam_starts(occupancy, view)
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
     def _corners(self, view: View) -> tuple[Int[Array, "cols"], Int[Array, "rows"]]:
@@ -98,20 +98,20 @@ class SpaceLeaping(Transform):
         columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in (width, height))
         return columns, rows
 
-    def _published(self, distances: EmptySpaceIndex, view: View) -> Float[Array, "rows cols"]:
-        """The nearest first hit of each cell's four corner rays."""
+    def _nearest_hits(self, distances: EmptySpaceIndex, view: View) -> Float[Array, "rows cols"]:
+        """The nearest of the first hits of each cell's four corner rays."""
         columns, rows = self._corners(view)
         hits = view.first_hit(distances, *jnp.meshgrid(columns, rows))
         across = jnp.minimum(hits[:, 1:], hits[:, :-1])
         return jnp.minimum(across[1:], across[:-1])
 
-    def _proven(self, occupancy: Occupancy, view: View) -> Float[Array, "rows cols"]:
-        """The distance up to which no cell of the grid that each beam meets is occupied."""
+    def _beam_starts(self, occupancy: Occupancy, view: View) -> Float[Array, "rows cols"]:
+        """The distance up to which each cell's beam meets no occupied cell of the grid."""
         columns, rows = self._corners(view)
         last = self.cell - 1
         column = jnp.stack([columns[:-1], columns[:-1] + last])[None, :, None, :]
         row = jnp.stack([rows[:-1], rows[:-1] + last])[:, None, :, None]
-        # (rows, cols, 4): the rays in the corners of each cell
+        # (rows, cols, 4): the corner rays of each cell
         column, row = (
             jnp.moveaxis(i.reshape(4, *i.shape[2:]), 0, -1) for i in jnp.broadcast_arrays(column, row)
         )
@@ -119,21 +119,21 @@ class SpaceLeaping(Transform):
         x, y, z, *direction = cast(column, row)
         box = Box.within(occupancy, (x, y, z), tuple(direction))
         box = jax.tree.map(jnp.ravel, box)
-        found = stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
-        first = found.following[0].astype(found.near.dtype)
-        start = jnp.where(first < found.following.shape[0], found.near + first * found.length, jnp.inf)
+        beams = stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
+        first = beams.following[0].astype(beams.near.dtype)
+        start = jnp.where(first < beams.following.shape[0], beams.near + first * beams.length, jnp.inf)
         return start.reshape(column.shape[:-1])
 
 
 class FirstHit(Transform):
-    """End a ray at its first sample that is seen."""
+    """End a ray at its first visible sample."""
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
         return stopped | (transmittance < 1)
 
 
 class _Beams(EmptySpaceIndex):
-    """Whether a stretch of a beam is empty, from the box around it."""
+    """Skips the stretches of a beam whose bounding boxes are empty."""
 
     occupancy: Occupancy
     sums: Sums
@@ -162,14 +162,14 @@ class _Beams(EmptySpaceIndex):
 
 
 class _Distances(EmptySpaceIndex):
-    """How far each ray may go, from the distance of its cell to the nearest occupied one."""
+    """Skips, ray by ray, as far as the distance from the ray's cell to the nearest occupied one allows."""
 
     occupancy: Occupancy
     distance: UInt8[Array, " cells"]
     starts: Float[Array, "rows cols"] | None
-    """Distance from the origin before which nothing is to be seen, for each cell of pixels."""
+    """For each cell of pixels, the distance from the ray origins before which nothing is visible."""
     corner: tuple[Int[Array, ""], Int[Array, ""]] | None
-    """Pixel in the corner of the first cell."""
+    """Pixel at the corner of the first cell."""
     cell: int = eqx.field(static=True)
 
     def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
@@ -179,7 +179,7 @@ class _Distances(EmptySpaceIndex):
         return jnp.ones((), bool)
 
     def within_ranges(self) -> EmptySpaceIndex:
-        # A ray's own range says more than a start that it shares with its neighbours.
+        # A ray's own range is tighter than a start that it shares with its neighbours.
         return replace(self, starts=None, corner=None)
 
     def skip_to(
@@ -190,7 +190,7 @@ class _Distances(EmptySpaceIndex):
         if self.starts is not None:
             assert self.corner is not None
             last = (n - 1 for n in reversed(self.starts.shape))
-            # those that only fill up groups lie past the image
+            # rays that only pad groups lie outside the image
             x, y = (
                 jnp.minimum((pixel - first.astype(pixel.dtype)) // self.cell, n)
                 for pixel, first, n in zip(rays.pixel, self.corner, last, strict=True)
@@ -211,7 +211,7 @@ class _Distances(EmptySpaceIndex):
             .get(mode="promise_in_bounds", wrap_negative_indices=False)
             .astype(depth.dtype)
         )
-        # all cells nearer than that are empty: on to where the ray leaves their cube
+        # all cells nearer than that are empty: advance to where the ray leaves their cube
         ahead = jnp.inf
         for p, r, corner in zip(point, rate, (x, y, z), strict=True):
             face = jnp.where(r > 0, corner + away, corner + 1 - away)

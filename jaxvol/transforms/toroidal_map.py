@@ -1,13 +1,13 @@
 """Where does a swept ultrasound fan lie in the world? Toroidal coordinates (Kim, Kwon and Shin 2008).
 
-A mechanical probe turns a fan of beams about a motor axis. Its samples are a box in (β, σ, γ): the motor's
-angle, the beam's angle in the fan, the depth along the beam. In the world, whose x axis is the motor's
+A mechanical probe turns a fan of beams about a motor axis. Its samples form a box in (β, σ, γ): the motor
+angle, the angle of the beam in the fan, and the depth along the beam. In the world, whose x axis is the motor
 axis and whose z axis points along the middle beam at β = σ = π/2, the box is a sector of a torus:
 
     ρ = sqrt(y² + z²)    R = ρ - a    β = π/2 + atan2(y, z)    σ = π/2 + atan2(x, R)    γ = sqrt(x² + R²) - b
 
 with `a` from the motor axis to the fan's apex and `b` from the apex to the first sample. The volume is
-rendered as it was acquired, without resampling: straight rays in the world are curved in its grid.
+rendered as acquired, without resampling: rays that are straight in the world are curved in its grid.
 """
 
 import math
@@ -27,26 +27,26 @@ from ..volume import Volume
 
 
 STEPS = 64
-"""Steps towards a face, at most. Those that need more graze it, and pass by it or along it."""
+"""Maximum number of steps towards a face. Rays that need more graze it, and pass by it or along it."""
 
 CUBES = 48
-"""Cells along a side of the box around the sector, for what is known of empty space."""
+"""Cells per side of the box around the sector, in the occupancy grid."""
 
 BACK = 0.01
-"""How far behind the origin an entry is looked for, in sizes of the probe. A ray begins anew near its entry
-(`enter`), past which rounding may have brought it: by this much for a camera 1e4 sizes away."""
+"""How far behind the origin an entry is searched for, in sizes of the probe. `enter` moves a ray's origin
+close to its entry, and rounding may take it past the entry: by this much for a camera 1e4 sizes away."""
 
 
 class ToroidalMap(Transform):
-    """Read `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, nodes evenly spaced over the ranges.
+    """Interpret `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, evenly spaced over the ranges.
 
-    The volume's own spacing and origin mean nothing under this map; the world is the probe's, with its
-    origin on the motor axis. Outside the swept sector there is nothing. A ray may leave the sector through
-    its hollow near side and come back; `AlphaCorrection` cuts cells at each such face.
+    The volume's own spacing and origin have no meaning under this map; world coordinates are the probe's,
+    with the origin on the motor axis. The world is empty outside the swept sector. A ray may leave the sector
+    through its hollow near side and re-enter it; `AlphaCorrection` cuts cells at each such face.
 
     **Arguments:**
 
-    - `a`: distance from the motor axis to the fan's apex, world length (mm); negative where the apex lies
+    - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
       behind the axis, as in probes whose array turns about a near axis.
     - `b`: distance from the apex to depth γ = 0, world length.
     - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
@@ -54,14 +54,14 @@ class ToroidalMap(Transform):
     - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
       b + first > 0.
 
-    All are differentiable. Values and gradients are finite everywhere, and 0 is taken for the gradient of
-    an angle where it has none: on the motor axis (y = z = 0) and at the apex (x = R = 0).
+    All are differentiable. Values and gradients are finite everywhere; where an angle has no gradient, on
+    the motor axis (y = z = 0) and at the apex (x = R = 0), it is taken as 0.
 
     **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
 
     Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), which print `atan`; `atan2` is the same where
-    z > 0 and R > 0, and outside every sector elsewhere. Two misprints there: (2.4) has τ for γ, and the
-    derivation of (2.2) has y/2 for y/z. ρ is our name for R + a.
+    z > 0 and R > 0, and elsewhere gives angles outside every sector. The paper has two misprints: (2.4) has
+    τ for γ, and the derivation of (2.2) has y/2 for y/z. ρ is our name for R + a.
     """
 
     a: Float[Array, ""]
@@ -95,7 +95,7 @@ class ToroidalMap(Transform):
         return jnp.vectorize(lambda p: jnp.stack(self._forward(apart(p))), signature="(k)->(k)")(points)
 
     def to_world(self, toroidal: Arrayable) -> Float[Array, "*points 3"]:
-        """World points of (β, σ, γ), (*points, 3): inverse of `to_toroidal` where γ > -b and ρ > 0."""
+        """World points of (β, σ, γ), (*points, 3): the inverse of `to_toroidal` where γ > -b and ρ > 0."""
         beta, sigma, gamma = _components("toroidal", toroidal)
         depth = gamma + self.b
         rho = self.a + depth * jnp.sin(sigma)  # sin σ = cos(σ - π/2)
@@ -107,7 +107,7 @@ class ToroidalMap(Transform):
         """Lowest and highest world coordinates of the swept sector; tight."""
         half = math.pi / 2
         depth = self.b + self.gamma_range
-        # depth and angles act separately: the extremes are at the ends of ranges, or where a cosine peaks
+        # depth and angles are separable: extremes lie at the ends of the ranges, or where a cosine peaks
         fan, turn = self.sigma_range - half, self.beta_range - half
         middle_fan, middle_turn = (jnp.clip(0.0, angles[0], angles[1]) for angles in (fan, turn))
         x = jnp.outer(depth, jnp.sin(fan))
@@ -124,7 +124,7 @@ class ToroidalMap(Transform):
 
     @property
     def center(self) -> Float[Array, "3"]:
-        """Middle of the bounds."""
+        """Center of the bounds."""
         low, high = self.corners
         return (low + high) / 2
 
@@ -170,8 +170,8 @@ class _Sector(Space):
         return apart(self.probe.to_world(jnp.stack(toroidal)))
 
     def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
-        """Cubes of the world around the sector. Each asks for the blocks that the sphere around it reaches:
-        no angle changes faster along a path than by the path's length over the distance to its axis."""
+        """World cells around the sector. A cell is occupied if the sphere around it reaches a visible block:
+        along a path, an angle changes by no more than the path's length over the distance to its axis."""
         low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
         x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
         middle = jnp.arange(CUBES, dtype=x.dtype) + 0.5
@@ -181,7 +181,7 @@ class _Sector(Space):
         off = _hypot(point[0], rho - self.probe.a)
 
         def angle(axis_distance: Scalar) -> Scalar:
-            """The most that an angle about an axis changes within the sphere."""
+            """Upper bound on the change of an angle about an axis within the sphere."""
             away = axis_distance > radius
             return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
 
@@ -203,12 +203,11 @@ class _Sector(Space):
         return _Curved(self, entry, direction)
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """First entry, not behind the origin by more than `BACK`, and last exit: between them the ray may be
-        outside.
+        """First entry, at most `BACK` behind the origin, and last exit; between them the ray may be outside.
 
-        No closed form is worth it (the faces are two tori, two cones and two planes); but each face's
-        distance is one, so each end is approached by steps of the distance that is still to go at least.
-        A ray that grazes a face may be given some of what lies before it, which is empty.
+        A closed form is not worth its cost (the faces are two tori, two cones and two planes). But the
+        distance to each face has one, so each end is approached by steps of the least distance left to go.
+        The interval of a ray that grazes a face may include some of the empty space before it.
         """
         low, high = (apart(corner) for corner in self.probe.corners)
         near, far = slab_interval(origin, direction, low, high)
@@ -221,31 +220,31 @@ class _Sector(Space):
         return jnp.where(hit, first, jnp.inf), jnp.where(hit, last, -jnp.inf)
 
     def _face(self, origin: Vec3, direction: Vec3, begin: Scalar, length: Scalar, sign: int) -> Scalar:
-        """Where the sector begins, coming from `begin` and going at most `length` along `sign` × the ray."""
+        """Distance at which the sector begins, searched from `begin` over `length` along `sign` × the ray."""
         tolerance = 8 * jnp.finfo(begin.dtype).eps * self._size
 
         def outside_at(sector: _Sector, origin: Vec3, direction: Vec3, t: Scalar) -> tuple[Scalar, Scalar]:
-            """How far outside the sector is, and the slope of that along the ray."""
+            """How far outside the sector a point is, and the derivative of that along the ray."""
             one = jnp.ones_like(t)
             return jax.jvp(lambda t: sector._outside(along(origin, direction, t)), (t,), (one,))
 
         fixed = jax.lax.stop_gradient((self, origin, direction))
         begin, length, tolerance = jax.lax.stop_gradient((begin, length, tolerance))
 
-        def go_on(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> Bool[Array, ""]:
+        def cond(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> Bool[Array, ""]:
             gone, outside, _, steps = state
             return (outside > tolerance) & (gone <= length) & (steps < STEPS)
 
-        def go(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        def body(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
             gone, outside, slope, steps = state
             here = along(fixed[1], fixed[2], begin + sign * gone)
             gone = gone + fixed[0]._clear(here, jnp.maximum(outside, tolerance), sign * slope)
             return gone, *outside_at(*fixed, begin + sign * gone), steps + 1
 
         outside, slope = outside_at(*fixed, begin)
-        gone, outside, _, _ = jax.lax.while_loop(go_on, go, (0 * outside, outside, slope, 0 * outside))
+        gone, outside, _, _ = jax.lax.while_loop(cond, body, (0 * outside, outside, slope, 0 * outside))
         t = begin + sign * gone
-        # One Newton step: it takes what the tolerance left, and carries the implicit function's gradient.
+        # One Newton step removes what the tolerance left, and carries the gradient of the implicit function.
         value, slope = outside_at(self, origin, direction, t)
         slope = jax.lax.stop_gradient(slope)
         at_face = (jnp.abs(outside) <= 4 * tolerance) & (jnp.abs(slope) > 1e-3)
@@ -253,17 +252,18 @@ class _Sector(Space):
 
     @property
     def _size(self) -> Scalar:
-        """The length by which rounding is measured."""
+        """Length scale of rounding errors."""
         probe = self.probe
         return jax.lax.stop_gradient(jnp.abs(probe.a) + probe.b + probe.gamma_range[1])
 
     def _clear(self, point: Vec3, outside: Scalar, slope: Scalar) -> Scalar:
-        """How far on the face that is `outside` away, and comes nearer by `slope` < 0, is not reached yet.
+        """A step along the ray that cannot pass the face `outside` away, whose distance has `slope` < 0.
 
-        The distance f to each face has |f'| ≤ 1, so f is clear. Its second derivative along a line is at
-        least -(1/ρ + 1/D), D the distance to the circle of apexes, and this at most doubles within half of
-        the smaller. So f + f' s - ½ k s², k = 4 / min(ρ, D), is a bound, and its root s is clear as well:
-        close to a face it is Newton's step, which does not creep along where the ray meets it obliquely.
+        The distance f to each face has |f'| ≤ 1, so a step of f is safe. Its second derivative along a line
+        is at least -(1/ρ + 1/D), with D the distance to the circle of apexes, and this at most doubles within
+        half of the smaller of ρ and D. So f + f' s - ½ k s², with k = 4 / min(ρ, D), is a lower bound, and a
+        step to its root s is safe as well: near a face it is Newton's step, which does not slow down where
+        the ray meets the face obliquely.
         """
         x, y, z = point
         rho = _hypot(y, z)
@@ -273,7 +273,7 @@ class _Sector(Space):
         return jnp.maximum(outside, jnp.minimum(2 * outside / (root - slope), near / 2))
 
     def _outside(self, point: Vec3) -> Scalar:
-        """How far outside the sector a point is at least; negative inside."""
+        """Lower bound on a point's distance from the sector; negative inside."""
         x, y, z = point
         probe, half = self.probe, math.pi / 2
         off = _hypot(y, z) - probe.a
@@ -290,7 +290,7 @@ class _Sector(Space):
 
 
 class _Curved(Path):
-    """A straight world ray in a sector's grid."""
+    """A straight world ray in the grid of a sector."""
 
     gaps: ClassVar[bool] = True
 
@@ -310,7 +310,7 @@ class _Curved(Path):
             (probe.gamma_range, self.sector._size),
         )
         for c, n, (ends, size) in zip(coordinate, self.sector.shape, axes, strict=True):
-            # rounding at a face must not decide whether its sample is seen
+            # rounding at a face must not decide whether its sample is visible
             slack = rounding * size / (ends[1] - ends[0]) * (n - 1)
             inside = inside & (c >= -slack) & (c <= n - 1 + slack)
         return inside
@@ -325,7 +325,7 @@ def _hypot(a: Scalar, b: Scalar) -> Scalar:
 
 def _atan2(a: Scalar, b: Scalar) -> Scalar:
     """atan2, with value and gradient 0 at the origin."""
-    # not just off 0: the derivative divides by a² + b², which must not underflow
+    # not merely nonzero: the derivative divides by a² + b², which must not underflow
     away = jnp.maximum(jnp.abs(a), jnp.abs(b)) > float(jnp.finfo(a.dtype).tiny) ** 0.25
     return jnp.where(away, jnp.arctan2(jnp.where(away, a, 0), jnp.where(away, b, 1)), 0)
 

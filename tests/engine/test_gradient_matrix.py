@@ -287,8 +287,8 @@ def test_gradients_under_jit_are_those_without(method):
 
 
 @slow
-def test_waves_and_batches_of_rays_do_not_show():
-    """1.07 million pixels: two waves, and tens of batches."""
+def test_tiles_and_batches_of_rays_do_not_show():
+    """1.07 million pixels: two tiles, and tens of batches."""
     gradients = {}
     for method in (None, "hierarchy"):
         volume, transfer, camera, march = scene_of("jittered", method)

@@ -1,4 +1,4 @@
-"""RayTiles and batches do not show; nothing is compiled twice; memory does not grow with the image."""
+"""Tiles and batches do not show; nothing is compiled twice; memory does not grow with the image."""
 
 from functools import partial
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.engine import tiles as waves
-from jaxvol.render import _How
+from jaxvol.engine.tiling import Tiling
+from jaxvol.render import _render
 
 from ..scenes import anisotropic_noise, around, counting, soft_transfer
 
@@ -28,15 +28,15 @@ def assert_same(a, b, tolerance=1e-6):
 @pytest.mark.parametrize(
     "size", [(65, 65), *(pytest.param(size, marks=pytest.mark.slow) for size in ((1, 1), (70, 3)))]
 )
-def test_waves_do_not_show(size, monkeypatch):
+def test_tiles_do_not_show(size):
     volume = anisotropic_noise()
     camera = around(volume, size)
     whole = jv.render(volume, soft_transfer(), camera, MARCH)
     assert whole.rgba.shape == (size[1], size[0], 4)
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
-    monkeypatch.setattr(waves, "WAVE", 4)
     Anew = counting()  # another type, so another program
-    assert_same(whole, jv.render(volume, Anew(*jax.tree.leaves(soft_transfer())), camera, MARCH))
+    scene = volume, Anew(*jax.tree.leaves(soft_transfer())), camera, MARCH, None
+    assert_same(whole, _render(scene, "all", "replay", Tiling(tile=4)))
     assert Anew.traces == 1
 
 
@@ -139,7 +139,7 @@ def test_memory_beside_the_image_does_not_grow_with_it():
             .temp_size_in_bytes
         )
 
-    small, large = workspace(1024), workspace(2048)  # four waves, and sixteen
+    small, large = workspace(1024), workspace(2048)  # four tiles, and sixteen
     pixels = 2048**2 - 1024**2
     bytes_per_pixel = 4 * 4 + 4 + 4 + 1 + 1  # of a Rendering, in tiles before they are put together
     assert large - small <= 1.1 * bytes_per_pixel * pixels
@@ -167,7 +167,9 @@ def test_unknown_outputs_are_named():
 def test_an_unknown_adjoint_is_named():
     # not through render, whose annotation the checker of the tests enforces first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
-        _How.of("all", "reverse", anisotropic_noise(), MARCH)
+        _render(
+            (anisotropic_noise(), soft_transfer(), around(anisotropic_noise()), MARCH, None), "all", "reverse"
+        )
 
 
 def test_direct_under_jit_asks_for_the_number_of_samples():

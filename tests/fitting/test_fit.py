@@ -292,7 +292,7 @@ BAD = {
     ),
     "checkpoint": (
         lambda: jv.fit(unreachable, BEGIN, checkpoint="/dev/null/a"),
-        r"checkpoint: /dev/null/a cannot be written \(/dev/null is no folder\)",
+        r"checkpoint: /dev/null/a cannot be written \(/dev/null is not a folder\)",
     ),
     "checkpoint a folder": (
         lambda: jv.fit(unreachable, BEGIN, checkpoint=Path(__file__).parent),
@@ -437,7 +437,7 @@ def test_a_fit_that_is_interrupted_keeps_its_steps(tmp_path):
     with pytest.raises(KeyboardInterrupt) as stop:
         jv.fit(curve, BEGIN, checkpoint=file, callback=interrupt)
     assert stop.value.__notes__ == [
-        f"fit: stopped after 3 steps, which {file} holds; the same call goes on from there."
+        f"fit: stopped after 3 steps, saved in {file}; the same call continues from there."
     ]
     steps = []
     again = jv.fit(curve, BEGIN, max_steps=30, checkpoint=file, callback=lambda *a: steps.append(a[0]))

@@ -422,7 +422,7 @@ def test_images_that_are_not_3d_or_not_scalar_are_refused(sitk, tmp_path):
         "vectors.nrrd": sitk.Image([4, 4, 4], sitk.sitkVectorFloat32, 3),
     }.items():
         sitk.WriteImage(image, str(tmp_path / name))
-        with pytest.raises(ValueError, match="must be a 3-D image of one value a voxel"):
+        with pytest.raises(ValueError, match="must be a 3-D image of one value per voxel"):
             load(tmp_path / name)
 
 

@@ -13,6 +13,7 @@ import jaxvol as jv
 from jaxvol import reference
 from jaxvol._util.vec3 import apart
 from jaxvol.engine import shading as visible
+from jaxvol.engine.shading import shade_pixels
 from jaxvol.lighting import (
     ConstantLight,
     Deferred,
@@ -26,9 +27,8 @@ from jaxvol.lighting import (
     shading as seam,
 )
 from jaxvol.lighting.baked import BakedLighting
-from jaxvol.lighting.deferred import Line, lit_picture
 from jaxvol.lighting.shading import Sample, Shading, Surroundings, lit
-from jaxvol.space import Affine
+from jaxvol.space import Affine, Line
 
 from ..half_space import chandrasekhar, reflected, under_sky
 from ..scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer
@@ -697,9 +697,9 @@ def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
     zero = jnp.zeros((), jnp.int32)
     line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
     rgba = jnp.asarray([[jnp.nan] * 4, [0.5] * 4, [0.0] * 4])
-    found = jax.jit(lambda rgba, depth: lit_picture(seen, space, lambda _: line, rgba, depth))(
-        rgba, jnp.asarray([jnp.nan, 0.0, jnp.inf])
-    )
+    found = jax.jit(
+        lambda rgba, depth: shade_pixels(Deferred(lighting), seen, space, lambda _: line, rgba, depth)
+    )(rgba, jnp.asarray([jnp.nan, 0.0, jnp.inf]))
     np.testing.assert_array_equal(np.isnan(found), [[True] * 4, [False] * 4, [False] * 4])
 
 
@@ -1232,7 +1232,7 @@ def test_rays_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
         turned = eqx.tree_at(lambda how: how.lights[0].direction, lighting, direction)
         seen = seam.classification(volume, TRANSFER, space, turned)
         line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
-        return jnp.sum(lit_picture(seen, space, lambda _: line, rgba, depth) ** 2)
+        return jnp.sum(shade_pixels(Deferred(turned), seen, space, lambda _: line, rgba, depth) ** 2)
 
     # one ray that ends where the skin comes in, toward a sun from the side, and one that sees nothing
     rgba, depth = jnp.asarray([[0.3, 0.2, 0.1, 0.5], [0.0] * 4]), jnp.asarray([0.11, jnp.inf])
@@ -1324,7 +1324,7 @@ BAD = {
     "critical_angle": (lambda: ScattererTemplates(HALF, SUN, critical_angle=0.0), "critical_angle must be"),
     "given": (lambda: ScattererTemplates([HALF, HALF], SUN, given=given(PAIR)), "templates of 2 materials"),
     "lights": (lambda: ScattererTemplates(HALF, ()), "lights must be a light"),
-    "materials": (lambda: ScattererTemplates((), SUN), "materials must hold a Material at least"),
+    "materials": (lambda: ScattererTemplates((), SUN), "materials must hold at least one Material"),
     "lighting": (
         lambda: jv.render(nodes({}), TRANSFER, around(nodes({})), jv.March(0.1), lighting=3),
         "lighting must be None or a Lighting, such as ScattererTemplates; got 3",

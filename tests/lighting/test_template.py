@@ -397,7 +397,7 @@ BAD = {
     "threshold 0": (lambda: scatterer_template(HALF, 0, threshold=0.0), "threshold must be"),
     "threshold 1": (lambda: scatterer_template(HALF, 0, threshold=1.0), "threshold must be"),
     "energy": (lambda: scatterer_template(HALF, 0, energy="lost"), "energy must be one of conserving, print"),
-    "flights": (lambda: scatterer_template(HALF, 0, flights=False), 'flights=False belongs to energy="print'),
+    "flights": (lambda: scatterer_template(HALF, 0, flights=False), 'flights=False requires energy="print'),
     "no angle": (lambda: scatterer_template(HALF, 0, critical_angle=0.0), "critical_angle must be"),
     "wide angle": (lambda: scatterer_template(HALF, 0, critical_angle=91.0), "critical_angle must be"),
     "opacity too low": (
@@ -440,7 +440,7 @@ BAD = {
     "cross_section": (lambda: Material.from_scatterers(0.5, 1.0, 0.0), "cross_section must be greater than"),
     "preset": (lambda: material("fat"), "name must be one of skin, muscle, bone; got 'fat'"),
     "millimetre": (lambda: material("skin", millimetre=0.0), "millimetre must be greater than 0"),
-    "no materials": (lambda: materials_of([]), "materials must hold a Material at least"),
+    "no materials": (lambda: materials_of([]), "materials must hold at least one Material"),
     "no material": (lambda: materials_of([HALF, "skin"]), "materials must hold jaxvol materials; got 'skin'"),
     "direction": (lambda: DirectionalLight((0, 0, 0)), "direction must not have length 0"),
     "direction's shape": (lambda: DirectionalLight((0, 1)), "direction must have shape"),
@@ -449,7 +449,7 @@ BAD = {
     "intensity": (lambda: PointLight((0, 0, 0), (-1, 1, 1)), "intensity must not be negative"),
     "radiance": (lambda: ConstantLight((1, 1)), "radiance must have shape"),
     "dark radiance": (lambda: ConstantLight((1, -1, 1)), "radiance must not be negative"),
-    "no lights": (lambda: lights_of(()), "lights must be a light, or a tuple"),
+    "no lights": (lambda: lights_of(()), "lights must be a light or a tuple"),
     "no light": (lambda: lights_of((ConstantLight(), 3)), "lights must hold jaxvol lights.*got 3"),
 }
 

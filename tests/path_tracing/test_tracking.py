@@ -7,10 +7,11 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.noise import hashed_uniforms_4
+from jaxvol._util.piecewise_linear import upper_bound_between
 from jaxvol._util.vec3 import apart
 from jaxvol.lighting import Material
 from jaxvol.occupancy import Blocks
-from jaxvol.path_tracing.majorants import Majorants, greatest_between
+from jaxvol.path_tracing.majorants import Majorants
 from jaxvol.path_tracing.medium import Medium
 from jaxvol.path_tracing.tracking import Flight, fly
 
@@ -103,7 +104,7 @@ def test_bounds_are_no_larger_than_need_be():
         transfer = random_transfer(random, points)
         low, high = np.sort(random.uniform(-0.1, 1.1, (2, 200)), axis=0).astype(np.float32)
         ends = jnp.asarray(low), jnp.asarray(high)
-        bound = jax.jit(greatest_between)(transfer.values, transfer.extinction, *ends)
+        bound = jax.jit(upper_bound_between)(transfer.values, transfer.extinction, *ends)
         values, extinction = (np.asarray(a, float) for a in (transfer.values, transfer.extinction))
         for a, b, told in zip(low, high, np.asarray(bound), strict=True):
             inside = values[(values >= a) & (values <= b)]

@@ -9,8 +9,10 @@ from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
-from jaxvol.engine import packing as packed, tiles as waves, wavefront
+from jaxvol.engine import packing as packed
+from jaxvol.engine.tiling import Tiling
 from jaxvol.phantoms import toroidal_phantom
+from jaxvol.render import _render
 
 from ..scenes import CAMERAS, around, counting, doubled, in_float64, inside, orthographic, scaled_phantom
 
@@ -184,23 +186,19 @@ def test_the_jitter_happens_at_the_same_sample_where_air_lies_beyond_the_last_po
 
 
 @pytest.mark.parametrize(
-    ("cells", "batch", "wave"), [(4, 4, 2), pytest.param(16, 64, 4, marks=pytest.mark.slow)]
+    "tiling",
+    [
+        Tiling(cells=4, batch=4, tile=2),
+        pytest.param(Tiling(cells=16, group=4, batch=64, tile=4, kept=0.5), marks=pytest.mark.slow),
+    ],
 )
-def test_sizes_of_tiles_do_not_show(cells, batch, wave, monkeypatch):
+def test_tilings_do_not_show(tiling):
     volume = jv.Volume(contents("blobs", 1).astype(np.float32), SPACING)
-    march = jv.March(0.013, leaping(PLAIN, "hierarchy"))
-    whole = jv.render(volume, table(1, 1.0), orthographic(volume, SIZE), march)
+    march, camera = jv.March(0.013, leaping(PLAIN, "hierarchy")), orthographic(volume, SIZE)
+    whole = jv.render(volume, table(1, 1.0), camera, march)
     assert float(whole.rgba[..., 3].max()) > 0.1
-    monkeypatch.setattr(wavefront, "CELLS", cells)
-    monkeypatch.setattr(wavefront, "BATCH", batch)
-    monkeypatch.setattr(waves, "WAVE", wave)
-
-    class Anew(Counting):
-        """Another type, so another program."""
-
-    transfer = Anew(*jax.tree.leaves(table(1, 1.0)))
     before = Counting.traces
-    other = jv.render(volume, transfer, orthographic(volume, SIZE), march)
+    other = _render((volume, table(1, 1.0), camera, march, None), "all", "replay", tiling)
     assert Counting.traces > before
     assert_same(other, whole, fewer=False)
 
@@ -208,24 +206,15 @@ def test_sizes_of_tiles_do_not_show(cells, batch, wave, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
-    ("where", "name", "size"),
-    [
-        *((wavefront, "CELLS", n) for n in (4, 16)),
-        *((wavefront, "BATCH", n) for n in (4, 64)),
-        *((waves, "WAVE", n) for n in (2, 16)),
-    ],
+    ("name", "size"), [("cells", 4), ("cells", 16), ("batch", 4), ("batch", 64), ("tile", 2), ("tile", 16)]
 )
-def test_no_size_shows_under_jitter_and_termination(where, name, size, method, monkeypatch):
+def test_no_size_shows_under_jitter_and_termination(name, size, method):
     volume = jv.Volume(bytes_of(contents("blobs", 1)), SPACING)
     camera = around(volume, (70, 66))
     march = jv.March(0.013, leaping(MOVING, method))
     whole = jv.render(volume, table(1, 255), camera, march)
-    monkeypatch.setattr(where, name, size)
-
-    class Anew(Counting):
-        """Another type, so another program."""
-
-    other = jv.render(volume, Anew(*jax.tree.leaves(table(1, 255))), camera, march)
+    tiling = Tiling()._replace(**{name: size})
+    other = _render((volume, table(1, 255), camera, march, None), "all", "replay", tiling)
     assert_same(other, whole, fewer=False)
 
 

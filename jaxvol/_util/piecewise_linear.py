@@ -1,0 +1,142 @@
+"""Piecewise linear functions of one variable: tables, look-ups, and bounds over ranges.
+
+Transfer functions are such functions of a volume's value. A table has one row for each control point, with
+all that a value needs which lies at or beyond this point and before the next: see `TransferFunction.rows`.
+"""
+
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .vec3 import Scalar, Vec3
+
+
+FEW = 16
+"""With up to so many control points, comparing a value with each of them costs less than a look-up."""
+
+ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
+"""By how much an interpolated extinction may exceed its bound, relative to the greatest of its table."""
+
+Row: TypeAlias = tuple[Scalar, ...]
+"""One row of a table."""
+
+
+def clip_below(value: Scalar, least: Scalar) -> Scalar:
+    """The larger of the two. NaN stays NaN. A comparison takes less time than a maximum."""
+    return jnp.where(value < least, least, value)
+
+
+def points_below(
+    values: Float[Array, " n"], value: Float[Array, "*batch"], *, strictly: bool = False
+) -> Int[Array, "*batch"]:
+    """Number of control points at or below a value, or strictly below it."""
+    values, last = jax.lax.stop_gradient(values), values.shape[0] - 1
+
+    def searched(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
+        # While there are few points, comparing with all of them, one fused kernel, is faster.
+        how, side = "compare_all" if last < 2 * FEW else "scan_unrolled", "left" if strictly else "right"
+        return jnp.searchsorted(values, value, side=side, method=how).astype(jnp.int32)
+
+    if last < FEW:
+        return searched(value)
+    first, step = values[0], (values[-1] - values[0]) / last
+
+    def counted(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
+        """Of evenly spaced points, by a division, which may be off by one."""
+        guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
+        reached = [
+            value > at if strictly else value >= at
+            for at in (table_entry(values, guess), table_entry(values, guess + 1))
+        ]
+        return guess + sum(each.astype(jnp.int32) for each in reached)
+
+    # compare positions rather than gaps: small deviations of gaps would add up
+    places = first + step * jnp.arange(last + 1, dtype=values.dtype)
+    even = jnp.all(jnp.abs(values - places) < 0.4 * step)
+    return jax.lax.cond(even, counted, searched, value)
+
+
+def table_entry(values: Float[Array, " n"], point: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+    return values.at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def table_row(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
+    """One row. Each entry is looked up by itself, so that batched entries are whole arrays from the start."""
+    point = jnp.clip(point, 0, rows.shape[0] - 1)
+    return tuple(
+        rows[:, i].at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        for i in range(rows.shape[1])
+    )
+
+
+def interpolate_row(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:
+    """Colour and extinction of a value at the distance `past` beyond the point of this row."""
+    r, g, b, extinction = (at + past * slope for at, slope in zip(row[1:5], row[5:9], strict=True))
+    # where it falls to 0, rounding may make it negative; NaN stays NaN
+    return (r, g, b), jnp.where(extinction < 0, 0, extinction)
+
+
+def positive_between(
+    values: Float[Array, " n"],
+    extinction: Float[Array, " n"],
+    low: Float[Array, "*blocks"],
+    high: Float[Array, "*blocks"],
+) -> Bool[Array, "*blocks"]:
+    """Whether the piecewise linear extinction is positive anywhere from `low` to `high`."""
+    low, high = low.astype(values.dtype), high.astype(values.dtype)
+    positive, n = extinction > 0, values.shape[0]
+    if n > FEW:  # counting by look-up costs less than comparing with each point
+        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
+        # between two points the extinction is positive wherever it is at one of the two
+        from_point = jnp.maximum(points_below(values, low) - 1, 0)
+        # the first point at or above `high`; the second of two points at `high`
+        to_point = jnp.maximum(points_below(values, high, strictly=True), points_below(values, high) - 1)
+        to_point = jnp.minimum(to_point, n - 1)
+        return before[to_point + 1] > before[from_point]
+    seen = jnp.zeros(low.shape, bool)
+    for point in range(n):
+        # a point's extinction reaches from the point before it to the one behind it
+        reached = jnp.full(low.shape, positive[point])
+        if point > 0:
+            reached &= (high > values[point - 1]) | (high >= values[point])
+        if point < n - 1:
+            reached &= low < values[point + 1]
+        seen |= reached
+    return seen
+
+
+def upper_bound_between(
+    values: Float[Array, " n"],
+    extinction: Float[Array, " n"],
+    low: Float[Array, "*blocks"],
+    high: Float[Array, "*blocks"],
+) -> Float[Array, "*blocks"]:
+    """Upper bound of the piecewise linear extinction from `low` to `high`, rounding included.
+
+    Such a function is greatest at an end of the range, or at a control point inside it."""
+    low, high = low.astype(values.dtype), high.astype(values.dtype)
+    ends = jnp.maximum(jnp.interp(low, values, extinction), jnp.interp(high, values, extinction))
+    first, end = points_below(values, low, strictly=True), points_below(values, high)
+    inside = _maximum_of_range(extinction, first, end)
+    return jnp.maximum(ends, inside) + ROUNDING * extinction.max()
+
+
+def _maximum_of_range(
+    entries: Float[Array, " n"], first: Int[Array, "*batch"], end: Int[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """Maximum of the entries from `first` to before `end`; 0 where there are none. Two look-ups in a table of
+    the maxima of all runs whose length is a power of two."""
+    runs, length = [entries], 1
+    while 2 * length <= entries.shape[0]:
+        shorter = runs[-1]
+        runs.append(jnp.maximum(shorter, jnp.concatenate([shorter[length:], shorter[-length:]])))
+        length *= 2
+    table, n = jnp.stack(runs), entries.shape[0]
+    count = end - first
+    level = sum((count >= 2**k).astype(jnp.int32) for k in range(1, len(runs)))
+    level = jnp.broadcast_to(level, count.shape)
+    left = table[level, jnp.clip(first, 0, n - 1)]
+    right = table[level, jnp.clip(end - 2**level, 0, n - 1)]
+    return jnp.where(count > 0, jnp.maximum(left, right), 0)

@@ -1,0 +1,144 @@
+"""How is an image differentiated? Each adjoint says how the image is made, and how it is pulled back.
+
+An image is one compiled program, and its gradient another.
+"""
+
+from abc import abstractmethod
+from functools import partial
+from typing import Any, Literal, TypeAlias
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from .._util.checks import is_traced
+from .._util.xla import compiled, forward_only, recomputed, transformations
+from ..march import March
+from ..reference import steps_across
+from ..rendering import Rendering
+from ..volume import Volume
+from .acceleration import Scene, VolumeAcceleration
+from .gradients import render_vjp
+from .image import RenderOptions, march_image, scan_image, shade_image
+
+
+Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
+
+WRONG_WAY = {
+    "replay": 'adjoint="replay" is for reverse mode (jax.grad, jax.vjp). For forward mode (jax.jvp, '
+    'jax.jacfwd) pass adjoint="forward"; for both, and for higher derivatives, adjoint="direct".',
+    "forward": 'adjoint="forward" is for forward mode (jax.jvp, jax.jacfwd). For reverse mode (jax.grad, '
+    'jax.vjp) pass adjoint="replay", the default; for both, adjoint="direct".',
+}
+
+
+class AbstractAdjoint(eqx.Module):
+    """How an image is made so that it can be differentiated."""
+
+    @abstractmethod
+    def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+        """The image."""
+
+    def shade(
+        self,
+        scene: Scene,
+        acceleration: VolumeAcceleration,
+        rgba: Float[Array, "*rays 4"],
+        depth: Float[Array, "*rays"],
+    ) -> Float[Array, "*rays 4"]:
+        """The image, as shaded by a lighting for which `shades_pixels` holds."""
+        return _shade(scene, acceleration, rgba, depth)
+
+
+class ReplayAdjoint(AbstractAdjoint):
+    """Reverse mode, by a second march."""
+
+    def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+        if not is_traced(scene):  # going through a custom rule takes milliseconds
+            return _march_in_turn(scene, options, acceleration)
+        kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
+        if any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds):
+            raise ValueError(WRONG_WAY["replay"])  # JAX's own error names neither argument nor remedy
+        # inside `jax.shard_map`, JAX has custom rules only under `jax.jit`
+        sharded = any("ShardMapTracer" in kind for kind in kinds)
+        image = _replayed_in_shard if sharded else _replayed
+        return image(scene, options, jax.lax.stop_gradient(acceleration))
+
+    def shade(
+        self,
+        scene: Scene,
+        acceleration: VolumeAcceleration,
+        rgba: Float[Array, "*rays 4"],
+        depth: Float[Array, "*rays"],
+    ) -> Float[Array, "*rays 4"]:
+        return _shade_again(scene, acceleration, rgba, depth)
+
+
+class ForwardAdjoint(AbstractAdjoint):
+    """Forward mode, by JAX, through the fast engine."""
+
+    def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+        return forward_only(_march(scene, options, acceleration), WRONG_WAY["forward"])
+
+
+class DirectAdjoint(AbstractAdjoint):
+    """Any mode and order, by JAX, through this many steps of the reference engine."""
+
+    length: int = eqx.field(static=True)
+
+    def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+        return _scan(scene, options, acceleration, self.length)
+
+
+def adjoint_of(name: Adjoint, volume: Volume, march: March) -> AbstractAdjoint:
+    """The adjoint of this name.
+
+    **Raises:** `ValueError` for `"direct"` where the march or the spacing is traced and `march.max_samples`
+    is not given."""
+    if name == "replay":
+        return ReplayAdjoint()
+    if name == "forward":
+        return ForwardAdjoint()
+    # rounded up to one of few lengths, so that a change of step rarely compiles the program again
+    return DirectAdjoint(min(-(-steps_across(volume, march) // 64) * 64, march.most_samples))
+
+
+def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    return march_image(scene, options, acceleration)[0]
+
+
+_march = compiled(_image, has_jvp=True)
+_march_in_turn = compiled(_image)
+_march_recorded = compiled(partial(march_image, record=True))
+_render_vjp = compiled(render_vjp)
+_scan = compiled(scan_image, has_jvp=True)
+_shade = compiled(shade_image, has_jvp=True)
+_shade_again = recomputed(shade_image)
+
+
+@eqx.filter_custom_vjp
+def _replayed(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    return _march_in_turn(scene, options, acceleration)
+
+
+@_replayed.def_fwd
+def _(
+    perturbed: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
+) -> tuple[Rendering, Any]:
+    rendering, ranges = _march_recorded(scene, options, acceleration)
+    return rendering, (rendering, ranges)
+
+
+@_replayed.def_bwd
+def _(
+    residuals: Any,
+    cotangent: Rendering,
+    perturbed: Any,
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+) -> Any:
+    return _render_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
+
+
+_replayed_in_shard = eqx.filter_jit(_replayed)

@@ -1,0 +1,165 @@
+"""Marches one batch of rays, segment after segment, until too few of them are left."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+from .._util.sharding import varying
+from ..beams import Box
+from ..march import EmptySpaceIndex, March
+from ..occupancy import Occupancy
+from ..reference import Progress, front, move
+from ..space import Ray
+from ..transfer import Classification
+from ..volume import Volume
+from .segment import SampleVisitor, march_segment, regular_from_here
+from .tiling import Tiling
+
+
+State: TypeAlias = tuple[Progress, tuple[PyTree, PyTree, PyTree]]
+"""Where all rays are, and a visitor's `kept`, `sums` and `total`."""
+
+
+class CellRange(NamedTuple):
+    """The visible cells of a ray lie from `first` on, and before `until`."""
+
+    first: Int[Array, "*rays"]
+    until: Int[Array, "*rays"]
+
+
+class Beams(eqx.Module):
+    """Rays that are marched together, in groups, of which equally many in a row make up a beam.
+
+    - `rays`: of shape (groups, rays in a group).
+    - `count`: number of beams.
+    - `box`: the boxes around the beams.
+    - `range`: where known, the cells outside of which a ray sees nothing, and is not marched.
+    """
+
+    rays: Ray
+    count: int = eqx.field(static=True)
+    box: Callable[[Occupancy], Box] = eqx.field(static=True)
+    range: CellRange | None = None
+
+    @property
+    def groups(self) -> int:
+        return self.rays.length.shape[0]
+
+
+class Job(NamedTuple):
+    """All that does not change while rays are marched.
+
+    - `empty_space`: where it is known, and `prepared`, what it has found out about these beams.
+    - `any_order`: whether rays with a shift ahead are marched among all others, rather than first.
+    """
+
+    march: March
+    volume: Volume
+    seen: Classification
+    beams: Beams
+    tiling: Tiling
+    visitor: SampleVisitor | None
+    empty_space: EmptySpaceIndex | None
+    prepared: PyTree
+    any_order: Bool[Array, ""]
+
+    def alive(self, at: Progress) -> Bool[Array, "*rays"]:
+        """Rays that are not finished, and may take more samples."""
+        return ~at.finished & (at.index < self.march.most_samples)
+
+    def wanted(self, at: Progress, regular: bool) -> Bool[Array, "*rays"]:
+        """Rays to be marched in this pass: the first one is for those with a shift ahead, unless all are
+        marched in any order, or the number of samples is limited; the second, `regular` one is for all."""
+        alive = self.alive(at)
+        if regular or self.march.max_samples is not None:
+            return alive
+        return alive & (self.any_order | ~regular_from_here(at))
+
+
+def march_batch(
+    job: Job, rows: Int[Array, " batch"], state: State, keep: Int[Array, ""], *, regular: bool
+) -> tuple[State, Bool[Array, " batch"]]:
+    """Marches the groups in these rows while more than `keep` of them are wanted, and tells which still are.
+    A row past the last one stands for no group."""
+    tiling, beams, visitor = job.tiling, job.beams, job.visitor
+    size, group = rows.size, tiling.group
+    known = jnp.minimum(rows, beams.groups - 1)
+    beam = jnp.repeat(known // (beams.groups // beams.count), group)
+
+    def gather(leaf: Array) -> Array:
+        # flat, so that the loop changes it in place: a reshape in there would copy it
+        taken = leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return taken.reshape(-1, *leaf.shape[2:])
+
+    def grouped(part: Array) -> Array:
+        return part.reshape(size, group, *part.shape[1:])
+
+    def scatter(leaf: Array, part: Array) -> Array:
+        return leaf.at[rows].set(grouped(part), mode="drop")
+
+    def scatter_add(leaf: Array, part: Array) -> Array:
+        return leaf.at[rows].add(grouped(part), mode="drop")
+
+    at, (kept, sums, total) = state
+    given = None if visitor is None else visitor.given
+    rays, here, range_, given, mine = jax.tree.map(gather, (beams.rays, at, beams.range, given, kept))
+    here = with_fields(here, finished=here.finished | jnp.repeat(rows >= beams.groups, group))
+    more = jax.tree.map(lambda leaf: jnp.zeros((size * group, *leaf.shape[2:]), leaf.dtype), sums)
+    more = varying(more, rays)
+
+    def going(here: Progress) -> Bool[Array, " batch"]:
+        # XLA finds the maximum of floats with SIMD, but looks at one truth value after the other
+        return jnp.max(grouped(job.wanted(here, regular).astype(jnp.float32)), axis=-1) > 0
+
+    def advance(state: State) -> State:
+        here, (mine, more, total) = state
+        if job.empty_space is not None:
+            here = _leap(job, job.empty_space, beam, rays, here)
+        after, samples = march_segment(job.march, job.volume, job.seen, tiling, rays, here, regular=regular)
+        if visitor is not None:
+            mine, found, total = visitor.visit(rays, here, samples, given, mine, total)
+            more = jax.tree.map(jnp.add, more, found)
+        return finished_after(range_, after), (mine, more, total)
+
+    here, (mine, more, total) = jax.lax.while_loop(
+        lambda state: jnp.sum(going(state[0])) > keep, advance, (here, (mine, more, total))
+    )
+    visited = jax.tree.map(scatter, kept, mine), jax.tree.map(scatter_add, sums, more), total
+    return (jax.tree.map(scatter, at, here), visited), going(here)
+
+
+def with_fields(at: Progress, **changes: Array) -> Progress:
+    """`at` with other values for these fields."""
+    return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
+
+
+def over_transparent(march: March, ray: Ray, at: Progress, cells: Int[Array, ""]) -> Progress:
+    """Moves a ray on by so many cells, all of which are transparent."""
+    moved = move(march, ray, at, jnp.ones((), bool), cells)
+    return jax.tree.map(lambda a, b: jnp.where((cells > 0) & ~at.finished, a, b), moved, at)
+
+
+def finished_after(range_: CellRange | None, at: Progress) -> Progress:
+    """Finishes rays whose last visible cell is behind them."""
+    return at if range_ is None else with_fields(at, finished=at.finished | (at.index >= range_.until))
+
+
+def _leap(
+    job: Job, empty_space: EmptySpaceIndex, beam: Int[Array, " rays"], rays: Ray, at: Progress
+) -> Progress:
+    """Moves rays on to the first cell that is not proven empty. A ray with nothing ahead of it is
+    finished."""
+    march = job.march
+    here = front(march, at)
+    there = empty_space.skip_to(job.prepared, beam, rays, here)
+    whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
+    # clipped before it becomes an integer, whose range it may exceed
+    cells = jnp.minimum(
+        jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype), march.most_samples - at.index
+    )
+    return jax.vmap(partial(over_transparent, march))(rays, at, cells)

@@ -1,0 +1,48 @@
+"""How is work divided for this machine? All constants of the fast engine, in one place."""
+
+import math
+from typing import NamedTuple
+
+import jax
+
+from .._util.compaction import CHUNK
+
+
+class Tiling(NamedTuple):
+    """Sizes by which rays and samples are processed. None of them shows in the result.
+
+    - `cells`: cells of a segment, whose samples are all fetched before any is composited.
+    - `group`: rays compacted as one unit, a square number.
+    - `batch`: groups marched at a time, so that they fit into the cache.
+    - `kept`: share of a batch's groups that must be alive for it to go on; below it, batches are refilled.
+    - `tile`: beams made, marched and finished before the next ones are made: 262 144 rays.
+    - `direct_tile`: the same where JAX differentiates the march itself, and so keeps all its states.
+    - `chunk`: samples shaded at a time.
+    """
+
+    cells: int = 8
+    group: int = 16
+    # Not 512: rows of 8192 floats would lie 32 KiB apart, so that all of them map to the same cache lines.
+    batch: int = 520
+    kept: float = 0.75
+    tile: int = 4096
+    direct_tile: int = 64
+    chunk: int = CHUNK
+
+    @property
+    def side(self) -> int:
+        """Pixels along the side of a group."""
+        return math.isqrt(self.group)
+
+    @property
+    def beam(self) -> int:
+        """Pixels along the side of a beam, which is 2 x 2 groups."""
+        return 2 * self.side
+
+    @classmethod
+    def of_backend(cls) -> "Tiling":
+        """Measured on CPU. Of other backends nothing has been measured yet, and they take the same."""
+        return BY_BACKEND.get(jax.default_backend(), cls())
+
+
+BY_BACKEND: dict[str, Tiling] = {"cpu": Tiling()}
