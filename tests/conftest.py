@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import hypothesis
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -18,6 +19,10 @@ with install_import_hook("jaxvol", "tests.typechecker.check"):
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+# Properties take the same examples in each run, so that none fails by chance.
+hypothesis.settings.register_profile("jaxvol", derandomize=True)
+hypothesis.settings.load_profile("jaxvol")
+
 PROGRAMS = pytest.StashKey[str]()
 """The folder in which all processes of this session keep what they compile."""
 
@@ -30,9 +35,13 @@ def pytest_configure(config):
         return  # a worker of pytest-xdist: the environment tells it
     if config.option.markexpr == "not slow":
         # The fast tests spend most of their time compiling. LLVM at its first level, without expensive
-        # passes, takes a third less of it, for programs that are somewhat slower and compute the same
-        # numbers. The slow tests, and those that are chosen in another way, compile as users do.
-        less = "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
+        # passes, and XLA's older way to emit fused kernels halve that, for programs that are somewhat slower
+        # and compute the same numbers. The slow tests, and those that are chosen in another way, compile
+        # as users do.
+        less = (
+            "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true "
+            "--xla_cpu_use_fusion_emitters=false"
+        )
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {less}"
     folder = config.stash[PROGRAMS] = tempfile.mkdtemp(prefix="jaxvol-programs-")
     settings = {
