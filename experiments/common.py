@@ -1,11 +1,11 @@
-"""Shared by all experiments: command-line options, timed frames with their errors, and saving of charts."""
+"""Shared by all experiments: their one `main`, timed frames with their errors, and saving of charts."""
 
-import argparse
 import math
 import os
-from collections.abc import Iterable
+from argparse import Namespace
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -14,6 +14,7 @@ import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from . import marches, record, timing
+from .command import QUICK, Main, command
 from .scenes import Scene
 
 
@@ -26,20 +27,49 @@ FINER = 8
 smaller."""
 
 
-def options(about: str | None, repetitions: int) -> argparse.ArgumentParser:
-    """Parser of the options that all experiments have; scripts add their own."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=record.RESULTS, metavar="FOLDER")
-    parser.add_argument("--repetitions", type=int, default=repetitions)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that the script runs")
-    return parser
+Answer: TypeAlias = tuple[Any, Callable[[Path], None]]
+"""Result of an experiment, and the function that draws its chart into a file."""
+
+
+def experiment(
+    name: str, question: str, about: str | None, **options: Any
+) -> Callable[[Callable[[Namespace], Answer]], Main]:
+    """Decorator that makes an experiment's `main` of a function from its options to its answer: it measures,
+    writes the record and draws the chart.
+
+    - `name`: of the module, and of the two files.
+    - `about`: the module's docstring.
+    - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
+    """
+
+    def made(answer: Callable[[Namespace], Answer]) -> Main:
+        @command(about, record.RESULTS, seed=0, quick=QUICK, **options)
+        def main(chosen: Namespace) -> None:
+            result, draw = answer(chosen)
+            path, ran = chosen.output / f"{name}.json", [f"experiments.{name}", *chosen.argv]
+            record.write(path, question, result, seed=chosen.seed, command=ran)
+            draw(path.with_suffix(".png"))
+
+        return main
+
+    return made
+
+
+def some_of(names: Iterable[str], metavar: str) -> dict[str, Any]:
+    """An option that takes some of the names, by default all."""
+    return {"nargs": "+", "choices": list(names), "default": list(names), "metavar": metavar}
 
 
 def data() -> Path | None:
     """The folder of real volumes that JAXVOL_DATA names, or None."""
     folder = os.environ.get("JAXVOL_DATA")
     return Path(folder) if folder else None
+
+
+def available(chosen: Namespace, phantom: str) -> tuple[Path | None, list[str]]:
+    """The folder of real volumes, and the names of `--only`; without a folder, or if quick, the phantom's."""
+    folder = data()
+    return folder, [phantom] if folder is None or chosen.quick else chosen.only
 
 
 def frame(scene: Scene, march: jv.March) -> jv.Rendering:

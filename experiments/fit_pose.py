@@ -7,7 +7,8 @@ first, since a derivative describes only features that move by less than their o
 """
 
 import time
-from collections.abc import Sequence
+from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from . import common, fit_transfer, record
+from . import common, fit_transfer
 from .common import plt
 
 
@@ -108,13 +109,15 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=1)
-    parser.add_argument("--size", type=int, default=96, help="pixels along a side")
-    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
-    parser.add_argument("--starts", type=int, default=10)
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "fit_pose",
+    "Is a camera's pose found from one image, from 10° and 5 % off?",
+    __doc__,
+    size=96,
+    resolution=96,
+    starts=10,
+)
+def main(chosen: Namespace) -> common.Answer:
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.starts = 32, 24, 2
 
@@ -126,20 +129,13 @@ def main(argv: Sequence[str] | None = None) -> None:
             f" {GOALS['shift']:.1%}; worst {worst['degrees']:.4f}° and {worst['shift']:.3%},"
             f" {np.mean([row['steps'] for row in rows]):.1f} steps"
         )
-    path = record.write(
-        chosen.output / "fit_pose.json",
-        "Is a camera's pose found from one image, from 10° and 5 % off?",
-        {
-            "image": [chosen.size] * 2,
-            "resolution": chosen.resolution,
-            "goals": GOALS,
-            "reached": {name: reached(rows) for name, rows in result.items()},
-            "starts": result,
-        },
-        seed=chosen.seed,
-        command=["experiments.fit_pose", *given],
-    )
-    draw(result, path.with_suffix(".png"))
+    return {
+        "image": [chosen.size] * 2,
+        "resolution": chosen.resolution,
+        "goals": GOALS,
+        "reached": {name: reached(rows) for name, rows in result.items()},
+        "starts": result,
+    }, partial(draw, result)
 
 
 if __name__ == "__main__":

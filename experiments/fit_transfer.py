@@ -10,7 +10,8 @@ Scenes are the head phantom and, if JAXVOL_DATA names the folder of real volumes
 
 import time
 import warnings
-from collections.abc import Sequence
+from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import psnr
 
-from . import common, record
+from . import common
 from .common import plt
 
 
@@ -134,12 +135,14 @@ def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=1)
-    parser.add_argument("--size", type=int, default=96, help="pixels along a side")
-    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "fit_transfer",
+    "Is a transfer function recovered from four views, and do other views agree?",
+    __doc__,
+    size=96,
+    resolution=96,
+)
+def main(chosen: Namespace) -> common.Answer:
     folder, names = common.data(), list(SCENES)
     if folder is None or chosen.quick:
         names = names[:1]
@@ -157,14 +160,12 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f"  {row['seconds with compilation']:.1f} s  {row['message']}",
                 flush=True,
             )
-    path = record.write(
-        chosen.output / "fit_transfer.json",
-        "Is a transfer function recovered from four views, and do other views agree?",
-        {"image": [chosen.size] * 2, "resolution": chosen.resolution, "goal": GOAL, "scenes": result},
-        seed=chosen.seed,
-        command=["experiments.fit_transfer", *given],
-    )
-    draw(result, path.with_suffix(".png"))
+    return {
+        "image": [chosen.size] * 2,
+        "resolution": chosen.resolution,
+        "goal": GOAL,
+        "scenes": result,
+    }, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,9 @@ volumes in the types of their files. Float voxels are a leaf of a second scene, 
 Real volumes are read from the folder that JAXVOL_DATA names; without one, only the phantom is measured.
 """
 
+from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +32,7 @@ from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
 
-from . import common, marches, record
+from . import common, marches
 from .common import plt
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -189,16 +191,17 @@ def draw(scenes: dict[str, Any], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=1)
-    parser.add_argument("--size", type=int, default=256, help="pixels along a side")
-    parser.add_argument("--only", nargs="+", choices=ALL, default=list(ALL), metavar="VOLUME")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="METHOD")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
-    folder, names, more = common.data(), chosen.only, {}
-    if folder is None or chosen.quick:
-        names = [PHANTOM]
+@common.experiment(
+    "gradient_agreement",
+    "Is replay's gradient that of forward mode, and that without leaps?",
+    __doc__,
+    size=256,
+    only=common.some_of(ALL, "VOLUME"),
+    methods=common.some_of(METHODS, "METHOD"),
+)
+def main(chosen: Namespace) -> common.Answer:
+    folder, names = common.available(chosen, PHANTOM)
+    more = {}
     if chosen.quick:
         chosen.size, chosen.methods, more = 24, ["none", "hierarchy"], {"resolution": 24}
 
@@ -213,14 +216,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f"{name:16} {method:13} from forward at most {worst:.1e} ({leaf}), from no leaps {apart:.1e}",
                 flush=True,
             )
-        path = record.write(
-            chosen.output / "gradient_agreement.json",
-            "Is replay's gradient that of forward mode, and that without leaps?",
-            {"size": chosen.size, "goal": GOAL, "scenes": scenes},
-            seed=chosen.seed,
-            command=["experiments.gradient_agreement", *given],
-        )
-        draw(scenes, path.with_suffix(".png"))
+    return {"size": chosen.size, "goal": GOAL, "scenes": scenes}, partial(draw, scenes)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,9 @@ The scene has material at all faces of the volume, empty space in its middle and
 the larger of the two, over several weightings of the image and directions of each leaf.
 """
 
+from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +28,7 @@ from matplotlib.colors import LogNorm
 
 import jaxvol as jv
 
-from . import common, record
+from . import common
 from .common import plt
 
 
@@ -190,11 +192,10 @@ def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path)
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=1)
-    parser.add_argument("--size", type=int, default=6, help="pixels along a side")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "gradient_errors", "Which gradients are wrong without AlphaCorrection, per transform?", __doc__, size=6
+)
+def main(chosen: Namespace) -> common.Answer:
     names, leaves, widths = list(marches()), list(LEAVES), WIDTHS
     quadratures = ["left", "midpoint"]
     if chosen.quick:
@@ -214,20 +215,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         quadrature: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
         for quadrature, rows in result.items()
     }
-    path = record.write(
-        chosen.output / "gradient_errors.json",
-        "Which gradients are wrong without AlphaCorrection, per transform?",
-        {
-            "image": [chosen.size] * 2,
-            "widths": list(widths),
-            "wrong from": WRONG,
-            "wrong": wrong,
-            "relative errors": result,
-        },
-        seed=chosen.seed,
-        command=["experiments.gradient_errors", *given],
-    )
-    draw(result, list(widths), path.with_suffix(".png"))
+    return {
+        "image": [chosen.size] * 2,
+        "widths": list(widths),
+        "wrong from": WRONG,
+        "wrong": wrong,
+        "relative errors": result,
+    }, partial(draw, result, list(widths))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ over log size is fitted to the upper three sizes, where the fixed cost of a fram
 ends early. Beside each time stands the image's RMSE against a converged one.
 """
 
+from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import common, record, timing
+from . import common, timing
 from .common import plt
 from .scenes import Scene, seen_head
 
@@ -110,11 +112,14 @@ def draw(sweeps: dict[str, Any], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=5)
-    parser.add_argument("--only", nargs="+", choices=SWEEPS, default=list(SWEEPS), metavar="AXIS")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "growth",
+    "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",
+    __doc__,
+    repetitions=5,
+    only=common.some_of(SWEEPS, "AXIS"),
+)
+def main(chosen: Namespace) -> common.Answer:
     sweeps, usual = SWEEPS, USUAL
     if chosen.quick:
         chosen.repetitions, sweeps, usual = 1, TINY, {"pixels": 32, "voxels": 32, "samples": 32}
@@ -131,14 +136,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                     flush=True,
                 )
             print(f"{along:8} {method:10} grows as size^{sweep['slope']:.2f}", flush=True)
-    path = record.write(
-        chosen.output / "growth.json",
-        "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",
-        {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found},
-        seed=chosen.seed,
-        command=["experiments.growth", *given],
-    )
-    draw(found, path.with_suffix(".png"))
+    return {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found}, partial(draw, found)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ that of ray casting. On the face, where the first sample of every ray lies at it
 plain jitter can be nearer to the truth in the mean, or farther; it is noisier in any case.
 """
 
+from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
-from . import common, marches, record, timing
+from . import common, marches, timing
 from .common import plt
 
 
@@ -151,12 +153,15 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=5)
-    parser.add_argument("--size", type=int, default=192, help="pixels along a side")
-    parser.add_argument("--resolution", type=int, default=128, help="voxels along an axis")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "jitter_accuracy",
+    "What do jitter and alignment do to wood grain, noise on cut faces, the whole error and the time?",
+    __doc__,
+    repetitions=5,
+    size=192,
+    resolution=128,
+)
+def main(chosen: Namespace) -> common.Answer:
     steps = STEPS
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.repetitions, steps = 96, 64, 1, (2.3, 1.9)
@@ -165,14 +170,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         name: measure(make(chosen.resolution, chosen.size), steps, chosen.repetitions, chosen.seed)
         for name, make in SCENES.items()
     }
-    path = record.write(
-        chosen.output / "jitter_accuracy.json",
-        "What do jitter and alignment do to wood grain, noise on cut faces, the whole error and the time?",
-        {"note": f"{NOTE} {compared(result)}", **result},
-        seed=chosen.seed,
-        command=["experiments.jitter_accuracy", *given],
-    )
-    draw(result, path.with_suffix(".png"))
     for name, rows in result.items():
         print(name)
         for row in rows:
@@ -183,6 +180,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f"  time {row['seconds'] * 1e3:7.1f} ms, {row['time']['median']:.3f} x ray casting"
             )
     print(NOTE, compared(result))
+    return {"note": f"{NOTE} {compared(result)}", **result}, partial(draw, result)
 
 
 if __name__ == "__main__":

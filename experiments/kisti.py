@@ -15,7 +15,9 @@ Steps are one voxel long. Rays end at 1 % of transmittance. Volumes are read fro
 names; without one, the phantoms of a head and an engine stand in.
 """
 
-from collections.abc import Callable, Sequence
+from argparse import Namespace
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ import jax.numpy as jnp
 
 import jaxvol as jv
 
-from . import common, record, timing
+from . import common, timing
 from .common import plt
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -100,10 +102,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=15)
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "kisti",
+    "What do early ray termination and empty-space skipping save, apart and together?",
+    __doc__,
+    repetitions=15,
+)
+def main(chosen: Namespace) -> common.Answer:
     folder, sizes, more = common.data(), SIZES, {}
     makers = PHANTOMS if folder is None or chosen.quick else REAL
     if chosen.quick:
@@ -135,14 +140,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "both, geometric mean": mean,
         "scenes": scenes,
     }
-    path = record.write(
-        chosen.output / "kisti.json",
-        "What do early ray termination and empty-space skipping save, apart and together?",
-        result,
-        seed=chosen.seed,
-        command=["experiments.kisti", *given],
-    )
-    draw(result, path.with_suffix(".png"))
+    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

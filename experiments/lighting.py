@@ -13,6 +13,7 @@ the material's opacity, for the conserving form and the printed one.
 """
 
 import time
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -37,7 +38,7 @@ from jaxvol.lighting import (
 )
 from jaxvol.metrics import rmse
 
-from . import common, record, timing
+from . import common, timing
 from .common import plt
 from .scenes import Scene, skin_head
 
@@ -229,12 +230,15 @@ def draw(result: dict[str, Any], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=5)
-    parser.add_argument("--size", type=int, default=256, help="pixels along a side")
-    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "lighting",
+    "What do photons, templates, occlusion, baking and deferring cost, and what do they buy?",
+    __doc__,
+    repetitions=5,
+    size=256,
+    resolution=96,
+)
+def main(chosen: Namespace) -> common.Answer:
     photons, blended, baked, many, trials = (1, 4, 8, 16), (1, 2, 4, 8), (32, 64, 128), 32, 24
     opacities, thinned = [round(0.1 * i, 1) for i in range(1, 10)], (1.0, 0.3, 0.1, 0.03, 0.01)
     if chosen.quick:
@@ -254,15 +258,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         "noise": noise(blended, trials, chosen.seed),
         "energy": {"opacity": opacities, "forms": energies(opacities, chosen.seed)},
     }
-    path = record.write(
-        chosen.output / "lighting.json",
-        "What do photons, templates, occlusion, baking and deferring cost, and what do they buy?",
-        result,
-        seed=chosen.seed,
-        command=["experiments.lighting", *given],
-    )
-    draw(result, path.with_suffix(".png"))
-    pictures(scene, many, chosen.seed, path.with_name("lit.png"))
     for row in result["deferring"]:
         print("deferred, " + ", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     for row in result["noise"]["blended"]:
@@ -270,6 +265,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"one template for each pixel: {result['noise']['one for each pixel']:.2%} between pixels")
     for name, found in result["energy"]["forms"].items():
         print(f"energy, {name}: " + ", ".join(f"{a} {e:.3f}" for a, e in zip(opacities, found, strict=True)))
+
+    def charts(path: Path) -> None:
+        draw(result, path)
+        pictures(scene, many, chosen.seed, path.with_name("lit.png"))
+
+    return result, charts
 
 
 if __name__ == "__main__":

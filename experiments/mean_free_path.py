@@ -11,7 +11,9 @@ meet known, and with it following from the mean free path, as in the path tracer
 mean free path leave it undetermined.
 """
 
+from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from . import common, record
+from . import common
 from .common import plt
 
 
@@ -198,13 +200,16 @@ def draw(result: dict[str, Any], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=1)
-    parser.add_argument("--size", type=int, default=32, help="pixels along a side")
-    parser.add_argument("--resolution", type=int, default=32, help="voxels along an axis")
-    parser.add_argument("--paths", type=int, default=256, help="paths through each pixel")
-    given = record.arguments(argv)
-    chosen, thicknesses = parser.parse_args(given), THICKNESSES
+@common.experiment(
+    "mean_free_path",
+    "Are mean free paths found back from images, of templates and path-traced?",
+    __doc__,
+    size=32,
+    resolution=32,
+    paths=256,
+)
+def main(chosen: Namespace) -> common.Answer:
+    thicknesses = THICKNESSES
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.paths = 10, 12, 2
         thicknesses = (2.0,)
@@ -220,14 +225,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     worst = max(abs(ratio - 1) for ratio in result["three materials"]["found"])
     steps = len(result["three materials"]["losses"])
     print(f"three materials: within {worst:.2%} (goal {GOAL:.0%}), {steps} steps")
-    path = record.write(
-        chosen.output / "mean_free_path.json",
-        "Are mean free paths found back from images, of templates and path-traced?",
-        result,
-        seed=chosen.seed,
-        command=["experiments.mean_free_path", *given],
-    )
-    draw(result, path.with_suffix(".png"))
+    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

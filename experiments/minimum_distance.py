@@ -13,7 +13,9 @@ R = 8.
 The airway is read from the folder that JAXVOL_DATA names; without one, only the colon phantom is measured.
 """
 
+from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common, record, timing
+from . import common, timing
 from .common import plt
 from .scenes import Scene
 
@@ -117,15 +119,17 @@ def draw(result: dict[str, Any], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=15)
-    parser.add_argument("--size", type=int, default=512, help="pixels along a side")
-    parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="SCENE")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
-    folder, names, cells, more = common.data(), chosen.only, CELLS, {}
-    if folder is None or chosen.quick:
-        names = [PHANTOM]
+@common.experiment(
+    "minimum_distance",
+    "What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil?",
+    __doc__,
+    repetitions=15,
+    size=512,
+    only=common.some_of(SCENES, "SCENE"),
+)
+def main(chosen: Namespace) -> common.Answer:
+    folder, names = common.available(chosen, PHANTOM)
+    cells, more = CELLS, {}
     if chosen.quick:
         chosen.size, chosen.repetitions, cells, more = 64, 2, (8, 32), {"resolution": 48}
 
@@ -148,14 +152,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "cells": cells,
         "scenes": scenes,
     }
-    path = record.write(
-        chosen.output / "minimum_distance.json",
-        "What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil?",
-        result,
-        seed=chosen.seed,
-        command=["experiments.minimum_distance", *given],
-    )
-    draw(result, path.with_suffix(".png"))
+    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

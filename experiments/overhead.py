@@ -8,7 +8,9 @@ one. The goal is a ratio of at most 1.02 for both proposed methods, in the geome
 Real volumes are read from the folder that JAXVOL_DATA names; without one, only the phantom is measured.
 """
 
+from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common, marches, record
+from . import common, marches
 from .common import plt
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -60,20 +62,18 @@ def draw(volumes: dict[str, Any], sizes: Sequence[int], path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=15)
-    parser.add_argument(
-        "--sizes", nargs="+", type=int, default=SIZES, help="pixels along a side; the paper's are 1024"
-    )
-    parser.add_argument(
-        "--early-termination", type=float, metavar="LEFT", help="in all marches, as in the paper"
-    )
-    parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="VOLUME")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
-    folder, names, more = common.data(), chosen.only, {}
-    if folder is None or chosen.quick:
-        names = [PHANTOM]
+@common.experiment(
+    "overhead",
+    "What do empty-space jitter and alignment add to the time of a whole frame?",
+    __doc__,
+    repetitions=15,
+    sizes={"nargs": "+", "type": int, "default": SIZES, "help": "pixels along a side; the paper's are 1024"},
+    early_termination={"type": float, "metavar": "LEFT", "help": "in all marches, as in the paper"},
+    only=common.some_of(SCENES, "VOLUME"),
+)
+def main(chosen: Namespace) -> common.Answer:
+    folder, names = common.available(chosen, PHANTOM)
+    more = {}
     if chosen.quick:
         chosen.sizes, chosen.repetitions, more = (32,), 2, {"resolution": 32}
 
@@ -95,21 +95,14 @@ def main(argv: Sequence[str] | None = None) -> None:
             of_size[str(size)][marches.BOTH]["ratio"]["median"] for of_size in volumes.values()
         )
     print(f"both proposed methods over ray casting, geometric means: {means}; the goal is {GOAL}")
-    path = record.write(
-        chosen.output / "overhead.json",
-        "What do empty-space jitter and alignment add to the time of a whole frame?",
-        {
-            "sizes": chosen.sizes,
-            "repetitions": chosen.repetitions,
-            "early termination": chosen.early_termination,
-            "goal": GOAL,
-            "both, geometric means": means,
-            "volumes": volumes,
-        },
-        seed=chosen.seed,
-        command=["experiments.overhead", *given],
-    )
-    draw(volumes, chosen.sizes, path.with_suffix(".png"))
+    return {
+        "sizes": chosen.sizes,
+        "repetitions": chosen.repetitions,
+        "early termination": chosen.early_termination,
+        "goal": GOAL,
+        "both, geometric means": means,
+        "volumes": volumes,
+    }, partial(draw, volumes, chosen.sizes)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,8 @@ reference is recorded, too.
 """
 
 import time
-from collections.abc import Sequence
+from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from . import common, record, timing
+from . import common, timing
 from .common import plt
 
 
@@ -104,14 +105,17 @@ def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> Non
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=3)
-    parser.add_argument("--size", type=int, default=128, help="pixels along a side")
-    parser.add_argument("--resolution", type=int, default=96, help="voxels along an axis")
-    parser.add_argument("--paths", type=int, default=128, help="paths through each pixel")
-    parser.add_argument("--templates", type=int, default=8, help="for each material")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "path_traced",
+    "How near do scatterer templates come to path tracing, and in what time?",
+    __doc__,
+    repetitions=3,
+    size=128,
+    resolution=96,
+    paths=128,
+    templates={"type": int, "default": 8, "help": "for each material"},
+)
+def main(chosen: Namespace) -> common.Answer:
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions = 16, 16, 2, 2, 1
     rows, images = measure(
@@ -119,14 +123,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     for name, row in rows.items():
         print(name, {key: value for key, value in row.items() if key != "all seconds"})
-    path = record.write(
-        chosen.output / "path_traced.json",
-        "How near do scatterer templates come to path tracing, and in what time?",
-        {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows},
-        seed=chosen.seed,
-        command=["experiments.path_traced", *given],
-    )
-    draw(rows, images, path.with_suffix(".png"))
+    result = {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows}
+    return result, partial(draw, rows, images)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ import os
 import platform
 import shlex
 import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -41,11 +40,6 @@ def write(path: Path, question: str, result: Any, *, seed: int, command: list[st
 def read(path: Path) -> dict[str, Any]:
     """A record that `write` wrote."""
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def arguments(argv: list[str] | None) -> list[str]:
-    """The arguments of a script: its caller's, or else those of the command line."""
-    return sys.argv[1:] if argv is None else list(argv)
 
 
 def _device() -> dict[str, Any]:

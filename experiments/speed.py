@@ -16,7 +16,9 @@ JAXVOL_DATA names; without one, only the head phantom is measured.
 """
 
 import os
+from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,7 +33,7 @@ from jaxvol._util.xla import OPTIONS
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks, Sums
 
-from . import common, fresh, marches, peer_vtk, record, timing
+from . import common, fresh, marches, peer_vtk, timing
 from .common import plt
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -190,16 +192,18 @@ def print_rows(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:
     print(f"{name:16} {size:4}  occupancy: {rows[OURS]['occupancy']['median']:.1%} of our frame", flush=True)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=15)
-    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES, help="pixels along a side")
-    parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES), metavar="VOLUME")
-    parser.add_argument("--gradients", action="store_true", help="measure gradients, too, at the first size")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
-    folder, names, resolution = common.data(), chosen.only, RESOLUTION
-    if folder is None or chosen.quick:
-        names = [PHANTOM]
+@common.experiment(
+    "speed",
+    "How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?",
+    __doc__,
+    repetitions=15,
+    sizes={"nargs": "+", "type": int, "default": SIZES},
+    only=common.some_of(SCENES, "VOLUME"),
+    gradients={"action": "store_true", "help": "measure gradients, too, at the first size"},
+)
+def main(chosen: Namespace) -> common.Answer:
+    folder, names = common.available(chosen, PHANTOM)
+    resolution = RESOLUTION
     if chosen.quick:
         chosen.sizes, chosen.repetitions, resolution = (32, 48), 2, 32
 
@@ -236,14 +240,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
     print("first image:", result["first image"])
     print(f"times over ours, geometric means: {result['geometric means']}; the goal is {GOAL}")
-    path = record.write(
-        chosen.output / "speed.json",
-        "How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?",
-        result,
-        seed=chosen.seed,
-        command=["experiments.speed", *given],
-    )
-    draw(result, path.with_suffix(".png"))
+    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

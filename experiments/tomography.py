@@ -18,7 +18,9 @@ error are recorded.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from argparse import Namespace
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +34,7 @@ from skimage.transform import iradon, iradon_sart
 import jaxvol as jv
 from jaxvol.metrics import psnr
 
-from . import common, record
+from . import common
 from .common import plt
 
 
@@ -218,17 +220,17 @@ def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     common.save(figure, path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = common.options(__doc__, repetitions=1)
-    parser.add_argument("--resolution", type=int, default=64, help="voxels along an axis")
-    parser.add_argument("--views", type=int, default=24)
-    parser.add_argument(
-        "--photons", type=float, nargs="*", default=[1e4], help="photons per ray; also without noise"
-    )
-    parser.add_argument("--sweeps", type=int, default=30, help="sweeps of SART")
-    parser.add_argument("--evaluations", type=int, default=45, help="of the fit's loss and its gradient")
-    given = record.arguments(argv)
-    chosen = parser.parse_args(given)
+@common.experiment(
+    "tomography",
+    "Is a density recovered from 24 X-ray views, beside filtered back projection and SART?",
+    __doc__,
+    resolution=64,
+    views=24,
+    photons={"nargs": "*", "type": float, "default": [1e4], "help": "photons per ray; also without noise"},
+    sweeps={"type": int, "default": 30, "help": "sweeps of SART"},
+    evaluations={"type": int, "default": 45, "help": "of the fit's loss and its gradient"},
+)
+def main(chosen: Namespace) -> common.Answer:
     if chosen.quick:
         chosen.resolution, chosen.views, chosen.sweeps, chosen.evaluations = 16, 8, 5, 25
 
@@ -246,23 +248,16 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f" {row['all'][-1]['seconds']:.1f} s",
                 flush=True,
             )
-    path = record.write(
-        chosen.output / "tomography.json",
-        "Is a density recovered from 24 X-ray views, beside filtered back projection and SART?",
-        {
-            "voxels": list(truth.shape),
-            "views": chosen.views,
-            "densest": float(truth.max()),
-            "steps": {"views": setting.step_of_views, "fit": setting.step},
-            "photons": {
-                name: {method: {k: v for k, v in row.items() if k != "slice"} for method, row in rows.items()}
-                for name, rows in result.items()
-            },
+    return {
+        "voxels": list(truth.shape),
+        "views": chosen.views,
+        "densest": float(truth.max()),
+        "steps": {"views": setting.step_of_views, "fit": setting.step},
+        "photons": {
+            name: {method: {k: v for k, v in row.items() if k != "slice"} for method, row in rows.items()}
+            for name, rows in result.items()
         },
-        seed=chosen.seed,
-        command=["experiments.tomography", *given],
-    )
-    draw(result, truth, path.with_suffix(".png"))
+    }, partial(draw, result, truth)
 
 
 if __name__ == "__main__":

@@ -15,9 +15,9 @@ class Over(eqx.Module):
 
         w = (1 - A) α        C ← C + w c        A ← A + w
 
-    so that the weights of a ray and the transmittance 1 - A that is left sum to 1. It is A that is kept: in
-    float32, taking thousands of small equal weights from a transmittance near 1 would round the same way each
-    time. `moment` is Σ w × depth past the entry. What is not asked for is None.
+    so that the weights of a ray and the remaining transmittance 1 - A sum to 1. A is stored rather than the
+    transmittance: in float32, subtracting thousands of small equal weights from a number near 1 would round
+    the same way each time. `moment` is Σ w × depth past the entry. What is not asked for is None.
 
     Source: Porter and Duff 1984; Max 1995.
     """
@@ -33,15 +33,15 @@ class Over(eqx.Module):
 
     @property
     def transmittance(self) -> Scalar:
-        """Of all cells so far together."""
+        """Of all cells so far."""
         return 1 - self.opacity
 
     def weight(self, alpha: Scalar) -> Scalar:
-        """Of a next cell of this opacity."""
+        """Weight of the next cell, of this opacity."""
         return (1 - self.opacity) * alpha
 
     def add(self, weight: Scalar, color: Vec3 | None = None, depth: Scalar | None = None) -> "Over":
-        """With one more cell of this weight, colour and depth past the entry; without what of these is not
+        """With one more cell, of this weight, colour and depth past the entry; colour and depth where
         given."""
         sums = moment = None
         if self.color is not None and color is not None:
@@ -57,29 +57,29 @@ class Over(eqx.Module):
         return jnp.stack([*self.color, self.opacity])
 
     def mean_depth(self) -> Scalar:
-        """The mean depth of what is seen, past the entry, weighted by how much each cell adds to the opacity;
-        infinite where nothing is."""
+        """Mean depth past the entry of what is visible, weighted by what each cell adds to the opacity;
+        infinite where nothing is visible."""
         assert self.moment is not None
-        # of NaN neither more nor less than 0 is true, and it is handed on
+        # not `> 0`, which is false for NaN: NaN is to be passed on
         seen = ~(self.opacity <= 0)
-        # Of moment and opacity as parts of the opacity, which is so divided by 1: the derivative of a
-        # quotient divides by the square, and that of the opacity of a veil is 0 in float32.
+        # Both are divided by the opacity first, so that the quotient's denominator is 1: its derivative
+        # divides by the square of that, which for the opacity of a veil underflows to 0 in float32.
         whole = jax.lax.stop_gradient(jnp.where(seen, self.opacity, 1))
         mean = (self.moment / whole) / jnp.where(seen, self.opacity / whole, 1)
         return jnp.where(seen, mean, jnp.inf)
 
 
 def pull_over(worth: Scalar, transmittance: Scalar, behind: Scalar) -> Scalar:
-    """How a loss changes with the optical depth of a cell: there is more of the cell, and less of all that
-    lies behind it.
+    """Derivative of a loss by the optical depth of a cell: more of the cell, and less of all that lies behind
+    it.
 
     **Arguments:**
 
-    - `worth`: what a unit of the cell's weight is worth to the loss.
-    - `transmittance`: of all cells up to this one, and of this one.
-    - `behind`: what all cells behind this one are worth, with their weights.
+    - `worth`: derivative of the loss by the cell's weight.
+    - `transmittance`: of all cells up to and including this one.
+    - `behind`: sum over all cells behind this one of weight × worth.
     """
-    # With no more than this left, what lies behind is lost in the rounding of the sums, which an opaque
-    # sample's extinction would blow up.
+    # Below this transmittance `behind` is nothing but the sums' rounding, which the extinction of an opaque
+    # sample would amplify.
     nothing = 2 * float(jnp.finfo(behind.dtype).eps)
     return jnp.where(transmittance <= nothing, 0, transmittance * worth - behind)

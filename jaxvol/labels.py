@@ -77,18 +77,18 @@ class LabelTransferFunction(Transfer):
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         bound = jnp.zeros_like(blocks.low)
-        for label, values, extinction in self._by_label():
+        for label, values, extinction in self._functions():
             own = upper_bound_between(values, extinction, blocks.low, blocks.high)
             bound = jnp.where(blocks.may_hold(label), jnp.maximum(bound, own), bound)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         seen = jnp.zeros(blocks.low.shape, bool)
-        for label, values, extinction in self._by_label():
+        for label, values, extinction in self._functions():
             seen |= positive_between(values, extinction, blocks.low, blocks.high) & blocks.may_hold(label)
         return seen
 
-    def _by_label(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
+    def _functions(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
         """Each label, with the control points and extinctions of its function, without their gradients."""
         functions = jax.lax.stop_gradient(self.stacked)
         for label in range(functions.values.shape[0] - 1):

@@ -1,15 +1,16 @@
-"""Where is the next sample, and how much of the ray does it stand for?
+"""Where is the next sample, and which part of the ray does it stand for?
 
-A march is a step length and a tuple of transforms. With none it is Levoy's ray casting: samples at
-depth 0, d, 2d, … past the entry, each standing for a cell of width d behind it, until the exit.
-A transform is one idea of one paper. It changes one of five answers, the seams, and leaves the
-others as they are; every seam passes through all transforms in turn, so that any of them compose.
+A march is a step length and a tuple of transforms. Without any it is Levoy's ray casting: samples at depths
+0, d, 2d, … past the entry, each of which stands for a cell of width d behind it, up to the exit. A transform
+is one idea of one paper. It overrides one of these methods, the seams, and leaves the others alone. Each seam
+passes through all transforms in turn, so that they compose.
 
-| seam | question | answer of the plain march |
+| seam | question | default answer |
 |---|---|---|
 | `locate` | which grid coordinate is this world point? | spacing and origin |
 | `start` | how many steps past the entry is the first cell? | 0 |
-| `shift` | by how much of a step is what lies behind the first empty space moved? | 0 |
+| `shift` | by what part of a step do samples behind the first transparent one move? | 0 |
+| `empty_space` | where is nothing visible? | unknown |
 | `cut` | which part of its cell does a sample stand for? | all of it |
 | `stop` | is this ray finished? | not before the exit |
 """
@@ -46,9 +47,9 @@ class View(NamedTuple):
 
     - `ray`: origin and unit direction of the ray through a column and a row.
     - `size`: (width, height).
-    - `corner`: pixel (column, row) by which the ray through column 0 and row 0 is keyed; others follow.
-    - `first_hit`: distances along the rays of columns and rows to the first sample that is seen, infinite
-      where there is none; found with the help of what is known already.
+    - `corner`: pixel (column, row) that keys the random numbers of the ray through column 0 and row 0.
+    - `first_hit`: distances along the rays of columns and rows to their first visible sample, infinite where
+      there is none. They are marched with the index that it is given.
     """
 
     ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
@@ -58,34 +59,32 @@ class View(NamedTuple):
 
 
 class EmptySpaceIndex(eqx.Module):
-    """What is known about empty space. Rays come in beams: arrays of shape (beams, rays in a beam)."""
+    """Where nothing is visible. It is asked about beams of rays."""
 
     @abstractmethod
     def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
-        """What is worth finding out once about these beams, from the boxes around them.
-
-        `stretch`: the length over which samples are taken at once. It is of no use to know of less."""
+        """What is worth finding out once about these beams, from the boxes around them. `stretch`: the length
+        of a segment; leaps shorter than that are of no use."""
 
     @abstractmethod
     def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
-        """Whether anything may be seen along each beam."""
+        """Whether anything may be visible along each beam."""
 
     @abstractmethod
     def skip_to(
         self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
-        """For some of the rays, from these beams: a depth, no less than `depth`, up to which nothing is
-        seen."""
+        """For some rays, of these beams: a depth of at least `depth`, before which nothing is visible."""
 
     def within_ranges(self) -> "EmptySpaceIndex":
-        """What of it is of use where it is known at which cells each ray begins and ends to see."""
+        """The part of it that is of use where each ray's first and last visible cell are known."""
         return self
 
 
 class Transform(eqx.Module):
-    """One change to a march. Override the seam that the idea is about; each default changes nothing.
+    """One change to a march. Override the seam that the idea is about; the defaults change nothing.
 
-    All methods see one ray; the engine batches them.
+    All methods see one ray. Engines batch them.
     """
 
     def locate(self, space: Space, volume: Volume) -> Space:
@@ -97,25 +96,25 @@ class Transform(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps the samples behind the ray's first transparent one are moved, in [-1, 0].
+        """By how many steps the samples behind the ray's first transparent one move, in [-1, 0].
 
-        A march applies it once on each ray, after the first cell of opacity 0, so that no more than that cell
-        is sampled again; everywhere else rays advance by whole steps. The shifts of several transforms add
-        up, and count as -1 below that."""
+        A march shifts each ray once, after its first cell of opacity 0, so that at most this cell is sampled
+        twice. Everywhere else rays advance by whole steps. The shifts of several transforms are summed, and
+        clipped to [-1, 0]."""
         return jnp.zeros_like(ray.length)
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
-        """What is known about empty space ahead of rays; None if nothing is. Asked once for each image.
-        `view` tells of the image that the rays belong to; None for rays of one's own."""
+        """Where nothing is visible; None if that is unknown. Called once for each image. `view`: of the
+        image; None for `render_rays`."""
         return None
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        """The pieces, front to back, that the cell falls into; each is sampled on its own. How many is
-        fixed; a piece may have width 0."""
+        """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
+        is fixed; a piece may have width 0."""
         return (cell,)
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
-        """Whether the ray is finished, given what the transforms before this one say."""
+        """Whether the ray is finished, given the answer of the transforms before this one."""
         return stopped
 
 
@@ -128,9 +127,9 @@ class March(eqx.Module):
     - `transforms`: applied in this order at every seam; none may be given twice.
     - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
       error falls with d. `"midpoint"`: in the middle; the error falls with d².
-    - `max_samples`: the most steps that a ray may take, an integer from 1 to 2²⁴, to where float32
-      counts. Rays that need more are marked in `Rendering.exhausted`. By default 131 072, against marches
-      that never end.
+    - `max_samples`: the most steps that a ray may take, an integer from 1 to 2²⁴, up to which float32 counts
+      exactly. Rays that need more are marked in `Rendering.exhausted`. By default 131 072, so that every
+      march ends.
 
     **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
     transform, for a transform given twice, and for a `max_samples` that is no such integer.
@@ -175,18 +174,18 @@ class March(eqx.Module):
         return 2**17 if self.max_samples is None else self.max_samples
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
-        """What is known about empty space, by the one transform that knows."""
+        """Where nothing is visible, as the first transform that overrides `empty_space` has it."""
         indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
         return next((index for index in indices if index is not None), None)
 
     @property
     def leaps(self) -> bool:
-        """Whether any transform knows of empty space."""
+        """Whether any transform overrides `empty_space`."""
         return any(type(transform).empty_space is not Transform.empty_space for transform in self.transforms)
 
     @property
     def may_shift(self) -> bool:
-        """Whether any transform may move samples."""
+        """Whether any transform overrides `shift`."""
         return any(type(transform).shift is not Transform.shift for transform in self.transforms)
 
     def locate(self, volume: Volume) -> Space:
@@ -204,11 +203,11 @@ class March(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps what lies behind a ray's first transparent cell is moved, in [-1, 0]."""
+        """By how many steps samples behind a ray's first transparent cell move, in [-1, 0]."""
         shift = jnp.zeros_like(ray.length)
         for transform in self.transforms:
             shift = shift + transform.shift(ray)
-        # beyond that a sample would leave the cell that is known to be empty
+        # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:

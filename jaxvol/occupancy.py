@@ -1,10 +1,9 @@
-"""Where might anything be seen? Ranges of a volume's values, block by block, and what a transfer function
-makes of them.
+"""Where may anything be visible? Ranges of values of a volume's blocks, and grids of occupied cells.
 
-The ranges depend on the volume alone. They are computed once for an array of voxels and kept as long as the
-array itself: arrays do not change, so whoever puts another in a volume gets the ranges of that one. Which
-blocks are visible depends on the transfer function as well, and is asked anew in every frame, in the
-compiled program. Both are conservative: what is called empty is proven to be, and gradients do not see them.
+Ranges depend on the voxels alone. They are computed once for an array of voxels, and kept as long as that
+array: arrays do not change, so that another array in a volume gets ranges of its own. Which blocks are
+visible depends on the transfer function as well, and is computed in each frame, in the compiled program. Both
+are conservative: what is called empty is proven to be. They carry no gradient.
 """
 
 from collections.abc import Callable
@@ -24,34 +23,34 @@ BLOCK = 4
 """Cells of the voxel grid along the side of a block."""
 
 FARTHEST = 255
-"""Distances, in blocks, are not told beyond this."""
+"""Stands for a grid without any occupied cell. Distances in others, in cells, are at most one less."""
 
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
-"""By how much interpolation may leave the range of the nodes around, relative to their size."""
+"""By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
 
 Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 
 
 class Blocks(eqx.Module):
-    """What is in each block of BLOCK³ cells, the nodes on its faces included."""
+    """Ranges of the values in each block of BLOCK³ cells, including the nodes on its faces."""
 
     low: Float[Array, "bx by bz"]
     high: Float[Array, "bx by bz"]
     labels: UInt32[Array, "bx by bz"] | None
-    """Bit `label % 32` is set for every label of the block's nodes."""
+    """Bit `label % 32` is set for each label of the block's nodes."""
 
     @classmethod
     def of(cls, volume: Volume) -> "Blocks":
-        """The blocks of a volume, from memory where its voxels and labels have been seen before."""
+        """The blocks of a volume, computed once for each array of voxels and of labels."""
         labels = None if volume.labels is None else kept(volume.labels, _label_bits)
         low, high = kept(volume.data, _ranges)
-        if volume.field is not None:  # whose values may be other than lie between the voxels
+        if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         return cls(low, high, labels)
 
     @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
-        """Which blocks hold NaN: nothing is known of them."""
+        """Blocks that hold NaN: nothing is known about them."""
         return ~(self.low <= self.high)
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
@@ -62,7 +61,7 @@ class Blocks(eqx.Module):
 
 
 class Sums(eqx.Module):
-    """How many cells of a grid are occupied in a box of any size, from eight look-ups."""
+    """Counts the occupied cells of a grid in a box of any size, by eight look-ups (a summed-volume table)."""
 
     table: Int[Array, " entries"]
     shape: tuple[int, int, int] = eqx.field(static=True)
@@ -71,14 +70,14 @@ class Sums(eqx.Module):
     def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
         for _ in range(3):
-            # Sum along the first axis, and put it last. XLA's own cumulative sums are slow windows on CPU.
+            # sums along the first axis, and moves it to the end; XLA's own cumulative sums are slow on CPU
             _, sums = jax.lax.scan(_add, varying(jnp.zeros_like(table[0]), table), table)
             table = jnp.moveaxis(sums, 0, 2)
         nx, ny, nz = occupied.shape
         return cls(table.reshape(-1), (nx, ny, nz))
 
     def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:
-        """Whether any cell from `first` to `last`, both included and inside the grid, is occupied."""
+        """Whether any cell from `first` to `last` is occupied, both inclusive and inside the grid."""
         _, ny, nz = (n + 1 for n in self.shape)
         x, y, z = (((low, -1), (high + 1, 1)) for low, high in zip(first, last, strict=True))
         count = jnp.zeros((), jnp.int32)
@@ -93,11 +92,9 @@ class Sums(eqx.Module):
 
 
 class Occupancy(eqx.Module):
-    """A regular grid of cells in the world, and which of them may hold anything that is seen.
+    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it.
 
-    What is visible lies in the grid, and in an occupied cell of it.
-
-    - `origin`, `size`: world position of the grid's corner, and world lengths of one cell.
+    - `origin`, `size`: world position of the grid's corner, and side lengths of a cell.
     """
 
     occupied: Bool[Array, "cx cy cz"]
@@ -105,12 +102,12 @@ class Occupancy(eqx.Module):
     size: Vec3
 
     def sums(self) -> Sums:
-        """For questions about boxes."""
+        """For queries about boxes."""
         return Sums.of(self.occupied)
 
     def distance(self) -> UInt8[Array, " cells"]:
-        """For each cell, how many cells away the nearest occupied one is, along the axis where it is
-        farthest (chessboard distance); 0 in an occupied cell, FARTHEST at most. In row-major order."""
+        """Chessboard distance of each cell to the nearest occupied one, in cells: 0 in an occupied cell.
+        In row-major order."""
 
         def spread(grid: Bool[Array, "cx cy cz"]) -> Bool[Array, "cx cy cz"]:
             for axis in range(3):
@@ -134,7 +131,7 @@ class Occupancy(eqx.Module):
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:
-        """Where a world point lies, counted in cells."""
+        """Coordinate of a world point in the grid, in cells."""
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
 
@@ -158,7 +155,7 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
 
 
 def _over_blocks(data: Shaped[Array, "nx ny nz"], combine: Callable) -> Shaped[Array, "bx by bz"]:
-    """All nodes of each block combined, axis by axis."""
+    """Combines all nodes of each block, axis by axis."""
     for axis in range(3):
         count = -(-(data.shape[axis] - 1) // BLOCK)
         missing = count * BLOCK + 1 - data.shape[axis]

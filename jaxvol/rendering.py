@@ -35,7 +35,7 @@ class Rendering(eqx.Module):
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
 
-    The last three raise `ValueError` where they were not asked for (`outputs="rgba"`).
+    The last three raise `AttributeError` where they were not asked for (`outputs="rgba"`).
     """
 
     rgba: Float[Array, "*rays 4"]
@@ -56,7 +56,7 @@ class Rendering(eqx.Module):
 
     def _detail(self, name: str, value: Array | None) -> Array:
         if value is None:
-            raise ValueError(f'{name} is not part of this rendering: pass outputs="all" to compute it.')
+            raise AttributeError(f'{name} is not part of this rendering: pass outputs="all" to compute it.')
         return value
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:

@@ -48,6 +48,11 @@ def check_scene(call: str, **arguments: Any) -> None:
     for name, value in arguments.items():
         kinds, expected, remedy = EXPECTED[name]
         if isinstance(value, kinds):
+            if isinstance(value, Volume) and type(value) is not Volume:
+                raise ValueError(
+                    f"{name} must be a jaxvol Volume itself; got its subclass {type(value).__name__}, whose methods "
+                    "the fast engine would not call. Subclass jaxvol.Field instead, and pass it as Volume(..., field=...)."
+                )
             continue
         elsewhere = [
             n for n, (other, *_) in EXPECTED.items() if value is not None and isinstance(value, other)

@@ -1,7 +1,8 @@
 """Which colour and extinction has this value?
 
-A transfer function is asked three things: `measured`, what it reads from the volume at a place; `classifier`,
-how that becomes colour and extinction; and `majorant`, a bound of its extinction over a block of the volume.
+A transfer function answers three questions: `measured`, what it reads from the volume at a place;
+`classifier`, how that becomes colour and extinction; and `majorant`, a bound of its extinction over a block
+of the volume.
 """
 
 from abc import abstractmethod
@@ -95,8 +96,8 @@ class Transfer(eqx.Module):
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
-        block's range. 0 only where the extinction is proven to be 0. It carries no gradient. By default
-        infinite: nothing is proven."""
+        block's range. 0 only where the extinction is proven to be 0, and in blocks that hold NaN
+        (`Blocks.unordered`). It carries no gradient. By default infinite: nothing is proven."""
         return jnp.full(blocks.low.shape, jnp.inf)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
@@ -116,7 +117,7 @@ class TransferFunction(Transfer):
     - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
       `1 - exp(-extinction w)`.
 
-    Extinction is what is interpolate_row. VTK interpolates opacity; the two agree at the points, and
+    Extinction is interpolated. VTK interpolates opacity; the two agree at the points, and
     differ between points where the opacity of a unit distance is high.
 
     Put a step between values of the data rather than at one: interpolation may round a value to either side.

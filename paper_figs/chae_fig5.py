@@ -2,13 +2,16 @@
 `experiments/minimum_distance.py`, with the number in the paper's text: at R = 8, 53 % less than the distance
 map alone."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+from experiments import record
+from experiments.command import command
+from experiments.common import plt, save
 from experiments.minimum_distance import HIERARCHY, MAP, PROVEN, PUBLISHED, named
 
-from .common import plt, recorded
+from .common import OUTPUT, RECORDS
 
 
 PAPER = 8, 0.47  # R, time over that of the distance map
@@ -47,14 +50,14 @@ def draw(measured: dict[str, Any], path: Path) -> None:
         panel.tick_params(labelsize=8)
     axes[0].set_ylabel("time / distance map; in red, wrong pixels", fontsize=9)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    figure.savefig(path, dpi=90, metadata={"Software": None})
-    plt.close(figure)
+    save(figure, path)
     print(path)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    measured, folder = recorded(argv, str(__doc__), "minimum_distance")
-    draw(measured, folder / "chae_fig5.png")
+@command(__doc__, OUTPUT, results=RECORDS)
+def main(chosen: Namespace) -> None:
+    measured = record.read(chosen.results / "minimum_distance.json")
+    draw(measured, chosen.output / "chae_fig5.png")
 
 
 if __name__ == "__main__":

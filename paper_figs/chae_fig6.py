@@ -5,7 +5,7 @@ rays of their cell of R x R pixels. Below, wrong pixels are green: those that di
 channel.
 """
 
-from collections.abc import Sequence
+from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from experiments.common import frame
 from experiments.minimum_distance import PUBLISHED, airway, colon, march, wrong
 from jaxvol.metrics import rmse
 
-from .common import BLACK, Page, options
+from .common import BLACK, Page, figure
 
 
 CELLS = (8, 16, 32, 64)
@@ -24,8 +24,8 @@ MIDDLE = 0.38, 0.52
 GREEN = (0.0, 0.7, 0.05)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, __doc__, resolution=256)
+@figure(__doc__, resolution=256)
+def main(chosen: Namespace) -> None:
     side, folder = chosen.size, chosen.data
     size = round(side * WHOLE)
     scene = airway(folder, size) if folder else colon(None, size, chosen.resolution)

@@ -3,26 +3,27 @@
 Images keep their pixels: one pixel of a picture is one ray, since resampling would smooth the artefacts.
 """
 
-import argparse
+from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import matplotlib
 import numpy as np
 
 import jaxvol as jv
 from experiments import record
+from experiments.command import QUICK, Main, command
+from experiments.common import plt
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
 from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
 
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-
 OUTPUT = Path(__file__).parent / "output"
+DATA = {"type": Path, "metavar": "FOLDER", "help": "real volumes, in place of phantoms"}
+RECORDS = {"type": Path, "default": record.RESULTS, "metavar": "FOLDER", "help": "that of the records"}
+"""The options `--data`, and `--results` of scripts that draw an experiment's record."""
+
 METHODS = (PLAIN, JITTER, EMPTY, BOTH)
 BLACK = (0.0, 0.0, 0.0)
 DPI = 100
@@ -74,36 +75,29 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
     return jv.Volume(part, volume.spacing, origin)
 
 
-def recorded(argv: Sequence[str] | None, about: str, name: str) -> tuple[dict[str, Any], Path]:
-    """For scripts that draw an experiment's record: the record, and the folder to write into."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=record.RESULTS, metavar="FOLDER")
-    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER")
-    chosen = parser.parse_args(argv)
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    return record.read(chosen.results / f"{name}.json"), chosen.output
+def figure(about: str | None, resolution: int = 160) -> Callable[[Callable[[Namespace], None]], Main]:
+    """Decorator that makes the `main` of a script that draws scenes of a function of its options.
+
+    - `about`: the module's docstring.
+    - `resolution`: voxels along an axis of a phantom, by default.
+    """
+
+    def made(draw: Callable[[Namespace], None]) -> Main:
+        @command(about, OUTPUT, data=DATA, size=184, resolution=resolution, quick=QUICK)
+        def main(chosen: Namespace) -> None:
+            if chosen.quick:
+                chosen.size, chosen.resolution = 48, 40
+            draw(chosen)
+
+        return main
+
+    return made
 
 
 def write_table(table: str, path: Path) -> None:
     """Write a Markdown table to a file and to the terminal."""
     path.write_text(table, encoding="utf-8")
     print(table)
-
-
-def options(argv: Sequence[str] | None, about: str, resolution: int = 160) -> argparse.Namespace:
-    """The options that the script of every figure has."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="real volumes, in place of phantoms")
-    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FOLDER", help="default: %(default)s")
-    parser.add_argument("--size", type=int, default=184, help="pixels along a side of each image")
-    parser.add_argument(
-        "--resolution", type=int, default=resolution, help="voxels along an axis of a phantom"
-    )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that the script runs")
-    chosen = parser.parse_args(argv)
-    if chosen.quick:
-        chosen.size, chosen.resolution = 48, 40
-    return chosen
 
 
 def comparison(
@@ -168,7 +162,6 @@ class Page:
         return axes
 
     def save(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.figure.savefig(path, dpi=DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
         plt.close(self.figure)
         print(path)

@@ -1,12 +1,12 @@
 """Kye 2013, Fig. 9: empty-space jittering on the head. The default is the head phantom, its crown cut off."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 
 import jaxvol as jv
 from experiments.scenes import SKIN
 
-from .common import View, comparison, cropped, options
+from .common import View, comparison, cropped, figure
 
 
 def phantom(resolution: int, size: int) -> View:
@@ -25,8 +25,8 @@ def real(folder: Path, size: int) -> View:
     return View(volume, transfer, camera, 1.5, 3.3, (0.4, 0.45))
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, __doc__)
+@figure(__doc__)
+def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     comparison(view, "Fig. 9: the head; boundary noise is that of the cut face", chosen.output / "fig09.png")
 

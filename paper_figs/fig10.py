@@ -1,11 +1,11 @@
 """Kye 2013, Fig. 10: the heart. The default is the engine phantom, cut open."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 
 import jaxvol as jv
 
-from .common import View, comparison, cropped, options
+from .common import View, comparison, cropped, figure
 
 
 METAL = [
@@ -31,8 +31,8 @@ def real(folder: Path, size: int) -> View:
     return View(volume, jv.preset("ct_bone", unit_distance=0.2), camera, 1.5, 3.5, (0.5, 0.4))
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, __doc__)
+@figure(__doc__)
+def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     shown = "bones of the chest" if chosen.data else "a cut engine"
     title = f"Fig. 10: {shown} in place of the heart; boundary noise is that of the cut faces"

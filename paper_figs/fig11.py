@@ -1,11 +1,11 @@
 """Kye 2013, Fig. 11: the kidney. The default is the colon phantom, soft tissue cut across."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 
 import jaxvol as jv
 
-from .common import View, comparison, cropped, options
+from .common import View, comparison, cropped, figure
 
 
 TISSUE = [
@@ -30,8 +30,8 @@ def real(folder: Path, size: int) -> View:
     return View(volume, jv.preset("engine", unit_distance=0.2), camera, 1.5, 4, (0.45, 0.5))
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, __doc__)
+@figure(__doc__)
+def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     shown = "a cut engine" if chosen.data else "a colon in soft tissue"
     title = f"Fig. 11: {shown} in place of the kidney; boundary noise is that of the cut face"

@@ -1,12 +1,12 @@
 """Kye 2013, Fig. 12: the effect of alignment where vessels leave the volume. The default is the vessel
 phantom, whose root the lower face cuts."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 
 import jaxvol as jv
 
-from .common import View, comparison, cropped, options
+from .common import View, comparison, cropped, figure
 
 
 CONTRAST = [
@@ -31,8 +31,8 @@ def real(folder: Path, size: int) -> View:
     return View(volume, jv.TransferFunction.from_points(CONTRAST, 2.0), camera, 2.0, 6, (0.5, 0.84))
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, __doc__)
+@figure(__doc__)
+def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     title = "Fig. 12: vessels; boundary noise is that of the pixels that alignment changes"
     comparison(view, title, chosen.output / "fig12.png", region=View.left)

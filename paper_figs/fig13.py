@@ -1,7 +1,7 @@
 """Kye 2013, Fig. 13: the pixels that alignment changes, in green, on the vessels of Fig. 12. The square marks
 the zoomed part of Fig. 12."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 
 import numpy as np
 from matplotlib.patches import Rectangle
@@ -10,14 +10,14 @@ import jaxvol as jv
 from experiments.marches import BOTH, transforms
 
 from . import fig12
-from .common import BLACK, Page, options
+from .common import BLACK, Page, figure
 
 
 GREEN = (0.0, 0.8, 0.05)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, __doc__)
+@figure(__doc__)
+def main(chosen: Namespace) -> None:
     size, resolution = chosen.size, chosen.resolution
     view = fig12.real(chosen.data, size) if chosen.data else fig12.phantom(resolution, size)
     page = Page(2, 1, size, "Fig. 13: pixels that alignment changes")

@@ -3,12 +3,14 @@ Writes the record of `experiments/kisti.py` in Markdown, beside the report's tab
 speed-ups.
 """
 
-from collections.abc import Sequence
+from argparse import Namespace
 from typing import Any
 
+from experiments import record
+from experiments.command import command
 from experiments.kisti import BOTH, ERT, ESS, NEITHER, REPORT
 
-from .common import recorded, write_table
+from .common import OUTPUT, RECORDS, write_table
 
 
 def table(measured: dict[str, Any]) -> str:
@@ -43,9 +45,10 @@ def table(measured: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    measured, folder = recorded(argv, str(__doc__), "kisti")
-    write_table(table(measured), folder / "kisti_table.md")
+@command(__doc__, OUTPUT, results=RECORDS)
+def main(chosen: Namespace) -> None:
+    measured = record.read(chosen.results / "kisti.json")
+    write_table(table(measured), chosen.output / "kisti_table.md")
 
 
 if __name__ == "__main__":

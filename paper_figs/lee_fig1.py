@@ -4,15 +4,15 @@ Photons seen along z, lengths in mean free paths; the area of a dot is the photo
 the sample that they light, and the ring the centre of their light.
 """
 
-from collections.abc import Sequence
+from argparse import Namespace
 
 import numpy as np
 
 import jaxvol as jv
-from experiments import common
+from experiments.common import plt, save
 from jaxvol.lighting import ScattererTemplate, scatterer_templates
 
-from .common import options, plt
+from .common import figure
 
 
 OPACITY, INDEX, THRESHOLD = 0.5, 1.4, 0.002
@@ -36,10 +36,10 @@ def draw(axes: plt.Axes, template: ScattererTemplate) -> plt.Artist:
     return dots
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, str(__doc__))
+@figure(__doc__)
+def main(chosen: Namespace) -> None:
     skin = jv.Material(OPACITY, 1.0, INDEX)
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
+    page, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
     for panel, packets, title in zip(axes, (1, 4), ("one packet", "four packets"), strict=True):
         template = jv.scatterer_template(skin, 0, packets=packets, threshold=THRESHOLD)
         dots = draw(panel, template)
@@ -50,9 +50,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         )
         panel.set_title(caption, fontsize=10)
         print(f"lee_fig1 {' '.join(caption.split())}; {np.sum(template.intensity > 0)} photons")
-    figure.colorbar(dots, ax=axes, label="z / λ")
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    common.save(figure, chosen.output / "lee_fig1.png")
+    page.colorbar(dots, ax=axes, label="z / λ")
+    save(page, chosen.output / "lee_fig1.png")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ the head, where nothing hides them, so the ear shines; if they are also tested f
 The text under each image is the mean brightness of the ear's pixels.
 """
 
-from collections.abc import Sequence
+from argparse import Namespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from experiments.lighting import march
 from experiments.scenes import Scene
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from .common import BLACK, Page, options
+from .common import BLACK, Page, figure
 
 
 GAP, THICK, RADIUS = 0.15, 0.06, 0.75
@@ -38,8 +38,8 @@ def volume(resolution: int, *, head: bool) -> jv.Volume:
     return jv.Volume(np.clip(0.5 - inside / spacing / 2, 0, 1), (spacing,) * 3, (-1.0,) * 3)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, str(__doc__), resolution=96)
+@figure(__doc__, resolution=96)
+def main(chosen: Namespace) -> None:
     whole, alone = (volume(chosen.resolution, head=head) for head in (True, False))
     points = [(0.1, (0.8, 0.5, 0.38), 0.0), (0.9, (0.8, 0.5, 0.38), 0.9)]
     transfer = jv.TransferFunction.from_points(points, unit_distance=0.05)

@@ -7,7 +7,7 @@ sample uses. In the right column occlusion is soft, and four templates of more p
 are the same.
 """
 
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from experiments.lighting import FLESH, march
 from experiments.scenes import Scene, skin_head
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from .common import BLACK, Page, options
+from .common import BLACK, Page, figure
 
 
 IRRADIANCE = (40.0, 40.0, 40.0)
@@ -97,8 +97,8 @@ def draw(page: Page, row: int, name: str, subject: Subject) -> None:
         page.draw(row, column, rendering.image(BLACK), caption, title if row == 0 else "")
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, str(__doc__), resolution=128)
+@figure(__doc__, resolution=128)
+def main(chosen: Namespace) -> None:
     subjects = {
         "the head phantom": head(chosen.resolution, chosen.size),
         "a frog": frog(chosen.resolution, chosen.size),

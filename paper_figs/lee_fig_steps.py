@@ -6,16 +6,18 @@ surfaces are so opaque that what lies under them shows only by the light that co
 each image is the mean of its visible pixels, as linear red, green and blue.
 """
 
-from collections.abc import Callable, Sequence
+from argparse import Namespace
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
+from jaxvol._util.vec3 import golden_spiral
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, ScattererTemplate, ScattererTemplates
 
-from .common import BLACK, Page, options
+from .common import BLACK, Page, figure
 
 
 FAR = 0.2
@@ -108,11 +110,8 @@ STEPS: dict[str, tuple[Look, Look]] = {
 
 def around(far: float, count: int = 48) -> ScattererTemplate:
     """Photons evenly in all directions, whose intensities add to 1."""
-    i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z**2)
-    offset = far * np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
-    return ScattererTemplate(jnp.asarray(offset)[None], jnp.full((1, count), 1 / count))
+    offset = jnp.asarray(far * golden_spiral(count))
+    return ScattererTemplate(offset[None], jnp.full((1, count), 1 / count))
 
 
 def render(look: Look, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -138,8 +137,8 @@ def render(look: Look, resolution: int, size: int) -> tuple[np.ndarray, np.ndarr
     return np.asarray(rendering.image(BLACK)), np.asarray(rendering.rgba[..., 3] > 0.5)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    chosen = options(argv, str(__doc__), resolution=96)
+@figure(__doc__, resolution=96)
+def main(chosen: Namespace) -> None:
     page = Page(len(STEPS), 2, chosen.size, "Lee, Kwon and Shin: the steps of shading, one at a time")
     for column, (title, looks) in enumerate(STEPS.items()):
         for row, look in enumerate(looks):

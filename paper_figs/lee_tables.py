@@ -2,13 +2,14 @@
 the conserving form, which the paper's own tables have (README.md), with lengths in mean free paths, beside
 the intensities that the paper prints in the same rows."""
 
-from collections.abc import Sequence
+from argparse import Namespace
 
 import numpy as np
 
 import jaxvol as jv
+from experiments.command import command
 
-from .common import options, write_table
+from .common import OUTPUT, write_table
 
 
 ROWS = 8
@@ -44,10 +45,9 @@ def table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    folder = options(argv, str(__doc__)).output
-    folder.mkdir(parents=True, exist_ok=True)
-    write_table(table(), folder / "lee_tables.md")
+@command(__doc__, OUTPUT)
+def main(chosen: Namespace) -> None:
+    write_table(table(), chosen.output / "lee_tables.md")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 as ratios to ray casting, with those of the paper.
 """
 
-from collections.abc import Sequence
+from argparse import Namespace
 from typing import Any
 
+from experiments import record
+from experiments.command import command
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 
-from .common import recorded, write_table
+from .common import OUTPUT, RECORDS, write_table
 
 
 COLUMNS = (JITTER, EMPTY, BOTH)
@@ -44,9 +46,10 @@ def table(measured: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    measured, folder = recorded(argv, str(__doc__), "overhead")
-    write_table(table(measured), folder / "table1.md")
+@command(__doc__, OUTPUT, results=RECORDS)
+def main(chosen: Namespace) -> None:
+    measured = record.read(chosen.results / "overhead.json")
+    write_table(table(measured), chosen.output / "table1.md")
 
 
 if __name__ == "__main__":

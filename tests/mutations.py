@@ -282,7 +282,7 @@ MUTATIONS = [
     # what is read, and what it looks like
     Mutation(
         "packing: the sign of int16 and int8 lost",
-        "engine/packing.py",
+        "_util/fetching.py",
         "if signed:  #",
         "if not signed:  #",
         (PACKED,),

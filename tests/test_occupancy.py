@@ -87,7 +87,7 @@ def drawn_table(rng, points):
 
 @eqx.filter_jit
 def visible(transfer, blocks):
-    return transfer.visible(blocks)
+    return transfer.visible(blocks), transfer.majorant(blocks)
 
 
 @eqx.filter_jit
@@ -114,10 +114,13 @@ def test_what_is_called_invisible_has_no_extinction(points):
         rng = np.random.default_rng(seed)
         transfer = drawn_table(rng, points)
         low, high = drawn_ranges(rng, np.asarray(transfer.values))
-        shown = np.asarray(visible(transfer, blocks_of_ranges(low, high)))[:, 0, 0]
+        blocks = blocks_of_ranges(low, high)
+        shown, bound = (np.asarray(found)[:, 0, 0] for found in visible(transfer, blocks))
         between = np.clip(np.float32(low + np.linspace(0, 1, 64)[:, None] * (high - low)), low, high)
         extinction = np.asarray(extinction_at(transfer, jnp.asarray(between)))
         assert not np.any(extinction.max(axis=0)[~shown] > 0)
+        assert np.all(extinction.max(axis=0) <= bound)
+        np.testing.assert_array_equal(bound > 0, shown)
         # and, away from the points, no more than that is called visible
         x, y = np.asarray(transfer.values), np.asarray(transfer.extinction)
         clear = ~(np.isin(low, x) | np.isin(high, x))
@@ -178,8 +181,10 @@ def test_hidden_labels_are_not_seen():
         ([None, see], [False, True]),
         ([None, None, see], [False, False]),
     ):
-        visible = jv.LabelTransferFunction(functions).visible(Blocks.of(volume))
-        np.testing.assert_array_equal(visible[:, 0, 0], expected)
+        transfer, blocks = jv.LabelTransferFunction(functions), Blocks.of(volume)
+        np.testing.assert_array_equal(transfer.visible(blocks)[:, 0, 0], expected)
+        np.testing.assert_array_equal(transfer.majorant(blocks)[:, 0, 0] >= 1, expected)
+        np.testing.assert_array_equal(transfer.majorant(blocks)[:, 0, 0] > 0, expected)
 
 
 # ---- boxes and distances ----

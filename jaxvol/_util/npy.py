@@ -2,6 +2,8 @@
 
 import math
 import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,41 +23,39 @@ def read_npy(path: Path, header: Header) -> dict[str, Any]:
 def read_npz(path: Path, header: Header) -> dict[str, Any]:
     """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
     header.refuse(path)
-    file_size(path)
-    with decoding(path), zipfile.ZipFile(path) as archive:
-        arrays = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        if "data" in arrays:
-            arrays = {k: arrays[k] for k in ("data", "spacing", "origin", "labels") if k in arrays}
-        elif len(arrays) == 1:
-            arrays = {"data": next(iter(arrays.values()))}
-        else:
-            raise ValueError(
-                f"path: {path} must hold an array called data, or one array; got {sorted(arrays)}. "
-                "Save it with np.savez(path, data=...)."
-            )
-        return _arrays(path, archive, arrays)
+    with _opened(path) as (names, read):
+        if "data" in names:
+            return {name: read(name) for name in ("data", "spacing", "origin", "labels") if name in names}
+        if len(names) == 1:
+            return {"data": read(names[0])}
+        raise ValueError(
+            f"path: {path} must hold an array called data, or one array; got {sorted(names)}. "
+            "Save it with np.savez(path, data=...)."
+        )
 
 
 def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The arrays of these names from an `.npz` file. **Raises** `ValueError` if one is missing."""
-    file_size(path)
-    with decoding(path), zipfile.ZipFile(path) as archive:
-        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        if missing := set(names) - set(members):
+    with _opened(path) as (there, read):
+        if missing := set(names) - set(there):
             raise ValueError(
                 f"path: {path} must hold arrays {', '.join(names)}; {sorted(missing)} is missing."
             )
-        return _arrays(path, archive, {name: members[name] for name in names})
+        return {name: read(name) for name in names}
 
 
-def _arrays(
-    path: Path, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]
-) -> dict[str, np.ndarray]:
-    arrays = {}
-    for name, member in members.items():
-        with archive.open(member) as stream:
-            arrays[name] = _npy_array(path, stream, member.file_size)
-    return arrays
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[list[str], Callable[[str], np.ndarray]]]:
+    """Names of the arrays in an `.npz` file, and the function that reads one of them."""
+    file_size(path)
+    with decoding(path), zipfile.ZipFile(path) as archive:
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+
+        def read(name: str) -> np.ndarray:
+            with archive.open(members[name]) as stream:
+                return _npy_array(path, stream, members[name].file_size)
+
+        yield list(members), read
 
 
 def _npy_array(path: Path, stream: Stream, size: int) -> np.ndarray:

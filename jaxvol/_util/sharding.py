@@ -1,4 +1,4 @@
-"""Over which devices does an array vary? What `jax.shard_map` asks of the arrays inside it."""
+"""What `jax.shard_map` needs to know: over which mesh axes an array varies."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Array, Int, PyTree
 
 def varies_over(leaf: Any) -> frozenset:
     """The mesh axes over which an array varies inside `jax.shard_map`; none under `check_vma=False`, where
-    JAX does not tell."""
+    JAX does not track them."""
     if not isinstance(leaf, jax.core.Tracer):
         return frozenset()
     kind = jax.typeof(leaf)
@@ -21,10 +21,11 @@ def varies_over(leaf: Any) -> frozenset:
 
 
 def varying(tree: PyTree, *like: PyTree) -> PyTree:
-    """A tree whose arrays vary over all the devices over which any array of `like`, or of itself, varies.
+    """The tree, with arrays that vary over all mesh axes over which any array of `like`, or of itself,
+    varies.
 
-    JAX types arrays by the mesh axes over which they vary, and a loop must begin with arrays of the types
-    that it ends with, where zeros do not vary. Outside of `jax.shard_map` this changes nothing."""
+    These axes are part of an array's type in JAX. A loop must start with arrays of the types that it ends
+    with, and zeros do not vary. Outside of `jax.shard_map` this changes nothing."""
     axes = frozenset().union(*(varies_over(leaf) for leaf in jax.tree.leaves((tree, like))))
 
     def one(leaf: Any) -> Any:
@@ -39,10 +40,11 @@ def varying(tree: PyTree, *like: PyTree) -> PyTree:
 
 
 def shard_number(*arrays: Any) -> Int[Array, ""]:
-    """Which shard this is of arrays that are sharded along their first axis; 0 outside of `jax.shard_map`."""
+    """Index of this shard, of arrays that are sharded along their first axis; 0 outside of
+    `jax.shard_map`."""
     axes = frozenset().union(*map(varies_over, arrays))
     if not axes:
         return jnp.zeros((), jnp.int32)
-    # JAX does not tell in which order the axes follow each other where an array has several
+    # of an array with several mesh axes, JAX does not tell their order
     names = tuple(name for name in jax.sharding.get_abstract_mesh().axis_names if name in axes)
     return jax.lax.axis_index(names).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""How does XLA make a fast program? What it needs to be told, since it does not find out by itself."""
+"""What XLA must be told to compile fast programs, and rules for transformations of whole programs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,31 +16,31 @@ from .sharding import varying
 
 
 OPTIONS = {
-    # 16 lanes at once where the processor has them: XLA prefers 8
+    # 16 lanes where the processor has them; XLA's default is 8
     "xla_cpu_prefer_vector_width": 512,
-    # kernels one after the other, each on all threads, rather than several on one thread each
+    # kernels one after the other, each on all threads, rather than several at once on one thread each
     "xla_cpu_enable_concurrency_optimized_scheduler": False,
 }
-"""How XLA compiles: 10 to 20 % faster on CPU, and of no meaning elsewhere."""
+"""Compiler options: programs are 10 to 20 % faster on CPU. They mean nothing on other backends."""
 
 
 def compiled(function: Callable[..., Any], *, has_jvp: bool = False) -> Callable[..., Any]:
-    """The function under jit, compiled with `OPTIONS` where it is a program of its own.
+    """The function under jit, compiled with `OPTIONS` where it is not part of a larger program.
 
     `jax.vmap` runs it for each element of the batch in turn, as a Python loop would, but in one program.
-    Batching its operations instead would turn every branch into both of its sides, and keep each loop going
-    until the last element is finished: 3 to 18 times slower.
+    Batching its operations instead would execute both sides of each branch, and run each loop until the last
+    element is finished: 3 to 18 times slower.
 
-    `has_jvp`: the function is to be differentiated by JAX itself. JAX cannot linearize what has a rule for
-    batching, so the rule is then used only where `jax.vmap` is all that is seen to be done to the arguments.
-    Where they are also differentiated, or a `jax.jit` stands between, operations are batched.
+    `has_jvp`: JAX itself is to differentiate the function. It cannot linearize a function with a batching
+    rule, so the rule is used only where `jax.vmap` is the innermost transformation of the arguments. Where
+    they are also differentiated, or a `jax.jit` lies between, operations are batched.
     """
     options: Any = {"compiler_options": OPTIONS}
     inner, alone = eqx.filter_jit(function), eqx.filter_jit(function, **options)
     in_turn = _in_turn(function, inner)
 
     def run(*args: Any) -> Any:
-        # a program within another one, or within a transformation, cannot have options of its own
+        # inside a larger program or a transformation, compiler options are not allowed
         if not is_traced(args, jnp.zeros(())):
             return alone(*args)
         return inner(*args) if has_jvp and not _only_vmapped(args) else in_turn(*args)
@@ -55,8 +55,8 @@ def _only_vmapped(args: PyTree) -> bool:
 
 
 def transformations(leaf: Any) -> list[str]:
-    """By which of JAX's tracers an array is traced, the innermost first. By name, since JAX does not export
-    their classes; what is outside of a `jax.jit` is not seen."""
+    """Names of JAX's tracers around an array, the innermost first. Names, since JAX does not export their
+    classes. Transformations outside of a `jax.jit` cannot be seen."""
     names = []
     while is_traced(leaf):
         names.append(type(leaf).__name__)
@@ -69,7 +69,7 @@ def _is_array(leaf: Any) -> bool:
 
 
 def _in_turn(function: Callable[..., Any], inner: Callable[..., Any]) -> Callable[..., Any]:
-    """`inner`, which is `function` under jit, with a rule for `jax.vmap`: a loop over the batch."""
+    """`inner`, which is `function` under jit, with a batching rule: a loop over the batch."""
 
     def run(*args: Any) -> Any:
         arrays, rest = eqx.partition(args, _is_array)
@@ -91,7 +91,8 @@ def _in_turn(function: Callable[..., Any], inner: Callable[..., Any]) -> Callabl
 
 
 def _each(function: Callable[..., Any], batched: tuple[bool, ...], args: tuple[Any, ...]) -> Any:
-    """`function` of each element of the batch; `batched` tells which arrays among the arguments have one."""
+    """`function` of each element of the batch. `batched`: which arrays among the arguments have a batch
+    axis."""
     arrays, rest = eqx.partition(args, _is_array)
     leaves, tree = jax.tree.flatten(arrays)
 
@@ -107,9 +108,8 @@ _batch = compiled(_each)
 
 
 def recomputed(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as a program, and its derivative by reverse mode as another one, which computes the
-    function again rather than keeping anything for it. Under `jax.vmap` both run in turn, as `compiled` has
-    it. For functions from trees to one array."""
+    """The function as one program, and its reverse-mode derivative as another, which recomputes the function
+    instead of keeping residuals. Both are `compiled`. For functions from trees to one array."""
     forward, backward = compiled(function), compiled(_pulled)
 
     @eqx.filter_custom_vjp
@@ -134,7 +134,7 @@ def _pulled(function: Callable[..., Any], perturbed: PyTree, args: tuple[Any, ..
 
 
 def forward_only(tree: PyTree, message: str) -> PyTree:
-    """The tree as it is; under reverse mode, `ValueError` with this message."""
+    """The tree, unchanged. Under reverse mode it raises `ValueError` with this message."""
 
     @jax.custom_jvp
     def same(leaf: Array) -> Array:
@@ -151,7 +151,7 @@ def _refuse(cotangent: Any, tangent: Any, *, message: str) -> Any:
     raise ValueError(message)
 
 
-# The identity, with an error for a transpose. (`jax.custom_derivatives.linear_call` cannot be batched.)
+# The identity, whose transpose is an error. (`jax.custom_derivatives.linear_call` cannot be batched.)
 _TANGENT = Primitive("forward_only")
 _TANGENT.def_impl(lambda tangent, *, message: tangent)
 _TANGENT.def_abstract_eval(lambda tangent, *, message: tangent)
@@ -161,11 +161,10 @@ ad.deflinear2(_TANGENT, _refuse)
 
 
 def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, computed once and put in memory for all who use it.
+    """`f(*arguments)`, computed once and stored in memory.
 
-    What XLA fuses it computes anew for each use, a fetch too; but the results of a branch lie in memory. So
-    `live` must always be true, in a way that XLA cannot see. That is asserted: where it is not, floats come
-    out as NaN."""
+    XLA recomputes what it fuses for each use, fetches too, but the results of a branch lie in memory. `live`
+    must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN."""
 
     def never(*arguments: Any) -> Any:
         def filled(leaf: Any) -> Array:

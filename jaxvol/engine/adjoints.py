@@ -99,6 +99,7 @@ def adjoint_of(name: Adjoint, volume: Volume, march: March) -> AbstractAdjoint:
         return ReplayAdjoint()
     if name == "forward":
         return ForwardAdjoint()
+    assert name == "direct"
     # rounded up to one of few lengths, so that a change of step rarely compiles the program again
     return DirectAdjoint(min(-(-steps_across(volume, march) // 64) * 64, march.most_samples))
 

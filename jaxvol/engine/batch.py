@@ -55,7 +55,7 @@ class Job(NamedTuple):
     """All that does not change while rays are marched.
 
     - `empty_space`: where it is known, and `prepared`, what it has found out about these beams.
-    - `any_order`: whether rays with a shift ahead are marched among all others, rather than first.
+    - `any_order`: whether the first pass takes all rays.
     """
 
     march: March
@@ -73,8 +73,8 @@ class Job(NamedTuple):
         return ~at.finished & (at.index < self.march.most_samples)
 
     def wanted(self, at: Progress, regular: bool) -> Bool[Array, "*rays"]:
-        """Rays to be marched in this pass: the first one is for those with a shift ahead, unless all are
-        marched in any order, or the number of samples is limited; the second, `regular` one is for all."""
+        """Rays to march in this pass: in the `regular` one, or where samples are limited, all that are alive;
+        otherwise those that may still shift, or all if `any_order`."""
         alive = self.alive(at)
         if regular or self.march.max_samples is not None:
             return alive

@@ -119,6 +119,13 @@ def _pulled(
     (total, of_source), _ = jax.lax.scan(
         tile, varying(start, image), (jnp.arange(tiles.number), ranges, *image)
     )
+    return _cotangents(volume, total, of_source, pull_light)
+
+
+def _cotangents(
+    volume: Volume, total: Total, of_source: PyTree, pull_light: Callable[[PyTree], Any] | None
+) -> tuple[PyTree, ...]:
+    """The cotangents of volume, transfer function, source of rays, march and lighting."""
     of_volume = total.volume
     if total.voxels is not None:
         voxels = total.voxels.reshape(volume.data.shape).astype(volume.data.dtype)

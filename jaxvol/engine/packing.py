@@ -1,8 +1,9 @@
-"""How are the eight voxels around a sample fetched at once? From words that hold neighbours side by side.
+"""A packed copy of the voxels, for fewer fetches: each word holds neighbouring voxels.
 
-A fetch costs the same for one byte as for four, so a copy of the volume in which each word holds a voxel
-and its neighbours along z, and for 8-bit voxels along y too, saves three fetches in four, or every second
-one. It takes four, or two, times the memory of the voxels, and is made once for an array of them.
+A fetch costs the same for one byte as for four. A copy in which each 32-bit word holds a voxel and its
+neighbour along z, and for 8-bit voxels the two beside these along y, saves three fetches in four for 8-bit,
+and one in two for 16-bit voxels. It takes four or two times the memory of the voxels, and is made once for
+each array of them.
 """
 
 import jax
@@ -16,14 +17,21 @@ from ..volume import Volume, with_fetch
 
 
 LIMIT = 2**30
-"""Bytes, at most, that a copy may take."""
+"""Bytes that a copy may take at most."""
 
 
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
-    """The packed copy of a volume's voxels; None where it is no use, or takes too much memory."""
+    """The packed copy of a volume's voxels. None for other types of voxels, traced ones, and NumPy arrays;
+    where a field replaces them; and where the copy would take too much memory."""
     data = volume.data
     small = data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
-    if not small or is_traced(data) or not isinstance(data, jax.Array) or 4 * data.size > LIMIT:
+    if (
+        not small
+        or volume.field is not None
+        or is_traced(data)
+        or not isinstance(data, jax.Array)
+        or 4 * data.size > LIMIT
+    ):
         return None
     return kept(data, _packed)
 
@@ -39,7 +47,7 @@ def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
     unsigned = data.view(f"uint{bits}").astype(jnp.uint32)
 
     def beside(voxels: UInt32[Array, "nx ny nz"], axis: int) -> UInt32[Array, "nx ny nz"]:
-        # what is beside the last one is never asked for
+        # the neighbour of the last voxel is never used
         return jnp.roll(voxels, -1, axis)
 
     words = unsigned | beside(unsigned, 2) << bits

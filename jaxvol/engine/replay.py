@@ -15,7 +15,7 @@ depths, colours and depths back to the transfer function, the voxels, the ray an
 time.
 
 Where rays leap over empty space, the first march records each ray's first and last visible cell, and the
-second one leaps over all cells outside of these: two fifths of the head's samples.
+second one leaps over all others, which saves two fifths of the samples in the head.
 """
 
 from typing import Any, NamedTuple
@@ -124,7 +124,7 @@ class Replay(SampleVisitor):
     - `given`: cotangents of the rays.
     - `total`: to be added to.
     - `light`: what shades the samples.
-    - `places`: whether the gradient of anything but the transfer function is asked for.
+    - `places`: whether volume, camera, rays or march have a gradient.
     """
 
     def __init__(

@@ -26,8 +26,8 @@ from .tiling import Tiling
 
 
 class Samples(NamedTuple):
-    """The pieces of the next cells of many rays: arrays (cells, rays), one of each kind for each piece that a
-    cell is divided into. Cells that a ray does not take are placed beyond its exit."""
+    """The next cells of many rays, as lists with one entry for each piece of a cell; each entry is an array
+    (cells, rays). Cells that a ray does not take are placed beyond its exit."""
 
     cells: list[Cell]
     measured: list[Measured]
@@ -110,7 +110,8 @@ def _sampled(
 
     cut = pieces_of(at)
     divided = len(cut) > 1
-    # Where a cell is divided takes work that is not to be repeated; a whole cell costs less than memory does.
+    # Dividing a cell is expensive, so that its pieces are stored. An undivided cell costs less to recompute
+    # than to load.
     given = cut if divided else None
 
     def cells(at: Progress, given: Any) -> tuple[Cell, ...]:

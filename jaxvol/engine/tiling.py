@@ -9,15 +9,16 @@ from .._util.compaction import CHUNK
 
 
 class Tiling(NamedTuple):
-    """Sizes by which rays and samples are processed. None of them shows in the result.
+    """Sizes by which rays and samples are processed. None of them shows in an image; gradients are summed in
+    another order, and the number of samples between two leaps differs.
 
     - `cells`: cells of a segment, whose samples are all fetched before any is composited.
     - `group`: rays compacted as one unit, a square number.
-    - `batch`: groups marched at a time, so that they fit into the cache.
+    - `batch`: groups marched at a time, as many as fit into the cache.
     - `kept`: share of a batch's groups that must be alive for it to go on; below it, batches are refilled.
-    - `tile`: beams made, marched and finished before the next ones are made: 262 144 rays.
+    - `tile`: beams that are marched to their ends before the next ones are made: 262 144 rays.
     - `direct_tile`: the same where JAX differentiates the march itself, and so keeps all its states.
-    - `chunk`: samples shaded at a time.
+    - `chunk`: samples shaded at a time, a multiple of 128.
     """
 
     cells: int = 8
@@ -41,8 +42,9 @@ class Tiling(NamedTuple):
 
     @classmethod
     def of_backend(cls) -> "Tiling":
-        """Measured on CPU. Of other backends nothing has been measured yet, and they take the same."""
-        return BY_BACKEND.get(jax.default_backend(), cls())
+        """The sizes for JAX's default backend."""
+        return BY_BACKEND.get(jax.default_backend(), BY_BACKEND["cpu"])
 
 
-BY_BACKEND: dict[str, Tiling] = {"cpu": Tiling()}
+BY_BACKEND = {"cpu": Tiling()}
+"""Sizes that were measured. Other backends take those of the CPU."""

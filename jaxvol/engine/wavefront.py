@@ -1,14 +1,15 @@
 """In which order are rays marched? In batches of groups, refilled as rays finish.
 
 - Rays are compacted in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is
-  marched segment by segment until a quarter of its groups is finished; then batches are made up anew from the
-  groups that are left. Idle lanes cost as much as working ones.
-- A ray with a shift ahead of it (`Transform.shift`) takes segments in part. Groups with such rays are marched
-  in a first pass, so that the second one need not ask. Where most groups have them, the first pass takes all:
-  apart from their neighbours, rays would find little in the cache.
+  marched segment by segment until too few of its groups are left (`Tiling.kept`); then batches are made up
+  anew from the groups that are left. Idle lanes cost as much as working ones.
+- A ray that may still shift (`Transform.shift`) must stop at its next transparent cell. Groups with such rays
+  are marched first; the second pass can then take whole segments without that test. If more than half of the
+  groups have such rays, and rays do not leap, the first pass takes all groups, so that neighbours stay
+  together in the cache. Where the number of samples is limited, there is only the first pass.
 - Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments.
 
-None of it shows in the result: cells, transforms and compositing are those of `reference`. (Measured on CPU.)
+None of it shows in an image: cells, transforms and compositing are those of `reference`. (Measured on CPU.)
 """
 
 from functools import partial
@@ -97,8 +98,8 @@ def _mostly(some: Bool[Array, "groups rays"], of: Bool[Array, "groups rays"]) ->
 
 
 def _past_first_cell(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
-    """Moves rays past their first cell where it is transparent, as that of most rays is: a ray that shifts
-    there would take no more than this one cell of a segment."""
+    """Moves rays past their first cell where it is transparent. Most rays begin in empty space and would
+    shift there, and so use one cell of their first segment only."""
 
     def one(ray: Ray, at: Progress) -> Progress:
         cut = pieces(march, ray, volume, front(march, at))

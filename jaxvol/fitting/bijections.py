@@ -2,6 +2,9 @@
 
 A solver moves the free variables, `free`; what is rendered is `forward(free)`, so no step can leave the
 allowed range. Free variables are of order 1 whatever the parameter's units, which suits a damped step.
+
+No library of transforms is used (paramax, NumPyro's): the maps are one line each, and what takes the lines,
+ranges named in errors, starts at an end of them and a camera's pose, none of them has.
 """
 
 from abc import abstractmethod
@@ -11,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import logit
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, number, require
@@ -90,7 +94,7 @@ class Positive(Bijection):
             _finite(value, name), lambda v: v >= 0, f"{name} must not be negative to be fitted; got {{got}}."
         )
         part = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
-        return part + jnp.log(-jnp.expm1(-part))
+        return part + jnp.log(-jnp.expm1(-part))  # inverse of softplus, which JAX lacks
 
 
 class UnitInterval(Bijection):
@@ -110,8 +114,7 @@ class UnitInterval(Bijection):
             lambda v: (v >= 0) & (v <= 1),
             f"{name} must be in [0, 1] to be fitted; got {{got}}.",
         )
-        value = jnp.clip(value, MARGIN, 1 - MARGIN)
-        return jnp.log(value) - jnp.log1p(-value)
+        return logit(jnp.clip(value, MARGIN, 1 - MARGIN))
 
 
 class Pose(Bijection):
@@ -173,7 +176,11 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0."""
+    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0.
+
+    Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts, and
+    jaxlie would bring its dataclasses and a parser of command lines (tyro) for this one function.
+    """
     square = jnp.sum(turn**2)
     small = square < 1e-6
     angle = jnp.sqrt(jnp.where(small, 1, square))  # never at 0, where the slope of sqrt is infinite

@@ -1,7 +1,8 @@
 """Checkpoints, so that a fit survives being killed: the file is complete at all times and identifies its fit.
 
-Arrays are stored as NumPy's .npz, never pickled, with a checksum over all of them. A new file is written
-beside the old one and moved into its place in one operation; the old one is kept as `NAME.before`.
+A file is one line with a checksum over the rest, one line of JSON that describes the fit, and the arrays, one
+after the other, as `equinox.tree_serialise_leaves` writes them: NumPy's .npy, never pickled. A new file is
+written beside the old one and moved into its place in one operation; the old one is kept as `NAME.before`.
 """
 
 import hashlib
@@ -9,23 +10,24 @@ import io
 import json
 import os
 import warnings
-import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
 import numpy as np
 
 
-Arrays = dict[str, np.ndarray]
+T = TypeVar("T")
 
 
-def save(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
-    """Write the arrays, and the description `about` of their fit, to `path`, replacing its content."""
-    content = {**arrays, "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
+def save(path: Path, state: Any, about: dict[str, Any]) -> None:
+    """Write the arrays of `state` and the description `about` of its fit to `path`, replacing its content."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, checksum=_checksum(content), **content)
+    buffer.write(json.dumps(about).encode() + b"\n")
+    eqx.tree_serialise_leaves(buffer, state)
     part = path.with_name(path.name + ".part")
     with part.open("wb") as file:
+        file.write(_seal(buffer))
         file.write(buffer.getbuffer())
         file.flush()
         os.fsync(file.fileno())
@@ -39,31 +41,37 @@ def save(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
         os.close(folder)
 
 
-def load(path: Path, about: dict[str, Any]) -> Arrays | None:
-    """The saved arrays, or None if there are none. A damaged file is named in a warning, and the previous one
-    is used.
+def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]] | None:
+    """The saved state, a tree like `like`, with its description; or None if none was saved. A damaged file is
+    named in a warning, and the previous one is used.
 
-    **Raises:** `ValueError` for a checkpoint of another fit than `about` describes.
+    **Raises:** `ValueError` for a checkpoint of another fit than `about` describes (the saved description may
+    have more entries), or of an earlier version.
     """
     for candidate in (path, before(path)):
         if not candidate.exists():
             continue
         try:
-            arrays, saved = _read(candidate)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as fault:
+            saved, leaves = _read(candidate)
+        except (OSError, ValueError) as fault:
             warnings.warn(
                 f"checkpoint {candidate} is damaged and ignored ({fault}); the fit continues from the "
                 "previous one, or from the start if there is none.",
                 stacklevel=4,
             )
             continue
+        if saved is None:
+            raise ValueError(
+                f"checkpoint {candidate} is a zip archive, as earlier versions of jaxvol wrote; this version "
+                "cannot continue from it. Choose another file, or delete this one."
+            )
         for key, expected in about.items():
             if not _agree(saved.get(key), expected):
                 raise ValueError(
                     f"checkpoint {candidate} belongs to another fit: its {key} is {saved.get(key)}, "
                     f"that of this fit is {expected}. Choose another file, or delete this one."
                 )
-        return arrays
+        return eqx.tree_deserialise_leaves(leaves, like), saved
     return None
 
 
@@ -72,22 +80,21 @@ def before(path: Path) -> Path:
     return path.with_name(path.name + ".before")
 
 
-def _read(path: Path) -> tuple[Arrays, dict[str, Any]]:
-    with np.load(path, allow_pickle=False) as file:
-        content = {name: file[name] for name in file.files}
-    checksum = content.pop("checksum")
-    if not np.array_equal(checksum, _checksum(content)):
+def _read(path: Path) -> tuple[dict[str, Any] | None, io.BytesIO]:
+    """The description, None for a zip archive; and the rest of the file."""
+    with path.open("rb") as file:
+        seal = file.readline()
+        content = io.BytesIO(file.read())
+    if seal.startswith(b"PK"):
+        return None, content
+    if seal != _seal(content):
         raise ValueError("its checksum does not match")
-    return content, json.loads(content.pop("about").tobytes())
+    return json.loads(content.readline()), content
 
 
-def _checksum(content: Arrays) -> np.ndarray:
-    digest = hashlib.sha256()
-    for name in sorted(content):
-        array = np.ascontiguousarray(content[name])
-        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode())
-        digest.update(array.tobytes())
-    return np.frombuffer(digest.digest(), np.uint8)
+def _seal(content: io.BytesIO) -> bytes:
+    """First line of a file with this content."""
+    return b"jaxvol checkpoint, SHA-256 " + hashlib.sha256(content.getbuffer()).hexdigest().encode() + b"\n"
 
 
 def _agree(saved: Any, expected: Any) -> bool:

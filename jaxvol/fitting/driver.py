@@ -137,8 +137,8 @@ def fit(
     the residual does not determine.
 
     **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
-    residual that is not finite at the start, a checkpoint of another fit, and one that cannot be written;
-    `ImportError` if Optax or the progress bar is requested but not installed.
+    residual that is not finite at the start, a checkpoint of another fit or of an earlier version, and one
+    that cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.
     """
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
         if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
@@ -252,20 +252,6 @@ class _Run(eqx.Module):
             return Outcome.nonlinear_max_steps_reached
         return None
 
-    def arrays(self) -> checkpoints.Arrays:
-        leaves = jax.tree.leaves(eqx.filter(self, eqx.is_array))
-        return {
-            **{f"a{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)},
-            "losses": np.asarray(self.losses),
-        }
-
-    def with_arrays(self, arrays: checkpoints.Arrays) -> "_Run":
-        dynamic, static = eqx.partition(self, eqx.is_array)
-        leaves, structure = jax.tree.flatten(dynamic)
-        leaves = [jnp.asarray(arrays[f"a{i}"]) for i in range(len(leaves))]
-        run = eqx.combine(jax.tree.unflatten(structure, leaves), static)
-        return replace(run, losses=arrays["losses"].tolist())
-
 
 def _squares(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, Array]]:
     """Residual for a least-squares solver, with auxiliary output: the loss, its point, and the triangle."""
@@ -317,17 +303,17 @@ class _Checkpointer:
 
     def resumed(self, run: _Run) -> _Run:
         """The saved run, or `run` if none was saved."""
-        arrays = checkpoints.load(self.file, self.about)
-        if arrays is None:
+        found = checkpoints.load(self.file, run, self.about)
+        if found is None:
             return run
-        run = run.with_arrays(arrays)
-        self.step = len(run.losses)
-        return run
+        run, saved = found
+        self.step = len(saved["losses"])
+        return replace(run, losses=saved["losses"])
 
     def save(self, run: _Run, seconds: float = 0) -> None:
         """Save the run, unless it has not advanced or the last save was less than `seconds` ago."""
         if len(run.losses) > self.step and time.monotonic() - self.time >= seconds:
-            checkpoints.save(self.file, run.arrays(), self.about)
+            checkpoints.save(self.file, run, {**self.about, "losses": run.losses})
             self.step, self.time = len(run.losses), time.monotonic()
 
 

@@ -98,7 +98,8 @@ class Surroundings(eqx.Module):
 class Shading(eqx.Module):
     """A lighting, made ready for one image. All methods see one sample.
 
-    A sample's light is a sum of `terms` over places around it. Only `term` looks at the volume.
+    A sample's light is a sum of `terms` over places around it. Only `term` may read voxels: under replay,
+    those that are read elsewhere get no gradient.
     """
 
     @property
@@ -137,8 +138,10 @@ class Lighting(eqx.Module):
         self, seen: Classification, space: Space, line: Line, rgba: Float[Array, "4"], depth: Scalar
     ) -> Float[Array, "4"]:
         """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
-        depth. `seen.light` shades samples."""
-        return rgba
+        depth. `seen.light` shades samples. To be overridden where `shades_pixels`."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must override shade_pixel, as it has shades_pixels."
+        )
 
 
 def classification(

@@ -105,14 +105,15 @@ def greatest_extinction(
             "Transfer.majorant."
         )
     blocks, transfer, materials = jax.lax.stop_gradient((blocks, transfer, materials))
+    own = transfer.majorant(blocks)
     bound = jnp.zeros_like(blocks.low)
     open_ = jnp.ones(blocks.low.shape, bool)
     for material in materials:
         may, must = _holds(material, blocks)
         bound = jnp.where(open_ & may, jnp.maximum(bound, 1 / material.mean_free_path), bound)
         open_ &= ~must
-    bound = jnp.where(open_, jnp.maximum(bound, transfer.majorant(blocks)), bound)
-    return jnp.where(transfer.visible(blocks), bound, 0)
+    bound = jnp.where(open_, jnp.maximum(bound, own), bound)
+    return jnp.where(own > 0, bound, 0)
 
 
 def _holds(material: Material, blocks: Blocks) -> tuple[Bool[Array, "bx by bz"], Bool[Array, "bx by bz"]]:

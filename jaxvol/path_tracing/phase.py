@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Scalar, Vec3, orthonormal
 
 
 def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
@@ -43,20 +43,8 @@ def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
 def turned(around_z: Vec3, direction: Vec3) -> Vec3:
     """Rotate a unit direction around the z axis to one that lies in the same way around `direction`."""
     (x, y, cosine), (dx, dy, dz) = around_z, direction
-    (a, b, c), (d, e, f) = _orthonormal(direction)
+    (a, b, c), (d, e, f) = orthonormal(direction)
     return _unit((x * a + y * d + cosine * dx, x * b + y * e + cosine * dy, x * c + y * f + cosine * dz))
-
-
-def _orthonormal(direction: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit vectors orthogonal to a unit direction and to each other.
-
-    Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
-    """
-    x, y, z = direction
-    sign = jnp.where(z >= 0, 1, -1).astype(z.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
 def _unit(direction: Vec3) -> Vec3:

@@ -484,6 +484,13 @@ def test_with_both_checkpoints_damaged_a_fit_starts_anew(tmp_path):
     assert same(again.parameters, whole.parameters)
 
 
+def test_a_checkpoint_of_an_earlier_version_is_refused(tmp_path):
+    file = tmp_path / "a.npz"
+    np.savez(file, a0=np.zeros(2), losses=np.ones(3))
+    with pytest.raises(ValueError, match=r"checkpoint .*a\.npz is a zip archive, as earlier versions"):
+        jv.fit(curve, BEGIN, checkpoint=file)
+
+
 @pytest.mark.parametrize("what", ["solver", "parameters", "loss at the start", "number of residuals"])
 def test_a_checkpoint_of_another_fit_is_refused(what, tmp_path):
     jv.fit(curve, BEGIN, checkpoint=tmp_path / "a")
