@@ -17,6 +17,7 @@ from ._util.piecewise_linear import (
     upper_bound_between,
 )
 from ._util.vec3 import Scalar, Vec3
+from ._util.xla import gather
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume
@@ -69,7 +70,7 @@ class LabelTransferFunction(Transfer):
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             value, label = measured
             label = jnp.where((label < 0) | (label > unseen), unseen, label)
-            values = self.stacked.values.at[label].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            values = gather(self.stacked.values, label)
             row = table_row(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
             return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
 

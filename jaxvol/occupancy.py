@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 from ._util.memo import kept
 from ._util.sharding import varying
 from ._util.vec3 import Vec3
+from ._util.xla import gather
 from .volume import Volume
 
 
@@ -84,9 +85,7 @@ class Sums(eqx.Module):
         for i, sign_i in x:
             for j, sign_j in y:
                 for k, sign_k in z:
-                    entry = self.table.at[(i * ny + j) * nz + k].get(
-                        mode="promise_in_bounds", wrap_negative_indices=False
-                    )
+                    entry = gather(self.table, (i * ny + j) * nz + k)
                     count = count + sign_i * sign_j * sign_k * entry
         return count > 0
 

@@ -50,8 +50,9 @@ def check_scene(call: str, **arguments: Any) -> None:
         if isinstance(value, kinds):
             if isinstance(value, Volume) and type(value) is not Volume:
                 raise ValueError(
-                    f"{name} must be a jaxvol Volume itself; got its subclass {type(value).__name__}, whose methods "
-                    "the fast engine would not call. Subclass jaxvol.Field instead, and pass it as Volume(..., field=...)."
+                    f"{name} must be a jaxvol Volume itself; got its subclass {type(value).__name__}, whose "
+                    "methods the fast engine would not call. Subclass jaxvol.Field instead, and pass it as "
+                    "Volume(..., field=...)."
                 )
             continue
         elsewhere = [

@@ -21,11 +21,11 @@ from ._util.piecewise_linear import (
     interpolate_row,
     points_below,
     positive_between,
-    table_entry,
     table_row,
     upper_bound_between,
 )
 from ._util.vec3 import Scalar, Vec3
+from ._util.xla import gather
 from .occupancy import Blocks
 from .volume import Volume
 
@@ -196,9 +196,7 @@ class TransferFunction(Transfer):
 
         def search(measured: Measured) -> Measured:
             interval = jnp.clip(points_below(values, measured[0]) - 1, 0, last)
-            return interval, clip_below(
-                measured[0] - table_entry(values, interval), jnp.zeros_like(values[0])
-            )
+            return interval, clip_below(measured[0] - gather(values, interval), jnp.zeros_like(values[0]))
 
         return search
 

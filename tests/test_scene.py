@@ -17,7 +17,19 @@ LIGHT = ConstantLight()
 RAY = [0.0, 0.0, -5.0], [0.0, 0.0, 1.0]
 RAYS = [RAY[0]], [RAY[1]]
 
+
+class Denser(jv.Volume):
+    """Overrides what is fetched by other means."""
+
+    def value(self, coordinate):
+        return 2 * super().value(coordinate)
+
+
 BAD = {
+    "a volume of another class": (
+        lambda: jv.render(Denser(VOLUME.data), TRANSFER, CAMERA, MARCH),
+        r"volume must be a jaxvol Volume itself; got its subclass Denser, .*field=",
+    ),
     "camera and march swapped": (
         lambda: jv.render(VOLUME, TRANSFER, MARCH, CAMERA),
         r"camera must be a jaxvol Camera; got a March\. That is the march: "

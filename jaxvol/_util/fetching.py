@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Shaped, UInt32
 
 from .vec3 import Scalar, Vec3
+from .xla import gather
 
 
 Cube: TypeAlias = list[list[list[Scalar]]]
@@ -59,7 +60,7 @@ class Packed(Fetch):
         return [row(base), row(base + ny * nz)], fraction
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
-        word = self.words.at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        word = gather(self.words, flat)
         # XLA repeats a fetch for each use of its value, but not for uses of the converted value
         return word.astype(jnp.int32)
 
@@ -122,4 +123,4 @@ def split(
 
 def fetched(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
     """The entry at index `flat` of the flattened array."""
-    return array.reshape(-1).at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return gather(array.reshape(-1), flat)

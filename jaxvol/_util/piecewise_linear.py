@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .vec3 import Scalar, Vec3
+from .xla import gather
 
 
 FEW = 16
@@ -48,7 +49,7 @@ def points_below(
         guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
         reached = [
             value > at if strictly else value >= at
-            for at in (table_entry(values, guess), table_entry(values, guess + 1))
+            for at in (gather(values, guess), gather(values, guess + 1))
         ]
         return guess + sum(each.astype(jnp.int32) for each in reached)
 
@@ -58,17 +59,10 @@ def points_below(
     return jax.lax.cond(even, counted, searched, value)
 
 
-def table_entry(values: Float[Array, " n"], point: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
-    return values.at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
 def table_row(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
     """One row. Each entry is looked up by itself, so that batched entries are whole arrays from the start."""
     point = jnp.clip(point, 0, rows.shape[0] - 1)
-    return tuple(
-        rows[:, i].at[point].get(mode="promise_in_bounds", wrap_negative_indices=False)
-        for i in range(rows.shape[1])
-    )
+    return tuple(gather(rows[:, i], point) for i in range(rows.shape[1]))
 
 
 def interpolate_row(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._util.sharding import varying
+from .._util.xla import gather
 from ..beams import Box
 from ..march import EmptySpaceIndex, March
 from ..occupancy import Occupancy
@@ -91,9 +92,9 @@ def march_batch(
     known = jnp.minimum(rows, beams.groups - 1)
     beam = jnp.repeat(known // (beams.groups // beams.count), group)
 
-    def gather(leaf: Array) -> Array:
+    def take(leaf: Array) -> Array:
         # flat, so that the loop changes it in place: a reshape in there would copy it
-        taken = leaf.at[known].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        taken = gather(leaf, known)
         return taken.reshape(-1, *leaf.shape[2:])
 
     def grouped(part: Array) -> Array:
@@ -107,7 +108,7 @@ def march_batch(
 
     at, (kept, sums, total) = state
     given = None if visitor is None else visitor.given
-    rays, here, range_, given, mine = jax.tree.map(gather, (beams.rays, at, beams.range, given, kept))
+    rays, here, range_, given, mine = jax.tree.map(take, (beams.rays, at, beams.range, given, kept))
     here = with_fields(here, finished=here.finished | jnp.repeat(rows >= beams.groups, group))
     more = jax.tree.map(lambda leaf: jnp.zeros((size * group, *leaf.shape[2:]), leaf.dtype), sums)
     more = varying(more, rays)
@@ -134,7 +135,8 @@ def march_batch(
 
 
 def with_fields(at: Progress, **changes: Array) -> Progress:
-    """`at` with other values for these fields."""
+    """`at` with other values for these fields, of many rays (`dataclasses.replace` would check the shapes of
+    one)."""
     return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
 
 

@@ -13,7 +13,7 @@ from .._util.sharding import varying
 from ..lighting.shading import classification
 from ..reference import begin, end, has_fault, step
 from ..rendering import Outputs, Rendering
-from ..space import Ray, invalid
+from ..space import Ray, Space, invalid
 from .acceleration import Scene, VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
 from .packing import with_words
@@ -40,7 +40,8 @@ def march_image(
     tiles = RayTiles.of(source, tiling)
     volume = with_words(volume, acceleration.words)
     index = empty_space_of((volume, transfer, source, march, None), acceleration, tiling)
-    seen = classification(volume, transfer, march.locate(volume), lighting)
+    space = march.locate(volume)
+    seen = classification(volume, transfer, space, lighting)
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
         beams = Beams(rays, tiles.beams, tiles.box(source, rays, tile))
@@ -48,7 +49,7 @@ def march_image(
         at, (ranges, *_) = march_rays(march, volume, seen, index, beams, tiling, options.outputs, recorder)
         return vmap_rays(end)(rays, at), ranges
 
-    return _over_tiles(scene, tiles, marched)
+    return _over_tiles(scene, space, tiles, marched)
 
 
 def scan_image(
@@ -58,7 +59,8 @@ def scan_image(
     volume, transfer, source, march, lighting = scene
     tiles = RayTiles.of(source, options.tiling, direct=True)
     volume = with_words(volume, acceleration.words)
-    seen = classification(volume, transfer, march.locate(volume), lighting)
+    space = march.locate(volume)
+    seen = classification(volume, transfer, space, lighting)
 
     def scanned(_: Int[Array, ""], rays: Ray) -> Rendering:
         one = vmap_rays(lambda ray, at: step(march, ray, volume, seen, at))
@@ -66,15 +68,15 @@ def scan_image(
         at, _ = jax.lax.scan(lambda at, none: (one(rays, at), none), start, None, length=length)
         return vmap_rays(end)(rays, at)
 
-    return _over_tiles(scene, tiles, lambda tile, rays: (scanned(tile, rays), None))[0]
+    return _over_tiles(scene, space, tiles, lambda tile, rays: (scanned(tile, rays), None))[0]
 
 
 def _over_tiles(
-    scene: Scene, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
+    scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
 ) -> tuple[Rendering, Any]:
     """`one` of the rays of each tile in turn, with the renderings assembled to an image."""
     volume, transfer, source, march, lighting = scene
-    space, fault = march.locate(volume), has_fault(volume, transfer, march, lighting)
+    fault = has_fault(volume, transfer, march, lighting)
 
     def tile(number: Int[Array, ""]) -> tuple[Rendering, Any]:
         return one(number, invalid(tiles.rays(source, space, number), fault))

@@ -67,7 +67,7 @@ class RayTiles(eqx.Module):
             beams = min(most_beams, across * down)
             return _PixelTiles(-(-across * down // beams), beams, tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
-        needed = -(-math.prod(shape) // side**2)
+        needed = -(-math.prod(shape) // tiling.rays_per_beam)
         beams = max(min(most_beams, needed), 1)
         return _OwnRayTiles(-(-needed // beams), beams, tiling, shape)
 
@@ -96,43 +96,40 @@ class _PixelTiles(RayTiles):
     down: int = eqx.field(static=True)
 
     def rays(self, source: Camera, space: Space, tile: Int[Array, ""]) -> Ray:
-        group_y, group_x, y, x = jnp.unravel_index(
-            jnp.arange(self.tiling.beam * self.tiling.beam), (2, 2, self.tiling.side, self.tiling.side)
-        )
-        column, row = self._pixels(tile, group_y * self.tiling.side + y, group_x * self.tiling.side + x)
-        column, row = column.reshape(-1, self.tiling.group), row.reshape(-1, self.tiling.group)
+        side, group = self.tiling.side, self.tiling.group
+        order = jnp.arange(self.tiling.rays_per_beam)
+        group_y, group_x, y, x = jnp.unravel_index(order, (2, 2, side, side))
+        column, row = self._pixels(tile, group_y * side + y, group_x * side + x)
+        column, row = column.reshape(-1, group), row.reshape(-1, group)
         width, height = self.size
         return entering(space, *lines(source, column, row), (column < width) & (row < height))
 
     def box(self, source: Camera, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
-        column, row = self._pixels(tile, y * (self.tiling.beam - 1), x * (self.tiling.beam - 1))
+        last = self.tiling.beam - 1
+        column, row = self._pixels(tile, y * last, x * last)
         return lambda occupancy: Box.within(occupancy, *vmap_rays(source.ray)(column, row))
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of these places in each of a tile's beams."""
-        beam = (tile * self.beams + jnp.arange(self.beams))[:, None]
-        return (beam % self.across) * self.tiling.beam + x[None], (
-            beam // self.across
-        ) * self.tiling.beam + y[None]
+        beam, side = (tile * self.beams + jnp.arange(self.beams))[:, None], self.tiling.beam
+        return (beam % self.across) * side + x[None], (beam // self.across) * side + y[None]
 
     def assemble(self, leaf: Array) -> Array:
         rest, (width, height) = leaf.shape[3:], self.size
-        beams = leaf.reshape(-1, self.tiling.beam * self.tiling.beam, *rest)[: self.across * self.down]
-        image = beams.reshape(self.down, self.across, 2, 2, self.tiling.side, self.tiling.side, *rest)
+        side, beam = self.tiling.side, self.tiling.beam
+        beams = leaf.reshape(-1, self.tiling.rays_per_beam, *rest)[: self.across * self.down]
+        image = beams.reshape(self.down, self.across, 2, 2, side, side, *rest)
         image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
-        return image.reshape(self.down * self.tiling.beam, self.across * self.tiling.beam, *rest)[
-            :height, :width
-        ]
+        return image.reshape(self.down * beam, self.across * beam, *rest)[:height, :width]
 
     def apart(self, leaf: Array) -> Array:
         rest, (width, height) = leaf.shape[2:], self.size
-        more = (self.down * self.tiling.beam - height, self.across * self.tiling.beam - width)
+        side, beam = self.tiling.side, self.tiling.beam
+        more = (self.down * beam - height, self.across * beam - width)
         image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
-        image = image.reshape(self.down, 2, self.tiling.side, self.across, 2, self.tiling.side, *rest)
-        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(
-            -1, self.tiling.beam * self.tiling.beam, *rest
-        )
+        image = image.reshape(self.down, 2, side, self.across, 2, side, *rest)
+        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, self.tiling.rays_per_beam, *rest)
         missing = self.number * self.beams - self.across * self.down
         beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (1 + len(rest)))
         return beams.reshape(self.number, -1, self.tiling.group, *rest)
@@ -143,13 +140,15 @@ class _OwnRayTiles(RayTiles):
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
+    @property
+    def _rays_per_tile(self) -> int:
+        return self.beams * self.tiling.rays_per_beam
+
     def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
             source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
-        place = tile * self.beams * self.tiling.beam**2 + jnp.arange(
-            self.beams * self.tiling.beam**2
-        ).reshape(-1, self.tiling.group)
+        place = tile * self._rays_per_tile + jnp.arange(self._rays_per_tile).reshape(-1, self.tiling.group)
         known = jnp.minimum(place, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
@@ -165,11 +164,11 @@ class _OwnRayTiles(RayTiles):
 
     def apart(self, leaf: Array) -> Array:
         rest, count = leaf.shape[len(self.shape) :], math.prod(self.shape)
-        missing = self.number * self.beams * self.tiling.beam**2 - count
+        missing = self.number * self._rays_per_tile - count
         padded = jnp.pad(leaf.reshape(count, *rest), [(0, missing)] + [(0, 0)] * len(rest))
-        return padded.reshape(
-            self.number, self.beams * self.tiling.beam**2 // self.tiling.group, self.tiling.group, *rest
-        )
+        # not -1, which is no number where there are no rays
+        groups = self._rays_per_tile // self.tiling.group
+        return padded.reshape(self.number, groups, self.tiling.group, *rest)
 
 
 def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:

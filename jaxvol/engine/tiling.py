@@ -40,6 +40,11 @@ class Tiling(NamedTuple):
         """Pixels along the side of a beam, which is 2 x 2 groups."""
         return 2 * self.side
 
+    @property
+    def rays_per_beam(self) -> int:
+        """Number of rays of a beam."""
+        return self.beam**2
+
     @classmethod
     def of_backend(cls) -> "Tiling":
         """The sizes for JAX's default backend."""

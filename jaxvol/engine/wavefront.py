@@ -29,6 +29,7 @@ from ..transfer import Classification
 from ..volume import Volume
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
 from .segment import SampleVisitor, regular_from_here
+from .tiles import vmap_rays
 from .tiling import Tiling
 
 
@@ -45,7 +46,7 @@ def march_rays(
     """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
     outputs or nothing but opacity; and the visitor's `kept`, `sums` and `total`."""
     rays, limited = beams.rays, march.max_samples is not None
-    at = jax.vmap(jax.vmap(lambda ray: begin(march, ray, outputs)))(rays)
+    at = vmap_rays(lambda ray: begin(march, ray, outputs))(rays)
     finished, prepared = rays.length <= 0, None
     if index is not None:
         prepared = index.prepare(beams.box, tiling.cells * march.step)
@@ -58,7 +59,7 @@ def march_rays(
         alive = job.alive(at)
         job = job._replace(any_order=_mostly(alive & ~regular_from_here(at), of=alive))
     if beams.range is not None:
-        over = jax.vmap(jax.vmap(partial(over_transparent, march)))
+        over = vmap_rays(partial(over_transparent, march))
         # Rays that see nothing are finished first, and so stay where they are: their `first` is no index.
         at = over(rays, finished_after(beams.range, at), beams.range.first)
     visited = (None, None, None) if visitor is None else (visitor.kept, visitor.sums, visitor.total)
@@ -112,4 +113,4 @@ def _past_first_cell(march: March, volume: Volume, seen: Classification, ray: Ra
             moved = eqx.tree_at(lambda moved: moved.met.samples, moved, samples)
         return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
 
-    return jax.vmap(jax.vmap(one))(ray, at)
+    return vmap_rays(one)(ray, at)

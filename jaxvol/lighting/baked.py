@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from .._util.compaction import Chosen
 from .._util.memory import require_room
 from .._util.vec3 import Vec3
+from .._util.xla import gather
 from ..volume import Volume, split
 from .shading import Lighting, Sample, Shading, Surroundings, lit
 
@@ -78,7 +79,7 @@ class BakedShading(Shading):
                 weight = weight * (fraction if side else 1 - fraction)
             place = ((i + corner[0]) * ny + j + corner[1]) * nz + k + corner[2]
             # int32, since signed integers are converted to float in one instruction
-            word = self.light.words.at[place].get(mode="promise_in_bounds").astype(jnp.int32)
+            word = gather(self.light.words, place).astype(jnp.int32)
             r, g, b = (
                 total + weight * (word >> shift & LEVELS).astype(x.dtype)
                 for total, shift in zip((r, g, b), (0, 10, 20), strict=True)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
+from .._util.xla import gather
 from ..lighting.materials import Material
 from ..occupancy import BLOCK, Blocks
 from ..space import Affine
@@ -56,7 +57,7 @@ class Majorants(eqx.Module):
 
     def at(self, block: Block) -> Scalar:
         """Table entry of a block."""
-        return self.table.at[block].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return gather(self.table, block)
 
     def block(self, x: Array, y: Array, z: Array) -> Block:
         """The block with these indices along the axes."""

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from .._util.checks import integer
 from .._util.vec3 import Scalar, Vec3
+from .._util.xla import gather
 from ..beams import Box, Stretches, stretches
 from ..march import EmptySpaceIndex, Transform, View
 from ..occupancy import FARTHEST, Occupancy, Sums
@@ -148,15 +149,11 @@ class _Beams(EmptySpaceIndex):
         self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
         count, beams = prepared.following.shape
-        near = prepared.near.at[beam].get(mode="promise_in_bounds")
+        near = gather(prepared.near, beam)
         place = (rays.t_in + depth - near) / prepared.length
         stretch = jnp.clip(place.astype(jnp.int32), 0, count - 1)
         entry = stretch * beams + beam
-        following = (
-            prepared.following.reshape(-1)
-            .at[entry]
-            .get(mode="promise_in_bounds", wrap_negative_indices=False)
-        )
+        following = gather(prepared.following.reshape(-1), entry)
         begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in
         return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
@@ -206,11 +203,7 @@ class _Distances(EmptySpaceIndex):
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
         i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))
         flat = (i * ny + j) * nz + k
-        away = (
-            self.distance.at[flat]
-            .get(mode="promise_in_bounds", wrap_negative_indices=False)
-            .astype(depth.dtype)
-        )
+        away = gather(self.distance, flat).astype(depth.dtype)
         # all cells nearer than that are empty: advance to where the ray leaves their cube
         ahead = jnp.inf
         for p, r, corner in zip(point, rate, (x, y, z), strict=True):
