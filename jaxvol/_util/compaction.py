@@ -17,7 +17,7 @@ CHUNK = 2048
 class Chosen(NamedTuple):
     """Chosen entries of arrays (rows, columns), of which there may be several, stacked along the rows.
 
-    - `place`: indices of the chosen entries, counted row by row, in front of indices past the end.
+    - `place`: flat indices of the chosen entries, padded with indices past the end.
     - `number`: how many are chosen.
     - `columns`: of the arrays.
     - `chunk`: entries processed at a time.

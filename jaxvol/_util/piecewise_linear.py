@@ -1,7 +1,7 @@
 """Piecewise linear functions of one variable: tables, look-ups, and bounds over ranges.
 
 Transfer functions are such functions of a volume's value. A table has one row for each control point, with
-all that a value needs which lies at or beyond this point and before the next: see `TransferFunction.rows`.
+all that values from this point up to the next one need: see `TransferFunction.rows`.
 """
 
 from typing import TypeAlias

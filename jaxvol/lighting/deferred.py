@@ -1,7 +1,7 @@
 """Deferred lighting: each ray is shaded once, at the mean depth of what it sees.
 
 Light varies more slowly than what it falls on, and the samples that make up a surface lie close together. So
-they can share the light of one place, at a cost that many times lower.
+they can share the light of one place, at a fraction of the cost.
 """
 
 from typing import Any, ClassVar
