@@ -1,4 +1,4 @@
-"""Every test runs with shapes and types checked, and with JAX's silent conversions forbidden."""
+"""Configures all tests: shapes and types are checked, and JAX's implicit conversions are errors."""
 
 import os
 import shutil
@@ -10,39 +10,38 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-from . import typechecker  # noqa: F401  (the hook looks it up by name)
+from . import typechecker  # noqa: F401  (the hook imports it by name)
 
 
 with install_import_hook("jaxvol", "tests.typechecker.check"):
-    import jaxvol  # noqa: F401  (every module that it brings is checked from here on)
+    import jaxvol  # noqa: F401  (the hook instruments every module imported with it)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Properties take the same examples in each run, so that none fails by chance.
+# Hypothesis draws the same examples in every run, so that no test fails by chance.
 hypothesis.settings.register_profile("jaxvol", derandomize=True)
 hypothesis.settings.load_profile("jaxvol")
 
 PROGRAMS = pytest.StashKey[str]()
-"""The folder in which all processes of this session keep what they compile."""
+"""The compilation cache that all processes of this session share."""
 
 
 def pytest_configure(config):
-    """Compile each program once a session, whichever worker, kernel or subprocess asks for it first.
+    """Compile each program once per session, for all workers, kernels and subprocesses.
 
-    The folder is new every time and removed at the end, so that nothing old is tested."""
+    The cache folder is new in each session and removed at its end, so that no stale program is tested."""
     if hasattr(config, "workerinput"):
-        return  # a worker of pytest-xdist: the environment tells it
+        return  # a worker of pytest-xdist inherits the environment variables
     if config.option.markexpr == "not slow":
-        # The fast tests spend most of their time compiling. LLVM at its first level, without expensive
-        # passes, and XLA's older way to emit fused kernels halve that, for programs that are somewhat slower
-        # and compute the same numbers. The slow tests, and those that are chosen in another way, compile
-        # as users do.
-        less = (
+        # The fast tests spend most of their time compiling. Optimization level 1 of LLVM, without expensive
+        # passes, and XLA's older emitter of fused kernels halve that time. The programs are somewhat slower
+        # and compute the same numbers. The slow tests, and any other selection, compile as users do.
+        flags = (
             "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true "
             "--xla_cpu_use_fusion_emitters=false"
         )
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {less}"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
     folder = config.stash[PROGRAMS] = tempfile.mkdtemp(prefix="jaxvol-programs-")
     settings = {
         "jax_compilation_cache_dir": folder,
@@ -60,9 +59,9 @@ def pytest_unconfigure(config):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def room_for_programs():
-    """Forget programs before a worker holds 3 GB of them, and long before their memory maps are as many as
-    Linux gives a process (65 530), past which XLA crashes. What is asked for again lies in the folder."""
+def limit_programs_in_memory():
+    """Drop compiled programs before a worker holds 3 GB of them, and long before their memory maps reach
+    Linux's limit per process (65 530), where XLA crashes. Programs needed again are in the cache folder."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > 15_000:
@@ -71,15 +70,15 @@ def room_for_programs():
 
 @pytest.fixture
 def real_volume():
-    """Path of a real volume by file name; skips where the data are not there."""
+    """Path of a real volume by its file name; skips the test if the file is missing."""
 
     def path(name: str) -> Path:
         folder = os.environ.get("JAXVOL_DATA")
         if not folder:
-            pytest.skip("JAXVOL_DATA is not set: it names the folder of real volumes")
+            pytest.skip("JAXVOL_DATA, the folder of real volumes, is not set")
         file = Path(folder) / name
         if not file.is_file():
-            pytest.skip(f"{name} is not in the folder that JAXVOL_DATA names")
+            pytest.skip(f"{name} is not in the folder JAXVOL_DATA")
         return file
 
     return path

@@ -1,7 +1,7 @@
-"""An independent marcher: float64 NumPy, values by scipy, loops over samples in the open.
+"""An independent ray marcher: float64 NumPy, values interpolated by scipy, one explicit loop over samples.
 
-It shares no code with jaxvol, takes plain arrays, and is written from the definition: samples at
-t_in + i d while t < t_out, each standing for the cell behind it.
+It shares no code with jaxvol, takes plain arrays, and follows the definition: samples at t_in + i d while
+t < t_out, each representing the cell behind it.
 """
 
 import numpy as np
@@ -38,14 +38,14 @@ def march(
     front_residual=False,
     empty_jump=None,
 ):
-    """(n, 4) premultiplied colour and opacity, and (n,) numbers of samples.
+    """(n, 4) premultiplied colour and opacity, and the (n,) numbers of samples.
 
-    - `points`: (values, colors, extinction), each a NumPy array.
-    - `align`: the last cell ends at the exit.
-    - `opacity_left`: a ray ends with this transmittance.
-    - `start`: (n,) the first sample's offset, in steps; with `front_residual` what lies before it is a
-      cell of its own.
-    - `empty_jump`: (n,) after the first transparent sample the next one follows at this part of a step.
+    - `points`: control points (values, colors, extinction), each a NumPy array.
+    - `align`: cut the last cell at the exit.
+    - `opacity_left`: end a ray once its transmittance is this low.
+    - `start`: (n,) offsets of the first samples, in steps. With `front_residual`, the part before the first
+      sample is a cell of its own.
+    - `empty_jump`: (n,) distance from the first transparent sample to the next one, in steps.
     """
     data, spacing, origin = (np.asarray(a, np.float64) for a in (data, spacing, origin))
     origins, directions = (np.asarray(a, np.float64).reshape(-1, 3) for a in (origins, directions))

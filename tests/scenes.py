@@ -1,4 +1,4 @@
-"""Small scenes that share shapes, so that one compiled program serves them all, in every file of tests."""
+"""Small scenes of the same shapes, so that all test files share their compiled programs."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ import jaxvol as jv
 RESOLUTION = 24
 SIZE = (20, 16)
 
-# eight control points each, on the values of the phantoms scaled to [0, 1]
+# eight control points, for phantoms scaled to [0, 1]
 SOFT = [
     (0.0, (0.1, 0.2, 0.9), 0.0),
     (0.1, (0.2, 0.3, 0.8), 0.0),
@@ -30,7 +30,7 @@ SOFT = [
 
 
 def soft_transfer(unit_distance: float = 0.5) -> jv.TransferFunction:
-    """Clear below 0.1, denser above."""
+    """Transparent below 0.1, denser above."""
     return jv.TransferFunction.from_points(SOFT, unit_distance)
 
 
@@ -47,13 +47,13 @@ def scaled_phantom(name: str, resolution: int = RESOLUTION) -> jv.Volume:
 
 
 def anisotropic_noise(seed: int = 0) -> jv.Volume:
-    """Independent values at every node, on a grid with three different spacings away from the origin."""
+    """Random values at the nodes of a grid with three different spacings, away from the origin."""
     data = np.random.default_rng(seed).random((RESOLUTION,) * 3, dtype=np.float32)
     return jv.Volume(data, spacing=(0.05, 0.08, 0.11), origin=(0.3, -1.2, 0.4))
 
 
 def counting() -> type[jv.TransferFunction]:
-    """A new class of transfer functions, which counts in `traces` the programs that classify by it."""
+    """A new class of transfer functions whose `traces` counts the programs traced with it."""
 
     class Counting(jv.TransferFunction):
         traces: ClassVar[int] = 0
@@ -66,25 +66,25 @@ def counting() -> type[jv.TransferFunction]:
 
 
 VOLUMES: dict[str, Callable[[], jv.Volume]] = {
-    "head": lambda: scaled_phantom("sphere"),
+    "sphere": lambda: scaled_phantom("sphere"),
     "cut_block": lambda: scaled_phantom("cut_block"),
     "noise": anisotropic_noise,
 }
 
 
 def around(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
-    """A camera that sees all of the volume from a direction without symmetry."""
+    """A camera that sees the whole volume, from an asymmetric direction."""
     return jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=size)
 
 
 def inside(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
-    """A camera in the volume."""
+    """A camera inside the volume."""
     low, high = volume.corners
     return jv.Camera(low + 0.4 * (high - low), high, (0, 0, 1), 70.0, size=size)
 
 
 def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
-    """A parallel view along +z, from outside."""
+    """An orthographic camera outside the volume, looking along +z."""
     low, high = volume.corners
     position = volume.center - jnp.asarray([0.0, 0.0, 1.0]) * (high - low)[2]
     return jv.Camera(position, volume.center, (0, 1, 0), size=size, parallel_scale=0.55 * (high - low)[1])
@@ -103,7 +103,7 @@ LEAVES: dict[str, Callable] = {
     "window": lambda s: s[2].window,
     "step": lambda s: s[3].step,
 }
-"""What a scene (volume, transfer function, camera, march) is differentiated with respect to."""
+"""Differentiable leaves of a scene (volume, transfer function, camera, march)."""
 
 CAMERAS = {"around": around, "inside": inside, "orthographic": orthographic}
 
@@ -119,23 +119,23 @@ TRANSFORMS: dict[str, tuple[jv.Transform, ...]] = {
     for count in range(len(KINDS) + 1)
     for names in combinations(KINDS, count)
 }
-"""Every set of transforms."""
+"""Every subset of `KINDS`."""
 
 TRANSFORMS["front residual, aligned"] = (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())
 
 FEW = ["plain", "aligned", "empty-space jittered, aligned, terminated", "front residual, aligned"]
-"""Names of a few sets that each transform is in."""
+"""Names of a few sets that together contain every transform."""
 
 
 @contextmanager
 def in_float64() -> Iterator[None]:
-    """JAX with 64-bit types; make what is to be float64 inside, or cast it by `doubled`."""
+    """Enable 64-bit types in JAX. Create float64 arrays inside the context, or cast with `to_float64`."""
     with jax.enable_x64(True):
         yield
 
 
-def doubled(tree):
-    """The same numbers in float64. Voxels keep their type."""
+def to_float64(tree):
+    """A copy with float64 leaves; voxels keep their type."""
 
     def double(leaf):
         if eqx.is_inexact_array(leaf) and leaf.ndim < 3:

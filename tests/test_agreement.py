@@ -1,4 +1,4 @@
-"""One truth: render, the reference engine and an independent float64 marcher give the same image."""
+"""Do `render`, the reference engine and an independent float64 marcher give the same image?"""
 
 import equinox as eqx
 import jax
@@ -9,14 +9,14 @@ import pytest
 import jaxvol as jv
 
 from . import oracle
-from .scenes import CAMERAS, FEW, TRANSFORMS, VOLUMES, doubled, in_float64, soft_transfer
+from .scenes import CAMERAS, FEW, TRANSFORMS, VOLUMES, in_float64, soft_transfer, to_float64
 
 
 STEP = 0.07
 
 
 def oracle_image(volume, transfer, camera, march):
-    """The independent marcher's rgba and samples, for the rays that the camera gave."""
+    """Image and numbers of samples by the independent marcher, for the camera's rays."""
     origins, directions = camera.rays()
     kinds = {type(t): t for t in march.transforms}
     ending, jitter, jump = (kinds.get(t) for t in (jv.EarlyTermination, jv.Jitter, jv.EmptySpaceJitter))
@@ -31,25 +31,25 @@ def oracle_image(volume, transfer, camera, march):
         midpoint=march.quadrature == "midpoint",
         align=jv.AlphaCorrection in kinds,
         opacity_left=None if ending is None else float(ending.opacity_left),
-        start=0.0 if jitter is None else random_parts(jitter, camera),
+        start=0.0 if jitter is None else random_numbers(jitter, camera),
         front_residual=jitter is not None and jitter.front_residual,
-        empty_jump=None if jump is None else random_parts(jump, camera),
+        empty_jump=None if jump is None else random_numbers(jump, camera),
     )
     shape = origins.shape[:-1]
     return rgba.reshape(*shape, 4), samples.reshape(shape)
 
 
-def random_parts(transform, camera):
-    """The random number of every pixel, row by row."""
+def random_numbers(transform, camera):
+    """The transform's random number for every pixel, row by row."""
     width, height = camera.size
     row, column = (jnp.asarray(index.reshape(-1), jnp.int32) for index in np.mgrid[:height, :width])
-    parts = jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32))(column, row)
-    return np.asarray(parts, np.float64)
+    numbers = jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32))(column, row)
+    return np.asarray(numbers, np.float64)
 
 
 def compare(rendering, rgba, samples, *, tolerance, left=0.0):
-    """Within the tolerance where as many samples were taken. Where rounding moved the sample at which a
-    ray leaves or ends, by no more than one, the images may differ by what that one sample adds."""
+    """Assert agreement within the tolerance in pixels with equal numbers of samples. Where rounding changes
+    the number, by at most one, the images may differ by `left`, the contribution of that sample."""
     off = np.abs(np.asarray(rendering.rgba) - rgba).max(axis=-1)
     moved = np.asarray(rendering.samples) != samples
     assert np.abs(np.asarray(rendering.samples) - samples).max() <= 1
@@ -60,7 +60,7 @@ def compare(rendering, rgba, samples, *, tolerance, left=0.0):
 
 @eqx.filter_jit
 def reference_image(volume, transfer, camera, march):
-    """Every pixel by the reference engine, one ray each."""
+    """Render every pixel with the reference engine."""
 
     def one(column, row):
         origin, direction = (jnp.stack(part) for part in camera.ray(column, row))
@@ -75,7 +75,7 @@ FAST = {
     *((name, "left") for name in ("plain", "aligned", "jittered")),
     *((name, "midpoint") for name in FEW[2:]),
 }
-"""All transforms meet in these; the slow run parts them."""
+"""Cases of the fast run, which cover every transform; the slow run adds the others."""
 
 CASES = [
     pytest.param(*case, marks=[] if case in FAST else pytest.mark.slow)
@@ -84,11 +84,11 @@ CASES = [
 
 
 @pytest.mark.parametrize(("transforms", "quadrature"), CASES)
-def test_the_renderer_is_the_independent_marcher(transforms, quadrature):
+def test_render_agrees_with_the_independent_marcher(transforms, quadrature):
     march = jv.March(STEP, TRANSFORMS[transforms], quadrature)
     left = 0.05 if "terminated" in transforms else 0.0
     transfer = soft_transfer()
-    # parallel rays are another program, for which two sets must do
+    # parallel rays need programs of their own: two sets are enough for them
     views = [view for name, view in CAMERAS.items() if name != "orthographic" or transforms in FEW[1:3]]
     for volume in (make() for make in VOLUMES.values()):
         for view in views:
@@ -101,7 +101,7 @@ ONE = [name if name == FEW[2] else pytest.param(name, marks=pytest.mark.slow) fo
 
 
 @pytest.mark.parametrize("transforms", ONE)
-def test_the_renderer_is_the_reference(transforms):
+def test_render_agrees_with_the_reference(transforms):
     march = jv.March(STEP, TRANSFORMS[transforms], "midpoint")
     counted = jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80)
     left = 0.05 if "terminated" in transforms else 0.0
@@ -117,13 +117,13 @@ def test_the_renderer_is_the_reference(transforms):
 
 
 @pytest.mark.parametrize("transforms", ONE)
-def test_reference_in_float64_is_the_independent_marcher_to_rounding(transforms):
+def test_float64_reference_agrees_with_the_independent_marcher_to_rounding(transforms):
     with in_float64():
-        march = doubled(jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80))
-        transfer = doubled(soft_transfer())
+        march = to_float64(jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80))
+        transfer = to_float64(soft_transfer())
         for make in VOLUMES.values():
-            volume = doubled(make())
-            camera = doubled(CAMERAS["around"](volume))
+            volume = to_float64(make())
+            camera = to_float64(CAMERAS["around"](volume))
             reference = reference_image(volume, transfer, camera, march)
             assert reference.rgba.dtype == jnp.float64
             rgba, samples = oracle_image(volume, transfer, camera, march)
@@ -158,5 +158,5 @@ def test_real_volumes_agree_with_the_independent_marcher(real_volume, file, spac
     march = jv.March(0.8, (jv.AlphaCorrection(),), "left")
     rendering = jv.render(volume, transfer, camera, march)
     assert float(rendering.rgba[..., 3].max()) > 0.5
-    # 300 voxels from the entry float32 resolves 3e-5 of a voxel, and values differ by thousands between two
+    # 300 voxels behind the entry, float32 resolves 3e-5 voxels, and neighbouring voxels differ by thousands
     compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=3e-5)

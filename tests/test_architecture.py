@@ -1,4 +1,4 @@
-"""Does the house stand as its listing says? Imports go one way, and a class is abstract or final."""
+"""Do imports go one way only, and is every class abstract or final?"""
 
 import ast
 import importlib
@@ -46,11 +46,11 @@ ORDER = [
     "__main__",
     "__init__",
 ]
-"""The picture, from what is rendered to who asks for it. A file imports what stands before it alone."""
+"""Order of imports, from the volume to the command line: a file imports only entries before its own."""
 
 DO_NOTHING = {Transform, RayPath, Light}
-"""Bases without an abstract method: each of their methods has an answer that changes nothing, or they have
-none and tell what counts as one. None of them is used by itself."""
+"""Base classes without abstract methods: the default of each method changes nothing, or there are no methods
+and the class only marks its subclasses. None of them is instantiated itself."""
 
 
 def files():
@@ -58,12 +58,12 @@ def files():
 
 
 def place(file: Path) -> str:
-    """The entry of the listing that a file belongs to."""
+    """The entry of `ORDER` that a file belongs to."""
     return file.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
 def imported(file: Path) -> set[Path]:
-    """The files of the library that a file imports."""
+    """The library's files that a file imports."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.level:
@@ -77,7 +77,7 @@ def imported(file: Path) -> set[Path]:
     return found - {file}
 
 
-def test_the_listing_is_that_of_the_picture():
+def test_every_file_has_a_place_in_the_order():
     assert {place(file) for file in files()} == set(ORDER)
 
 
@@ -90,12 +90,12 @@ def test_no_file_imports_what_comes_later(file):
         assert there < here or place(other) not in ("__init__",), other
 
 
-def test_no_folder_imports_itself_in_a_circle():
-    ahead = {file: imported(file) for file in files()}
-    while ahead:
-        free = [file for file, others in ahead.items() if not others & ahead.keys()]
-        assert free, sorted(str(file.relative_to(ROOT)) for file in ahead)
-        ahead = {file: others for file, others in ahead.items() if file not in free}
+def test_there_are_no_circular_imports():
+    remaining = {file: imported(file) for file in files()}
+    while remaining:
+        free = [file for file, others in remaining.items() if not others & remaining.keys()]
+        assert free, sorted(str(file.relative_to(ROOT)) for file in remaining)
+        remaining = {file: others for file, others in remaining.items() if file not in free}
 
 
 def classes():
@@ -112,4 +112,4 @@ def test_a_class_is_abstract_or_final():
         for base in kind.__bases__:
             if base.__module__.startswith("jaxvol") and base not in DO_NOTHING:
                 abstract = inspect.isabstract(base) or bool(getattr(base, "__abstractvars__", ()))
-                assert abstract, f"{kind.__name__} has the base {base.__name__}, which is not abstract"
+                assert abstract, f"{kind.__name__} inherits from {base.__name__}, which is not abstract"

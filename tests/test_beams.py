@@ -1,5 +1,5 @@
-"""Is the box around a beam a bound? Every ray between those of the corners lies in it, at every distance; and
-no stretch of it is called empty in which a ray meets anything."""
+"""Do a beam's boxes bound its rays at every distance? Is a stretch called empty only if no ray meets anything
+in it?"""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxvol.occupancy import Occupancy
 VOLUME = jv.Volume(np.zeros((33, 41, 29), np.uint8), (0.1, 0.07, 0.12), (-1.0, 0.3, 2.0))
 SIDE = 32
 ROUNDING = 1e-4
-"""Of the rays here, which are made in float32, in blocks."""
+"""Bound on the rounding of the rays in these tests, which are computed in float32; in blocks."""
 
 
 WAYS = [(1, 0, 0), (0, -1, 0), (0, 0, 1), (-1, -1, -1), (-0.6, 0.2, 0.1)]
@@ -24,7 +24,7 @@ BLOCKS = tuple(-(-(n - 1) // 4) for n in VOLUME.shape)
 
 
 def beams(way, parallel=None):
-    """From several distances: a camera's rays, and the four in the corners."""
+    """For cameras at several distances: all rays, and the four corner rays."""
     center, diagonal = np.asarray(VOLUME.center), float(np.linalg.norm(np.subtract(*VOLUME.corners)))
     for away in (0.1, 1, 20):
         position = center - away * diagonal * np.asarray(way) / np.linalg.norm(way)
@@ -38,7 +38,7 @@ def beams(way, parallel=None):
 
 
 def blocks_at(rays, distance):
-    """Where rays are, counted in blocks."""
+    """Positions along the rays, in blocks."""
     origins, directions = rays
     return (origins + distance * directions - np.asarray(VOLUME.origin)) / np.asarray(jnp.stack(SIZES))
 
@@ -57,7 +57,7 @@ def test_a_box_holds_every_ray_of_its_beam(way, parallel):
 
 
 @pytest.mark.parametrize("way", WAYS, ids=str)
-def test_no_stretch_in_which_a_ray_meets_anything_is_empty(way):
+def test_stretches_called_empty_contain_nothing_along_any_ray(way):
     met = 0
     for seed, (rays, corners) in enumerate(beams(way)):
         occupied = np.random.default_rng(seed).random(BLOCKS) < 0.01

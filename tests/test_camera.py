@@ -1,4 +1,4 @@
-"""Which ray belongs to which pixel."""
+"""Which ray does a camera give to which pixel?"""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_zoom_magnifies_around_a_point():
     camera = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=(40, 20))
     _, whole = camera.rays()
     _, zoomed = camera.zoom(4).rays()
-    # the middle quarter, at four times the pixels: four of them make one
+    # the middle quarter at four times the resolution: average blocks of 4 x 4 pixels
     coarse = unit_each(zoomed.reshape(5, 4, 10, 4, 3).sum((1, 3)))
     np.testing.assert_allclose(coarse[2, 5], unit(whole[9:11, 20:21].sum((0, 1))), atol=2e-2)
     _, corner = camera.zoom(2, center=(0.25, 0.25)).rays()
@@ -148,8 +148,8 @@ def test_rays_are_differentiable_in_the_camera():
 
 @pytest.mark.parametrize("parallel_scale", [None, 2.1])
 def test_rays_round_alike_whether_or_not_they_are_differentiated(parallel_scale):
-    """Or image, replay and forward mode would each sample places of their own, 1e-4 of a voxel apart."""
-    # of numbers that leave something to be rounded
+    """Otherwise image, replay and forward mode would sample different positions, 1e-4 voxels apart."""
+    # numbers that are not exact in float32
     place = (5.1, -6.2, 4.3), (0.53, 1.07, 0.9), (0.1, 0.2, 1.0)
     camera = jv.Camera(*place, 33.3, size=(64, 64), parallel_scale=parallel_scale)
     volume = jv.Volume(np.ones((9, 9, 9), np.float32), (0.31, 0.37, 0.29))

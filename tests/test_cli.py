@@ -1,4 +1,4 @@
-"""The command line, run as a user would."""
+"""The command line, run as users run it."""
 
 import json
 import re
@@ -25,7 +25,7 @@ def volume_file(tmp_path):
 
 
 def scene_of(volume_file):
-    """As the command renders it, and of its shapes: one program serves all images of this file."""
+    """The scene that the command renders. All images of this file share its shapes, and so one program."""
     view = jv.Camera((40, -30, 20), (11.5,) * 3, (0, 0, 1), size=(16, 16)).zoom(1.5)
     march = jv.March(0.4, (jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
     return jv.load(volume_file), jv.preset("engine"), view, march
@@ -33,14 +33,14 @@ def scene_of(volume_file):
 
 def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path), "--size", "40", "30", "--resolution", "24"]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for name in ("head.png", "before.png", "after.png"):
         image = imread(tmp_path / name)
         assert image.shape == (30, 40, 3)
         assert image.std() > 5
-        assert str(tmp_path / name) in told
-    assert "compilation" in told
-    assert "cpu" in told.lower() or "gpu" in told.lower()
+        assert str(tmp_path / name) in printed
+    assert "compilation" in printed
+    assert "cpu" in printed.lower() or "gpu" in printed.lower()
 
 
 def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
@@ -138,8 +138,8 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
         shown,
     ]:
         assert render_file(tmp_path / "v.npy", *words, "-o", tmp_path / "x.png") == 0
-        told = capsys.readouterr().out
-        assert re.search(message, told) if message else "nothing" not in told, told
+        printed = capsys.readouterr().out
+        assert re.search(message, printed) if message else "nothing" not in printed, printed
 
 
 STARTED = """
@@ -147,12 +147,12 @@ import signal
 import sys
 import jaxvol.cli
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, whoever runs the tests
+signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
 render = jaxvol.cli.render
-def told(*scene):
+def announced(*scene):
     print("under way", flush=True)
     return render(*scene)
-jaxvol.cli.render = told
+jaxvol.cli.render = announced
 sys.exit(jaxvol.cli.main(sys.argv[1:]))
 """
 
@@ -176,10 +176,10 @@ def test_ctrl_c_ends_a_command_at_once_with_one_line(volume_file, tmp_path):
     time.sleep(0.3)
     run.send_signal(signal.SIGINT)
     begun = time.monotonic()
-    told = run.communicate(timeout=60)[1]
+    printed = run.communicate(timeout=60)[1]
     assert time.monotonic() - begun < 2
     assert run.returncode == 130
-    assert told == "\njaxvol render: interrupted\n"
+    assert printed == "\njaxvol render: interrupted\n"
     assert not (tmp_path / "x.png").exists()
 
 
@@ -193,14 +193,14 @@ def test_a_fit_that_is_interrupted_goes_on_from_its_checkpoint(volume_file, seen
         time.sleep(0.1)
     run.send_signal(signal.SIGINT)
     begun = time.monotonic()
-    told = run.communicate(timeout=60)[1]
+    printed = run.communicate(timeout=60)[1]
     assert time.monotonic() - begun < 2
     assert run.returncode == 130
-    assert told.splitlines()[-1] == f"jaxvol fit: interrupted; the same command resumes from {kept}"
+    assert printed.splitlines()[-1] == f"jaxvol fit: interrupted; the same command resumes from {kept}"
     assert not (tmp_path / "t.json").exists()
     steps = len(json.loads(kept.read_bytes().splitlines()[1])["losses"])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what the pictures do not determine
+        warnings.simplefilter("ignore")  # some parameters are not determined by the images
         assert main([*words, "--max-steps", str(steps), "-o", str(tmp_path / "t.json")]) == 0
     assert jv.read_transfer(tmp_path / "t.json").values.shape == (8,)
 
@@ -240,18 +240,18 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys
     arguments, message = BAD[case]
     arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
     output = tmp_path / "x.png"
-    monkeypatch.setattr("jaxvol.cli.render", None)  # not reached
+    monkeypatch.setattr("jaxvol.cli.render", None)  # fails if it is called
     assert main(["render", "-o", str(output), *arguments]) == 2
-    told = capsys.readouterr()
-    assert told.err.count("\n") == 1
-    assert told.err.startswith("jaxvol render: error: ")
-    assert message in told.err
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1
+    assert printed.err.startswith("jaxvol render: error: ")
+    assert message in printed.err
     assert not output.exists()
 
 
 @pytest.fixture
 def seen(volume_file, tmp_path):
-    """Two pictures of the engine, and their cameras, in files."""
+    """Files of two images of the engine, and a file of their cameras."""
     volume, pictures, cameras = jv.load(volume_file), [], []
     march = scene_of(volume_file)[-1]
     for number, position in enumerate([(40, -30, 20), (-30, 5, 45)]):
@@ -270,8 +270,8 @@ def test_fit_finds_a_transfer_function_that_makes_the_pictures(volume_file, seen
     command = ["fit", str(volume_file), "--images", *seen, *cameras, "-o", str(output)]
     with pytest.warns(UserWarning, match="not determined"):
         assert main([*command, "--max-steps", "20"]) == 0
-    told = capsys.readouterr().out
-    assert float(told.partition("RMSE ")[2].split()[0]) < 0.01
+    printed = capsys.readouterr().out
+    assert float(printed.partition("RMSE ")[2].split()[0]) < 0.01
     transfer = jv.read_transfer(output)
     assert transfer.values.shape == (8,)
     assert float(transfer.extinction.max()) > 0
@@ -298,12 +298,12 @@ def test_errors_of_fit_are_one_line_and_exit_code_2(case, volume_file, seen, tmp
     options = {"--images": ["0.png", "1.png"], "--cameras": ["cameras.json"], **changed}
     words = [w for name, values in options.items() for w in (name, *values)]
     words = ["cameras.json" if w == "CAMERAS" else w for w in words]
-    monkeypatch.setattr("jaxvol.fitting.driver._Run", None)  # no work is begun
+    monkeypatch.setattr("jaxvol.fitting.driver._Run", None)  # fails if the fit begins
     assert main(["fit", str(volume_file), *words, "-o", "x.json"]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("jaxvol fit: error: ")
-    assert told.count("\n") == 1
-    assert message in told
+    printed = capsys.readouterr().err
+    assert printed.startswith("jaxvol fit: error: ")
+    assert printed.count("\n") == 1
+    assert message in printed
     assert not (tmp_path / "x.json").exists()
 
 
@@ -340,7 +340,7 @@ def test_a_transfer_function_is_read_as_it_was_written(tmp_path):
         np.testing.assert_array_equal(getattr(again, name), getattr(transfer, name))
 
 
-def test_a_slip_in_the_options_is_told_by_usage(capsys):
+def test_invalid_options_print_the_usage(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["render", "x.raw", "--size", "many", "few"])
     assert stop.value.code == 2
@@ -348,16 +348,16 @@ def test_a_slip_in_the_options_is_told_by_usage(capsys):
 
 
 def test_help_names_commands_presets_and_examples():
-    told = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, "-m", "jaxvol", "--help"], capture_output=True, text=True, check=True
     ).stdout
     for word in ("demo", "render", "fit", "examples:"):
-        assert word in told
-    told = subprocess.run(
+        assert word in printed
+    printed = subprocess.run(
         [sys.executable, "-m", "jaxvol", "render", "--help"], capture_output=True, text=True, check=True
     ).stdout
     for word in ("--preset", "ct_skin_bone", "--camera", "--step", "--view-angle"):
-        assert word in told
+        assert word in printed
 
 
 def test_as_a_program_a_fault_leaves_no_traceback(tmp_path):

@@ -1,4 +1,4 @@
-"""From linear light to a picture file, and over a background."""
+"""Conversion from linear light to image files, and compositing over a background."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ import jaxvol as jv
 def test_srgb_and_back():
     ramp = np.linspace(0, 1, 1001)
     np.testing.assert_allclose(jv.from_srgb(jv.to_srgb(ramp)), ramp, atol=1e-6)
-    # the standard's own numbers: mid grey, and where its straight part ends
+    # values from the standard: mid grey, and the end of the linear segment
     np.testing.assert_allclose(
         jv.to_srgb(jnp.array([0.0, 0.0031308, 0.21404, 1.0])), [0, 0.04045, 0.5, 1], atol=1e-5
     )

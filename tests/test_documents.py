@@ -1,4 +1,4 @@
-"""The code in the documents, and in the library's docstrings, runs, and what it computes is finite."""
+"""Do the examples in documents and docstrings run, and are their results finite?"""
 
 import ast
 import inspect
@@ -17,21 +17,21 @@ BLOCK = re.compile(r"^( *)```python\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
 
 def examples(text):
-    """The Python in a text: of its blocks, and of its lines at a prompt."""
+    """Python code in a text: its ```python blocks, and its lines at a >>> prompt."""
     blocks = [textwrap.dedent(block) for _, block in BLOCK.findall(text)]
     prompts = re.findall(r"^ *(?:>>>|\.\.\.) ?(.*)$", text, re.MULTILINE)
     return [*blocks, *(["\n".join(prompts)] if prompts else [])]
 
 
 def docstrings(module):
-    """Of a file of the library: of the module, its classes, and their functions."""
+    """Docstrings of a module, its classes and its functions."""
     kinds = ast.Module, ast.ClassDef, ast.FunctionDef
     nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
     return [ast.get_docstring(node) or "" for node in nodes if isinstance(node, kinds)]
 
 
 def documents():
-    """Every document with examples: name, and the examples, which share their names as its readers do."""
+    """Name and examples of every document that has some. A document's examples share one namespace."""
     for name in ("README.md", "CONTRIBUTING.md"):
         yield name, examples((ROOT / name).read_text(encoding="utf-8"))
     for module in sorted((ROOT / "jaxvol").rglob("*.py")):
@@ -43,7 +43,7 @@ def documents():
 DOCUMENTS = dict(documents())
 FITS = "jv.fit("
 
-# A fit takes minutes. What stands before it in its document runs in the fast tests.
+# A fit takes minutes. The fast tests run the examples before it.
 CASES = [
     *(pytest.param(name, False, id=name) for name in DOCUMENTS),
     *(
@@ -55,7 +55,7 @@ CASES = [
 
 
 def assert_tells_something(value, what):
-    """Every float is finite, and not all are 0."""
+    """Every float is finite, and some are not 0."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(value) if hasattr(leaf, "dtype")]
     floats = [leaf for leaf in leaves if np.issubdtype(leaf.dtype, np.inexact)]
     assert floats, what
@@ -73,7 +73,6 @@ def test_python_in_the_documents_runs(document, fits, tmp_path, monkeypatch):
         exec(block, names)
     assert float(names["rendering"].rgba.max()) > 0.1
     assert_tells_something(names["rendering"].rgba, "rendering")
-    # what a document differentiates
     if "jax.grad" in "".join(blocks):
         gradient = names["gradient"]
         assert_tells_something(gradient.colors, "gradient.colors")

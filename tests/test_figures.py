@@ -1,4 +1,4 @@
-"""The scripts of experiments/ and paper_figs/ run, tiny, and write what they say."""
+"""Do the scripts of experiments/ and paper_figs/ run, at tiny sizes, and write the promised files?"""
 
 import importlib
 import json
@@ -25,18 +25,18 @@ from paper_figs import chae_fig5, common, kisti_table, lee_tables, table1
 
 ROOT = Path(__file__).parent.parent
 FIGURES = sorted(path.stem for path in (ROOT / "paper_figs").glob("*fig*.py") if path.stem != "chae_fig5")
-"""Figures that are drawn without recorded results."""
+"""Figures that need no recorded results."""
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
-"""Those whose records are kept."""
+"""Experiments with stored records."""
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A folder into which all experiments have written."""
+    """A folder with the results of all experiments."""
     folder = tmp_path_factory.mktemp("results")
     for name in EXPERIMENTS:
         importlib.import_module(f"experiments.{name}").main(["--quick", "--output", str(folder)])
-        jax.clear_caches()  # of all their programs together a process would die
+        jax.clear_caches()  # a process cannot hold all their programs
     return folder
 
 
@@ -51,12 +51,12 @@ def test_figure_is_drawn(name, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [f"{name}.png"]
 
 
-def test_every_figure_that_is_told_of_is_there():
-    told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
+def test_every_figure_in_the_readme_exists():
+    text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     lee = ["lee_fig1", "lee_fig4", "lee_fig6", "lee_fig_steps"]
     assert ["chae_fig6", "fig01", "fig09", "fig10", "fig11", "fig12", "fig13", *lee] == FIGURES
     for name in FIGURES:
-        assert f"output/{name}.png" in told
+        assert f"output/{name}.png" in text
         assert (common.OUTPUT / f"{name}.png").stat().st_size < 300_000
 
 
@@ -114,7 +114,7 @@ def test_skipping_leaves_the_error_of_an_image_as_it_is(measured):
 
 
 @pytest.mark.slow
-def test_speed_tells_which_peers_there_are_and_an_error_beside_each_time(measured):
+def test_speed_records_its_peers_and_an_error_with_each_time(measured):
     result = record.read(measured / "speed.json")["result"]
     assert set(result["peers"]) == {speed.VTK, speed.DRJIT}
     for rows in result["volumes"][PHANTOM].values():
@@ -124,7 +124,7 @@ def test_speed_tells_which_peers_there_are_and_an_error_beside_each_time(measure
 
 
 @pytest.mark.slow
-def test_light_costs_time_and_more_of_it_is_nearer_to_many_templates(measured):
+def test_lighting_error_falls_with_more_photons_and_with_blending(measured):
     result = record.read(measured / "lighting.json")["result"]
     few, whole = result["frames"][lighting.PHOTONS]
     (blended,) = result["frames"][lighting.BLENDED]
@@ -144,7 +144,7 @@ def test_fits_recover_what_was_hidden(measured):
                 > max(rows[points]["psnr at the start"])
             )
             assert rows[points]["steps"] <= fit_transfer.STEPS
-    # on a volume and an image as coarse as these, not every start leads back
+    # on such a coarse volume and image, not every start converges to the true pose
     reached = record.read(measured / "fit_pose.json")["result"]["reached"]
     assert reached["from coarse to fine"] >= max(0.5, reached["as they are"])
 
@@ -153,7 +153,7 @@ def test_fits_recover_what_was_hidden(measured):
 def test_a_gradient_misses_jumps_at_the_exit_alone(measured):
     rows = record.read(measured / "gradient_errors.json")["result"]["relative errors"]["left"]
     plain, aligned = rows["ray casting"], rows["ray casting" + gradient_errors.CUT]
-    assert plain["position"][0] < 1e-6  # a short difference meets no jump
+    assert plain["position"][0] < 1e-6  # a short difference crosses no jump
     assert aligned["position"][-1] < 0.05 < 0.5 < plain["position"][-1]
     assert plain["colours"][-1] < 1e-6
 
@@ -175,30 +175,30 @@ def test_chae_and_shin_s_figure_5_is_drawn_from_the_record(measured, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_report_s_table_is_told_from_the_record(measured, tmp_path):
+def test_the_report_s_table_is_written_from_the_record(measured, tmp_path):
     kisti_table.main(["--results", str(measured), "--output", str(tmp_path)])
-    told = (tmp_path / "kisti_table.md").read_text(encoding="utf-8")
-    assert "| *report: ERT + ESS* | 2.60 / 3.48 | 3.14 / 4.55 | 2.38 / 3.22 | 2.78 / 4.08 |" in told
+    text = (tmp_path / "kisti_table.md").read_text(encoding="utf-8")
+    assert "| *report: ERT + ESS* | 2.60 / 3.48 | 3.14 / 4.55 | 2.38 / 3.22 | 2.78 / 4.08 |" in text
 
 
 @pytest.mark.slow
-def test_table_1_is_told_from_the_record(measured, tmp_path):
+def test_table_1_is_written_from_the_record(measured, tmp_path):
     table1.main(["--results", str(measured), "--output", str(tmp_path)])
-    told = (tmp_path / "table1.md").read_text(encoding="utf-8")
-    assert PHANTOM in told
-    assert "| *paper: vessels* | 1024² | 1.192 s | 1.003 | 1.006 | 1.020 |" in told
+    text = (tmp_path / "table1.md").read_text(encoding="utf-8")
+    assert PHANTOM in text
+    assert "| *paper: vessels* | 1024² | 1.192 s | 1.003 | 1.006 | 1.020 |" in text
 
 
 def test_the_tables_in_the_readme_are_those_of_the_kept_records():
-    told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
-    assert table1.table(record.read(record.RESULTS / "overhead.json")) in told
-    assert kisti_table.table(record.read(record.RESULTS / "kisti.json")) in told
+    text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
+    assert table1.table(record.read(record.RESULTS / "overhead.json")) in text
+    assert kisti_table.table(record.read(record.RESULTS / "kisti.json")) in text
 
 
 @pytest.mark.slow
 def test_the_templates_in_the_readme_are_those_that_grow():
-    told = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
-    assert lee_tables.table() in told
+    text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
+    assert lee_tables.table() in text
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

@@ -1,4 +1,4 @@
-"""What holds for every combination of transforms: energy, exactness, order, gradients."""
+"""Properties that hold for every combination of transforms: energy, exactness, order, gradients."""
 
 import itertools
 
@@ -21,28 +21,28 @@ from .scenes import (
     TRANSFORMS,
     VOLUMES,
     around,
-    doubled,
     in_float64,
     scaled_phantom,
     soft_transfer,
+    to_float64,
     uniform_transfer,
 )
 
 
 def whitened(transfer):
-    """All colours white, so that a colour channel is the sum of the weights."""
+    """The same extinction with all colours white, so that each colour channel is the sum of the weights."""
     return jv.TransferFunction(transfer.values, np.ones((8, 3)), transfer.extinction)
 
 
 @pytest.mark.parametrize(
     ("transforms", "quadrature"),
     [
-        # the program of `test_agreement`
+        # shares its program with `test_agreement`
         pytest.param(*case, marks=[] if case == (FEW[2], "midpoint") else pytest.mark.slow)
         for case in itertools.product(FEW, ("left", "midpoint"))
     ],
 )
-def test_weights_and_what_is_left_sum_to_one(transforms, quadrature):
+def test_weights_and_transmittance_sum_to_one(transforms, quadrature):
     march = jv.March(0.07, TRANSFORMS[transforms], quadrature)
     for make in VOLUMES.values():
         volume = make()
@@ -66,8 +66,8 @@ def test_a_constant_volume_is_exact_at_any_step_under_alpha_correction(step, ext
     color = (0.25, 0.5, 1.0)
     rgba = jv.render(volume, uniform_transfer(extinction, color), camera, march).rgba
     exact = -np.expm1(-extinction * lengths_inside(volume, camera))
-    # beside it, what the last bits of the length make of it, since the renderer is another program; and the
-    # rounding of a sum of so many samples
+    # 1e-6, the effect of the length's last bits (the renderer is another program and rounds differently), and
+    # the rounding of a sum over the samples
     samples = lengths_inside(volume, camera) / step
     tolerance = 1e-6 + extinction * (1 - exact) * 8e-7 + 2.0**-24 * np.sqrt(samples)
     error = np.abs(rgba - exact[..., None] * np.array([*color, 1.0])).max(axis=-1)
@@ -76,7 +76,7 @@ def test_a_constant_volume_is_exact_at_any_step_under_alpha_correction(step, ext
 
 @eqx.filter_jit
 def rounded_lengths(volume, camera):
-    """Length of each ray inside the volume, as float32 has it; `test_space` checks it."""
+    """Length of each ray inside the volume, computed in float32; `test_space` checks it."""
     space = Affine(volume)
     enter_all = jax.vmap(
         jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (jnp.int32(0), jnp.int32(0))).length)
@@ -91,8 +91,8 @@ def lengths_inside(volume, camera):
 @pytest.mark.parametrize("quadrature", ["left", "midpoint"])
 def test_a_constant_volume_is_exact_to_rounding_in_float64(quadrature):
     with in_float64():
-        volume = doubled(scaled_phantom("constant"))
-        camera = doubled(around(volume))
+        volume = to_float64(scaled_phantom("constant"))
+        camera = to_float64(around(volume))
         for step in (0.013, 0.4, 5.0):
             march = jv.March(step, (jv.AlphaCorrection(),), quadrature)
             opacity = jv.render(volume, uniform_transfer(3.0), camera, march).rgba[..., 3]
@@ -102,13 +102,13 @@ def test_a_constant_volume_is_exact_to_rounding_in_float64(quadrature):
 
 
 def true_interval(camera):
-    """Entry and exit of every pixel's ray into [-1, 1]³, by the independent clip."""
+    """Entry and exit distances of every pixel's ray into [-1, 1]³, by the independent marcher's clipping."""
     origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
     return oracle.box_interval(origins, directions, [-1] * 3, [1] * 3)
 
 
 def gaussian_opacity(camera, extinction):
-    """Opacity of the Gaussian blob exp(-r²/(2 w²)), w = 0.3, by its closed line integral."""
+    """Opacity of the Gaussian blob exp(-r²/(2 w²)), w = 0.3, from its line integral in closed form."""
     width = 0.3
     origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
     t_in, t_out = true_interval(camera)
@@ -120,7 +120,7 @@ def gaussian_opacity(camera, extinction):
 
 
 class Gaussian(jv.Field):
-    """The blob itself in place of its voxels, so that the step is the only approximation."""
+    """The Gaussian evaluated exactly instead of from voxels, so that the step is the only approximation."""
 
     def value(self, volume, coordinate):
         x, y, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
@@ -132,7 +132,7 @@ def test_the_error_falls_with_the_order_claimed_for_image_and_gradient(quadratur
     steps = np.array([0.16, 0.08, 0.04, 0.02])
     with in_float64():
         volume = jv.Volume(np.zeros((24, 24, 24), np.float32), [2 / 23] * 3, [-1.0] * 3, field=Gaussian())
-        # aside of the middle, so that the entry face cuts the blob and the first order shows
+        # off centre, so that the entry face cuts the blob and the first-order error shows
         camera = jv.Camera((0.2, -0.35, 0.1), (0.0, 1.0, 0.0), (0, 0, 1), 60.0, size=(12, 10))
         exact = gaussian_opacity(camera, 2.0).reshape(10, 12)
 
@@ -161,7 +161,7 @@ def test_the_error_falls_with_the_order_claimed_for_image_and_gradient(quadratur
 
 @pytest.mark.parametrize("extinction", [0.0, 1e-6, 1.0, 1e6])
 def test_values_and_gradients_are_finite_at_the_extremes(extinction):
-    """By `"direct"`; `test_gradients` has the others."""
+    """With `adjoint="direct"`; `test_gradients` covers the others."""
     volume = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)
     origins = jnp.asarray(
         [[-1, 1, 1], [-1, 5, 1], [1, 1, 1], [-1, 0, 0], [-1, -1, -1], [1, 1, 9]], jnp.float32
@@ -192,7 +192,8 @@ def test_values_and_gradients_are_finite_at_the_extremes(extinction):
 
 @pytest.mark.slow
 def test_alpha_correction_makes_the_image_continuous_in_the_camera():
-    """Without it the image jumps when a sample crosses the exit: a derivative misses what differences see."""
+    """Without it the image jumps when a sample crosses the exit, which finite differences see and derivatives
+    do not."""
     volume = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)
     directions = [[1.0, 0.0, 0.0]]
 
@@ -208,7 +209,7 @@ def test_alpha_correction_makes_the_image_continuous_in_the_camera():
             x = jnp.float32(x)
             return map(float, jax.jvp(opacity, (x,), (jnp.ones_like(x),)))
 
-        # the camera stands in the volume: moving on shortens the ray
+        # the camera is inside the volume: moving it forward shortens the ray
         (_, derivative), (near, _), (far, _) = map(value_and_slope, (0.25, 0.55, 0.1))
         return derivative, (near - far) / 0.45
 

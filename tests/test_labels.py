@@ -1,4 +1,4 @@
-"""Structures with transfer functions of their own, and cells cut where one meets another."""
+"""Transfer functions per label, and cells cut at the boundaries between labels."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ def plain(color, extinction):
 
 
 def layers(*widths):
-    """A block whose label counts up along x; `widths` in nodes."""
+    """A block of layers labelled 0, 1, … along x; `widths` in nodes."""
     labels = np.repeat(np.arange(len(widths)), widths).astype(np.uint8)[:, None, None] * np.ones(
         (1, 3, 3), np.uint8
     )
@@ -24,7 +24,7 @@ RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 LEFT = np.exp(-0.35)
 RED_THEN_BLUE = LEFT * np.array([1 / LEFT - 1, 0, 1 - np.exp(-0.8), 1 / LEFT - np.exp(-0.8)])
-"""Of 3.5 of a red extinction of 0.1, behind which lie 4 of a blue one of 0.2."""
+"""Colour and opacity of a red layer (length 3.5, extinction 0.1) in front of a blue one (4, 0.2)."""
 
 
 def along_x(volume, transfer, march, y=1.0):
@@ -34,7 +34,7 @@ def along_x(volume, transfer, march, y=1.0):
 def test_each_label_has_its_own_function_and_others_are_not_seen():
     volume = layers(4, 4, 4, 4)  # label 3 has no function
     transfer = jv.LabelTransferFunction([plain(RED, 0.1), None, plain(BLUE, 0.2)])
-    # nodes 0..15; faces half-way, at 3.5, 7.5 and 11.5
+    # nodes 0..15; label boundaries half-way between nodes, at 3.5, 7.5 and 11.5
     fine = jv.March(0.01, (jv.AlphaCorrection(labels=True),))
     np.testing.assert_allclose(along_x(volume, transfer, fine).rgba[0], RED_THEN_BLUE, atol=1e-5)
 
@@ -44,7 +44,7 @@ def test_functions_may_be_named_by_label_and_differ_in_points():
     three = jv.TransferFunction([0.0, 50.0, 255.0], [BLUE] * 3, [0.0, 0.2, 0.2])
     fine = jv.March(0.01, (jv.AlphaCorrection(labels=True),))
     named = jv.LabelTransferFunction({np.uint8(2): three, 0: plain(RED, 0.1)})
-    # also beyond the points of each
+    # also beyond the end points
     for value in (100, 300):
         data = jv.Volume(np.full(volume.shape, value, np.uint16), labels=volume.labels)
         np.testing.assert_allclose(along_x(data, named, fine).rgba[0], RED_THEN_BLUE, atol=1e-5)
@@ -59,7 +59,7 @@ def test_cells_are_cut_at_labels_and_exact_at_any_step(step, quadrature, jittere
     transforms = (jv.Jitter(0, front_residual=True),) if jittered else ()
     march = jv.March(step, (*transforms, jv.AlphaCorrection(labels=True)), quadrature)
     rgba = along_x(volume, transfer, march).rgba[0]
-    depths = np.array([3.5 * 0.1, 5 * 0.3, 5.5 * 0.2])  # faces at 3.5 and 8.5, exit at 14
+    depths = np.array([3.5 * 0.1, 5 * 0.3, 5.5 * 0.2])  # boundaries at 3.5 and 8.5, exit at 14
     before = np.exp(-np.concatenate([[0], np.cumsum(depths)[:-1]]))
     np.testing.assert_allclose(rgba[:3], before * (1 - np.exp(-depths)), atol=2e-5)
 
@@ -80,7 +80,7 @@ def test_without_cutting_the_face_lies_where_the_samples_happen_to_be():
 
 
 def label_runs(volume, camera, steps=1500):
-    """The shortest stretch of one label along each pixel's ray, world length, by dense look-up."""
+    """World length of the shortest run of one label along each pixel's ray, by dense sampling."""
     origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
     low, high = (np.asarray(corner, np.float64) for corner in volume.corners)
     middle = np.linalg.norm(np.asarray(camera.position) - (low + high) / 2)
@@ -112,13 +112,13 @@ def test_faces_of_a_frog_stay_smooth_under_jitter():
         return np.abs(np.asarray(rendering.rgba - exact.rgba)).max(axis=-1)
 
     jittered, cut = error(jv.AlphaCorrection()), error(jv.AlphaCorrection(labels=True))
-    # pixels whose rays cross faces, and none so obliquely that a label lasts less than what is documented
+    # pixels whose rays cross label boundaries, without runs shorter than the documented limit
     runs = label_runs(frog, camera)
     boundary = np.isfinite(runs) & (runs > step / 2)
     assert boundary.sum() > 200
     rms = [np.sqrt(np.mean(e[boundary] ** 2)) for e in (jittered, cut)]
     assert rms[1] < rms[0] / 10
-    # grazing rays and corners of voxels included, it still falls
+    # even including grazing rays and voxel corners, the error falls
     assert cut.mean() < jittered.mean() / 3
 
 

@@ -1,4 +1,4 @@
-"""The seams: what a march asks its transforms, and how transforms of one's own join in."""
+"""The methods that a march calls on its transforms, and custom transforms."""
 
 import jax
 import jax.numpy as jnp
@@ -13,26 +13,26 @@ from .scenes import around, scaled_phantom, soft_transfer, uniform_transfer
 
 
 class Shift(jv.Transform):
-    """Starts half a step in."""
+    """Puts the first sample half a step in."""
 
     def start(self, steps, ray):
         return steps + 0.5
 
 
 class Late(jv.Transform):
-    """Moves what lies behind empty space forth by part of a step."""
+    """Shifts the samples behind empty space by a fraction of a step."""
 
     by: jax.Array
 
     def __init__(self, by):
-        self.by = jnp.asarray(by, jnp.float32)  # an array, so that one program serves all
+        self.by = jnp.asarray(by, jnp.float32)  # an array, so that all values share one program
 
     def shift(self, ray):
         return jnp.broadcast_to(self.by, ray.length.shape)
 
 
 class Halves(jv.Transform):
-    """Samples each half of a cell on its own."""
+    """Splits each cell into halves, sampled separately."""
 
     def cut(self, cell, ray, volume):
         half = cell.width / 2
@@ -40,7 +40,7 @@ class Halves(jv.Transform):
 
 
 class Moved(jv.Transform):
-    """The volume, moved in the world."""
+    """Places the volume elsewhere in the world."""
 
     def locate(self, space, volume):
         return Affine(jv.Volume(volume.data, volume.spacing, volume.origin + 10.0))
@@ -157,9 +157,9 @@ BAD = {
     **{
         f"max_samples={bad!r}": (
             lambda bad=bad: jv.March(0.1, max_samples=bad),
-            rf"max_samples must be an integer from 1 to 16777216; got {told}\.",
+            rf"max_samples must be an integer from 1 to 16777216; got {shown}\.",
         )
-        for bad, told in [
+        for bad, shown in [
             (0, "0"),
             (2**31, "2147483648"),
             (2.5, "2.5"),

@@ -1,4 +1,4 @@
-"""Measures of images whose answer is known."""
+"""Image metrics, on images for which their values are known."""
 
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ def noise(seed, shape=(H, W)):
 
 
 def chirp(rate=0.0012):
-    """Rings around a corner, as on a sphere: the frequency grows with the radius, here to 0.45."""
+    """Rings around a corner, as on a sphere: the frequency grows with the radius, up to 0.45."""
     return np.cos(2 * np.pi * rate / 2 * ((X + 50) ** 2 + (Y + 50) ** 2))
 
 
@@ -103,11 +103,11 @@ def test_white_noise_adds_to_a_comb_what_the_docstring_says():
 
 
 def test_harmonics_fold_at_nyquist_and_are_never_counted_twice():
-    # 3 · 0.21 = 0.63 folds to -0.37, and is met there
+    # 3 · 0.21 = 0.63 aliases to -0.37, where it is measured
     assert wood_grain_energy(wave(0.63, 0), (0.21, 0.0)) == pytest.approx(0.5, rel=2e-3)
-    # 3 · 1/3 folds to 0, and 2 · 1/3 to -1/3, the fundamental's own mirror: one wave is left
+    # 3 · 1/3 aliases to 0, and 2 · 1/3 to -1/3, the fundamental's mirror image: one wave is left
     assert wood_grain_energy(wave(1 / 3, 0), (1 / 3, 0.0)) == pytest.approx(0.5, rel=2e-3)
-    # 2 · 1/4 is its own mirror
+    # 2 · 1/4 is its own mirror image
     assert wood_grain_energy(wave(0.5, 0), (0.25, 0.0)) < 1e-6
     for lost in ((0.0, 0.0), (0.5, 0.0), (1.0, -0.5), (0.005, 0.0)):
         with pytest.raises(ValueError, match="frequency must be two bins"):
@@ -130,7 +130,7 @@ def test_a_wave_is_all_structure(frequency, phase):
 @pytest.mark.parametrize("seed", range(8))
 def test_white_noise_is_no_structure(seed):
     assert abs(wood_grain_energy(noise(seed))) < 0.02
-    # uniform noise, of another strength in every part of the image, and none in most of it
+    # two-valued noise whose strength varies over the image and is 0 in most of it
     uneven = (noise(seed) > 0) * (np.hypot(X - 80, Y - 60) < 50) * X / W
     assert abs(wood_grain_energy(uneven - uneven.mean())) < 0.05 * np.var(uneven)
 
@@ -142,7 +142,7 @@ def test_noise_has_no_structure_in_the_mean():
 
 @pytest.mark.parametrize("amplitude", [0.5, 1.0, 2.0])
 def test_a_wave_and_noise_add_up(amplitude):
-    """Up to what the docstring says that noise takes away."""
+    """Up to the loss through noise that the docstring states."""
     image = wave(0.1371, 0.031, amplitude=amplitude)
     known = amplitude**2 / 2
     for seed in range(4):
@@ -157,7 +157,7 @@ def test_rings_that_bend_and_narrow_are_structure():
 
 
 def test_rings_half_broken_keep_the_part_that_is_left():
-    """What a jitter of half a step would leave: it can tell 1/2 from 1/10."""
+    """As a jitter of half a step would leave them: the metric distinguishes 1/2 from 1/10."""
     phase = np.random.default_rng(0).uniform(-0.25, 0.25, (H, W))
     image = np.cos(2 * np.pi * (0.1371 * X + 0.031 * Y + phase))
     assert wood_grain_energy(image) == pytest.approx(0.5 * np.sinc(0.5) ** 2, rel=0.15)
@@ -220,7 +220,7 @@ def test_boundary_noise_needs_a_region():
         boundary_noise(X, (X % 3) > 0)
 
 
-# -- slow noise ---------------------------------------------------------------------------------------
+# -- low-frequency noise ------------------------------------------------------------------------------
 
 
 def test_low_frequency_energy_divides_waves_and_noise_at_its_limit():
@@ -231,7 +231,7 @@ def test_low_frequency_energy_divides_waves_and_noise_at_its_limit():
     assert np.mean(measured) == pytest.approx(np.pi / 256, rel=0.1)
 
 
-# -- what is refused ----------------------------------------------------------------------------------
+# -- invalid arguments ----------------------------------------------------------------------------------
 
 
 def test_bad_images_are_named():

@@ -1,4 +1,4 @@
-"""The notebooks run from the first cell to the last."""
+"""Do the notebooks run from the first cell to the last?"""
 
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 @pytest.fixture
 def this_python(tmp_path, monkeypatch):
-    """A kernel that is the interpreter of the tests, whatever kernels are installed."""
+    """Use the tests' interpreter as the kernel, whatever kernels are installed."""
     from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
 
     argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
@@ -36,7 +36,7 @@ def test_notebook_runs(path, this_python, tmp_path):
     notebook = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
-    ).execute()  # raises what a cell raises, with the cell
+    ).execute()  # raises a failing cell's error, with its source
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert all(output.output_type != "error" for output in outputs)
     assert any("image/png" in output.get("data", {}) for output in outputs)

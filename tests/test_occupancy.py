@@ -1,4 +1,4 @@
-"""Is what is called empty empty? Ranges of blocks, what a transfer function shows, boxes, distances."""
+"""Are blocks called empty really empty? Ranges of blocks, visibility, box queries, distances."""
 
 import gc
 import weakref
@@ -20,7 +20,7 @@ SHAPES = [(24, 20, 28), (5, 9, 13), (2, 2, 2), (6, 3, 18)]
 
 
 def blocks_of_ranges(low, high):
-    """One block for each range."""
+    """One block per range."""
     low, high = (jnp.asarray(side, jnp.float32).reshape(-1, 1, 1) for side in (low, high))
     return Blocks(low, high, None)
 
@@ -44,7 +44,7 @@ def test_blocks_hold_every_value_between_their_nodes(dtype, shape):
     assert blocks.low.shape == tuple(-(-(n - 1) // BLOCK) for n in shape)
     assert blocks.labels is None
     points = rng.random((20_000, 3)) * (np.array(shape) - 1)
-    points[:5000] = np.round(points[:5000])  # nodes, which belong to all blocks around them
+    points[:5000] = np.round(points[:5000])  # nodes, which belong to all adjacent blocks
     values = map_coordinates(data.astype(np.float64), points.T, order=1)
     for toward in (1e-9, -1e-9):
         block = np.clip(np.floor(points / BLOCK + toward).astype(int), 0, np.array(blocks.low.shape) - 1)
@@ -69,14 +69,14 @@ def test_blocks_know_their_labels():
         may = np.asarray(blocks.may_hold(label))
         for block in np.ndindex(shape):
             part = labels[tuple(slice(i * BLOCK, i * BLOCK + BLOCK + 1) for i in block)]
-            assert may[block] == np.any(part % 32 == label % 32)  # no label missed, few taken for another
+            assert may[block] == np.any(part % 32 == label % 32)  # labels equal mod 32 share a bit
 
 
 def test_without_labels_any_may_be_there():
     assert np.all(Blocks.of(jv.Volume(np.zeros((6, 6, 6), np.uint8))).may_hold(3))
 
 
-# ---- what a transfer function shows ----
+# ---- visibility under a transfer function ----
 
 
 def drawn_table(rng, points):
@@ -96,7 +96,7 @@ def extinction_at(transfer, value):
 
 
 def drawn_ranges(rng, values, count=200):
-    """Narrow and wide, some from point to point, some beyond all points."""
+    """Narrow and wide ranges, some between control points, some beyond the ends."""
     low, width = rng.uniform(values[0] - 20, values[-1] + 20, count), rng.exponential(20, count)
     high = low + width * (rng.random(count) < 0.8)
     at_points = rng.integers(0, len(values), (2, count))
@@ -121,7 +121,7 @@ def test_what_is_called_invisible_has_no_extinction(points):
         assert not np.any(extinction.max(axis=0)[~shown] > 0)
         assert np.all(extinction.max(axis=0) <= bound)
         np.testing.assert_array_equal(bound > 0, shown)
-        # and, away from the points, no more than that is called visible
+        # and, for ranges that do not end at a control point, nothing else is called visible
         x, y = np.asarray(transfer.values), np.asarray(transfer.extinction)
         clear = ~(np.isin(low, x) | np.isin(high, x))
         inner = (x > low[:, None]) & (x < high[:, None])
@@ -132,7 +132,7 @@ def test_what_is_called_invisible_has_no_extinction(points):
     check()
 
 
-def test_ranges_next_to_what_is_seen_are_told_from_it():
+def test_ranges_that_only_touch_visible_values_are_invisible():
     values, extinction = jnp.asarray([0.0, 1, 2, 3, 4, 5]), jnp.asarray([0.0, 0, 0, 1, 0, 0])
     cases = [
         ((-5, 0), False),
@@ -156,11 +156,11 @@ def test_extinction_is_exactly_that_of_the_end_beyond_it_and_never_negative(poin
         rng = np.random.default_rng(seed)
         drawn = drawn_table(rng, points)
         x, y = np.asarray(drawn.values), np.array(drawn.extinction)
-        y[rng.integers(2) - 1] = 0  # an end that is not seen must be transparent exactly
+        y[rng.integers(2) - 1] = 0  # an invisible end must be exactly transparent
         transfer = jv.TransferFunction(x, np.ones((points, 3)), y)
         ends = np.array([x[0] - 9, x[0], x[-1], x[-1] + 9])
-        told = extinction_at(transfer, jnp.asarray(ends))
-        np.testing.assert_allclose(told, y[[0, 0, -1, -1]], rtol=1e-6, atol=0)
+        extinction = extinction_at(transfer, jnp.asarray(ends))
+        np.testing.assert_allclose(extinction, y[[0, 0, -1, -1]], rtol=1e-6, atol=0)
         near = np.concatenate([x, np.nextafter(x, np.float32(-np.inf)), np.nextafter(x, np.float32(np.inf))])
         assert float(extinction_at(transfer, jnp.asarray(near)).min()) >= 0
 
@@ -191,7 +191,7 @@ def test_hidden_labels_are_not_seen():
 
 
 @pytest.mark.parametrize("density", [0.0, 0.003, 0.1, 1.0])
-def test_any_box_is_answered_as_by_looking(density):
+def test_box_queries_agree_with_direct_inspection(density):
     rng = np.random.default_rng(3)
     occupied = rng.random((7, 5, 11)) < density
     ends = np.sort(rng.integers(0, occupied.shape, (2, 500, 3)), axis=0)
@@ -221,21 +221,21 @@ def test_distances_are_those_of_a_chessboard(count):
 
 
 def test_distances_end_at_255_and_nothing_is_that_far_from_everything():
-    """255 proves that nothing is anywhere; what is seen from farther away may just be told to be nearer."""
+    """255 proves that nothing is occupied anywhere; distances of 250 and more may be reported as smaller."""
     line = np.zeros((300, 1, 2), bool)
     np.testing.assert_array_equal(distances(line), 255)
     line[0] = True
-    told = distances(line).reshape(300, 2)[:, 0]
-    np.testing.assert_array_equal(told[:250], np.arange(250))
-    assert np.all(told[250:] <= np.arange(250, 300))
-    assert np.all(told[250:] >= 250)
+    distance = distances(line).reshape(300, 2)[:, 0]
+    np.testing.assert_array_equal(distance[:250], np.arange(250))
+    assert np.all(distance[250:] <= np.arange(250, 300))
+    assert np.all(distance[250:] >= 250)
     np.testing.assert_array_equal(distances(np.ones((3, 4, 5), bool)), 0)
 
 
-# ---- memory ----
+# ---- memoization ----
 
 
-def test_what_was_computed_goes_with_its_array():
+def test_memoized_results_are_freed_with_their_array():
     calls = []
 
     def double(array):
@@ -265,7 +265,7 @@ def test_blocks_are_made_once_for_an_array_and_go_with_it():
     assert alive() is None
 
 
-def test_a_numpy_array_may_change_and_nothing_is_kept_of_it():
+def test_nothing_is_memoized_for_mutable_numpy_arrays():
     array = np.zeros(3)
     assert float(kept(array, lambda a: a.sum())) == 0
     array[:] = 1

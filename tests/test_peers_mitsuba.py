@@ -1,7 +1,7 @@
-"""Does a program that shares no line with ours see the same light? Mitsuba's `volpath`, on the head phantom.
+"""Does an independent path tracer compute the same light? Mitsuba's `volpath`, on the head phantom.
 
-The medium is the same to the last bit but rounding: Mitsuba's grids of extinction and albedo are trilinear
-between our nodes, and ours are linear in the trilinear value.
+The media are equal up to rounding: Mitsuba interpolates grids of extinction and albedo trilinearly between
+our nodes, and our extinction and albedo are linear in the trilinear value.
 """
 
 from typing import Any
@@ -18,26 +18,26 @@ mi: Any = pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip i
 
 SIZE = 24
 DENSE = 12.0
-"""Extinction of the greatest value, 1/length; the head is 1.7 lengths high."""
+"""Extinction at the largest value, 1/length; the head is 1.7 lengths high."""
 DARK, BRIGHT = np.array([0.95, 0.6, 0.4]), np.array([0.7, 0.9, 0.99])
-"""Albedo of values 0 and 255."""
+"""Albedo at the values 0 and 255."""
 POSITION, VIEW_UP, ANGLE = (1.5, -3.0, 1.2), (0.3, 0.1, 1.0), 34.0
 SUN, IRRADIANCE, SKY = (-0.3, 1.0, -0.6), (6.0, 8.0, 10.0), (0.3, 0.2, 0.1)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():
-    """The fast variant where there is an LLVM, else the one that is always there."""
+    """Use the LLVM variant if LLVM is available, else the scalar one, which always is."""
     import drjit as dr
 
     mi.set_variant("llvm_ad_rgb" if dr.has_backend(dr.JitBackend.LLVM) else "scalar_rgb")
 
 
 def by_mitsuba(volume: jv.Volume, anisotropy: float, samples: int, seed: int) -> np.ndarray:
-    """Its image of samples at any place of a pixel, with the sky behind."""
+    """Mitsuba's image, with samples at random positions in each pixel and the sky as background."""
     place = mi.ScalarTransform4f
     low, high = (corner.tolist() for corner in volume.corners)
-    # its texels are the middles of cells, ours are nodes: its grid reaches half a cell farther
+    # its voxels are cell centres, ours are nodes: its grid extends half a cell farther
     half = np.asarray(volume.spacing, float) / 2
     start, end = np.asarray(low) - half, np.asarray(high) + half
     to_grid = place().translate(start.tolist()).scale((end - start).tolist())
@@ -96,7 +96,7 @@ def test_the_head_is_lit_as_by_mitsuba(anisotropy):
     lights = DirectionalLight(SUN, IRRADIANCE), ConstantLight(SKY)
     how: Any = {"paths": 256, "anisotropy": anisotropy, "antialias": True}
     ours = jv.path_trace(volume, transfer, camera, lights, **how)
-    # its standard error from images of several seeds
+    # Mitsuba's standard error, estimated from images of several seeds
     theirs = np.stack([by_mitsuba(volume, anisotropy, samples=64, seed=seed) for seed in range(8)])
 
     def regions(image: Any) -> np.ndarray:
@@ -105,7 +105,7 @@ def test_the_head_is_lit_as_by_mitsuba(anisotropy):
     mine = regions(ours.image(jnp.asarray(SKY)))
     variance = regions(jnp.square(ours.image_error(jnp.asarray(SKY)))) / (SIZE // 6) ** 2
     each = np.stack([regions(image) for image in theirs])
-    # of 8 images alone a variance would be too rough: that of all regions together, by brightness
+    # a variance from 8 images is too noisy: bound it below by ours, scaled by the median ratio of all regions
     of_8 = each.var(axis=0, ddof=1) / 8
     pooled = np.maximum(of_8, variance * np.median(of_8[variance > 0] / variance[variance > 0]))
     z = (mine - each.mean(axis=0)) / np.sqrt(np.maximum(variance + pooled, 1e-12))

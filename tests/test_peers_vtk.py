@@ -1,10 +1,10 @@
-"""Does a program that shares no line with ours draw the same picture? VTK's fixed-point ray caster.
+"""Does an independent renderer draw the same image? VTK's fixed-point ray caster.
 
-Both interpolate linearly, classify after it, shade nothing, and step by half a voxel with the left
-rule. What is left between them is VTK's arithmetic: it rounds an interpolated 8-bit value to a whole
-number, computes with 15 bits, stops a ray at 255/32767 of transmittance, writes 8 bits, and counts its
-steps from the near plane where ours are counted from the entry. Together that is about 1/255 on average,
-and with the rounding of values, the stop and the near plane imitated less than 0.5/255.
+Both interpolate linearly, classify after interpolation, do not shade, and step by half a voxel with the left
+rule. The remaining difference is VTK's arithmetic: it rounds an interpolated 8-bit value to an integer,
+computes with 15 bits, stops a ray at a transmittance of 255/32767, writes 8 bits, and counts steps from the
+near plane, where ours are counted from the entry. Together this is about 1/255 on average, and less than
+0.5/255 once the rounding of values, the stop and the near plane are imitated.
 """
 
 import functools
@@ -18,16 +18,16 @@ import jaxvol as jv
 from experiments import peer_vtk
 
 
-BACKGROUND = (0.2, 0.4, 0.6)  # 51, 102 and 153 of 255: exact, and no two channels alike
+BACKGROUND = (0.2, 0.4, 0.6)  # 51, 102 and 153 of 255: exact, and different in each channel
 AGREED = 2 / 255
 STEP = 0.5  # voxels
 
 
 @pytest.fixture(scope="module", autouse=True)
 def vtk():
-    """These tests run where VTK is installed and can draw without a screen."""
-    if lacking := peer_vtk.missing():
-        pytest.skip(lacking)
+    """Skip unless VTK is installed and can render off screen."""
+    if reason := peer_vtk.missing():
+        pytest.skip(reason)
 
 
 class Scene(NamedTuple):
@@ -72,7 +72,7 @@ def engine(real_volume: Callable) -> Scene:
 
 
 def bonsai(real_volume: Callable) -> Scene:
-    """Looking past the faces of the volume that cut it: VTK skips rays along their edges."""
+    """A view past the faces at which the volume is cut off: VTK skips rays along their edges."""
     volume = jv.load(real_volume("bonsai_256x256x256_uint8.raw.gz"))
     camera = jv.Camera((835, 385, 553), (128, 173, 128), (0, 1, 0), 16, size=(256, 256))
     return Scene(volume, jv.preset("bonsai"), camera)
@@ -87,7 +87,7 @@ SCENES: dict[str, Callable[[Callable], Scene]] = {
 
 
 def drawn_by_vtk(scene: Scene) -> tuple[np.ndarray, Any]:
-    """VTK's image over the background, (height, width, 3) in [0, 1], top row first; and its mapper."""
+    """VTK's image over the background, (height, width, 3) in [0, 1], top row first, and its mapper."""
     drawn = peer_vtk.prepare(
         scene.volume, scene.transfer, scene.camera, STEP * scene.voxel, background=BACKGROUND
     )
@@ -95,7 +95,7 @@ def drawn_by_vtk(scene: Scene) -> tuple[np.ndarray, Any]:
 
 
 def drawn_by_us(scene: Scene, mapper: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Our image over the background as VTK would display it, and which pixels are inside the object."""
+    """Our image over the background as VTK would display it, and a mask of the pixels inside the object."""
     rendering = jv.render(scene.volume, scene.transfer, scene.camera, jv.March(STEP * scene.voxel))
     image, opacity = rendering.image(BACKGROUND), rendering.rgba[..., 3]
     return peer_vtk.as_displayed(np.asarray(image), mapper), np.asarray(opacity) > 0.01
@@ -113,7 +113,7 @@ def test_vtk_draws_the_same_picture_to_the_pixel(real_volume, name):
     assert inside.mean() > 0.1
     right = difference(ours, theirs, inside)
     assert right < AGREED
-    # and what is off by no more than one pixel is told apart from what is right
+    # images that are off by a single pixel differ much more
     moved = {"right": (0, 1), "left": (0, -1), "down": (1, 0), "up": (-1, 0)}
     wrong = {f"one pixel {where}": np.roll(ours, by, axis=(0, 1)) for where, by in moved.items()}
     wrong |= {"upside down": ours[::-1], "mirrored": ours[:, ::-1], "blue for red": ours[..., ::-1]}

@@ -1,4 +1,4 @@
-"""What comes in place of a volume, a transfer function, a camera or a march is named, and a way out told."""
+"""Errors for wrong arguments in place of a volume, transfer function, camera or march, and their advice."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ RAYS = [RAY[0]], [RAY[1]]
 
 
 class Denser(jv.Volume):
-    """Overrides what is fetched by other means."""
+    """Overrides how values are fetched, which is a field's task."""
 
     def value(self, coordinate):
         return 2 * super().value(coordinate)
@@ -92,7 +92,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_something_else_is_named(case):
+def test_wrong_argument_types_are_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()

@@ -1,4 +1,4 @@
-"""Where a ray meets the volume: misses, grazes, rays along axes, starts inside, looks away."""
+"""Entry and exit of rays: misses, grazing rays, rays along axes, origins inside, rays that look away."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def part_inside(origin, direction):
 
 
 def see(origins, directions):
-    """Opacity of rays through the box filled with one extinction."""
+    """Render rays through the box, filled with a constant extinction."""
     rendering = jv.render_rays(
         BOX, uniform_transfer(SIGMA), np.array(origins, float), np.array(directions, float), EXACT
     )
@@ -118,7 +118,7 @@ def test_entry_and_exit_carry_gradients():
 
 def test_depth_is_the_mean_distance_of_what_is_seen():
     opaque = jv.render_rays(BOX, uniform_transfer(1e6), [[-3, -0.5, 3]], [[1, 0, 0]], EXACT)
-    np.testing.assert_allclose(opaque.depth, 3, atol=1e-6)  # a left-rule sample stands at its cell's front
+    np.testing.assert_allclose(opaque.depth, 3, atol=1e-6)  # the left rule samples a cell at its front
     fine = jv.March(0.002, (jv.AlphaCorrection(),), "midpoint")
     clear = jv.render_rays(BOX, uniform_transfer(SIGMA), [[-3, -0.5, 3]], [[1, 0, 0]], fine)
     t = np.linspace(0, 2, 20001)

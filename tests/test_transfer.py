@@ -1,4 +1,4 @@
-"""Colour and extinction between control points; presets, colormaps, and what is refused."""
+"""Colour and extinction between control points; presets, colormaps, and invalid arguments."""
 
 import equinox as eqx
 import jax
@@ -126,7 +126,7 @@ def test_two_equal_points_are_a_step(case):
         color, sigma = evaluate(transfer, [below, there, above])
         np.testing.assert_allclose(sigma, extinction[[at, at + 1, at + 1]], rtol=1e-5)
         np.testing.assert_allclose(color, colors[[at, at + 1, at + 1]], rtol=1e-5)
-    # all else as between other points; numpy takes the second one at a step, too
+    # everywhere else as without steps; at a step, numpy also takes the second point
     where = np.concatenate([np.linspace(-10, 260, 541), values]).astype(np.float32)
     inside = where >= values[0]
     expected = np.where(inside, np.interp(where, values, extinction), extinction[0])
@@ -157,8 +157,8 @@ def test_the_derivative_at_a_step_is_finite_and_that_of_jax(case):
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_what_a_step_shows_is_known_to_be_visible(many):
-    """Ranges that end exactly at a step, or begin there: the second point counts, the first one does not."""
+def test_visibility_of_ranges_at_a_step(many):
+    """For ranges that end or begin exactly at a step, the second point counts and the first one does not."""
     filler = np.linspace(80, 255, 20) if many else [255.0]
     up = jv.TransferFunction(
         [0, 60, 60, *filler], np.ones((3 + len(filler), 3)), [0, 0, 1, *np.ones(len(filler))]
@@ -192,7 +192,7 @@ def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
         rgba = image(transfer, march, adjoint)
         return jnp.sum(rgba**2), rgba
 
-    # in any direction but that of an extinction of 0, whose derivative leaps leave out
+    # any direction without extinctions of 0, whose derivatives leaping omits
     random = np.random.default_rng(0)
     ways = jv.TransferFunction(
         step.values, random.random((4, 3)), np.sign(np.asarray(step.extinction)) * random.random(4)
@@ -200,14 +200,14 @@ def test_a_step_is_rendered_and_differentiated_alike_with_and_without_leaps():
     ways = eqx.tree_at(lambda t: t.values, ways, jnp.zeros(4))
 
     def forward(transfer):
-        """Image and slope come out of one program."""
+        """Slope and image, from one program."""
         return jax.jvp(lambda t: loss(t, plain, "forward"), (transfer,), (ways,), has_aux=True)[1:]
 
     gradient, rgba = jax.grad(loss, has_aux=True)(step, leaping)
     slope, whole = forward(step)
     np.testing.assert_allclose(rgba, whole, atol=2e-6)
     assert 0.1 < float((rgba[..., 3] > 0).mean()) < 0.9
-    # as the steepest ramp that a viewer without steps draws
+    # compare with the steepest ramp that needs no step
     ramp = jv.TransferFunction([0, np.nextafter(np.float32(60), 0), 60, 255], step.colors, step.extinction)
     np.testing.assert_allclose(rgba, forward(ramp)[1], atol=1e-5)
     assert np.isfinite(gradient.extinction).all()
@@ -302,8 +302,8 @@ def test_bad_input_is_named(case):
 
 
 def test_points_that_lie_nearly_evenly_are_counted_exactly():
-    """4096 of them, each a little nearer to or farther from the one before: in the middle they are several
-    intervals away from where even ones would lie."""
+    """4096 points with slightly uneven gaps: those in the middle lie several intervals away from where evenly
+    spaced ones would."""
     n = 4096
     gaps = np.where(np.arange(n - 1) < n / 2, 1 - 9e-4, 1 + 9e-4)
     values = np.concatenate([[0], np.cumsum(gaps)]).astype(np.float32)
@@ -314,7 +314,7 @@ def test_points_that_lie_nearly_evenly_are_counted_exactly():
 
 
 class Gained(jv.TransferFunction):
-    """With a leaf of its own, by which its extinction is multiplied."""
+    """Multiplies its extinction by a leaf of its own."""
 
     gain: jax.Array
 
@@ -332,7 +332,7 @@ class Gained(jv.TransferFunction):
         return gained
 
 
-def test_a_transfer_function_of_ones_own_pulls_as_its_look_up_says():
+def test_vjp_of_a_custom_transfer_function_matches_its_look_up():
     for n in (4, 40):
         function = Gained(np.linspace(0, 1, n), np.full((n, 3), 0.5), np.linspace(1, 3, n))
         value = jnp.asarray([0.1, 0.45, 0.8])

@@ -1,4 +1,4 @@
-"""Values, gradients and labels between the nodes of a grid, and what is no volume."""
+"""Values, gradients and labels between the nodes of a grid, and invalid volumes."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ SHAPE = (5, 7, 6)
 
 
 def random_data(dtype: str, seed: int = 0) -> np.ndarray:
-    """Values all over the type's range, or some of it."""
+    """Random values over an integer type's whole range, or normal ones for floats."""
     random = np.random.default_rng(seed)
     if dtype in ("float16", "bfloat16", "float32"):
         return random.normal(0, 100, SHAPE).astype(ml_dtypes.bfloat16 if dtype == "bfloat16" else dtype)
@@ -25,7 +25,7 @@ def random_data(dtype: str, seed: int = 0) -> np.ndarray:
 
 
 def random_coordinates(n: int = 200) -> np.ndarray:
-    """Points in the grid and up to one node outside, with all nodes at its corners among them."""
+    """Points in the grid and up to one node outside, including the grid's corners."""
     corners = np.array([(x, y, z) for x in (0, 4) for y in (0, 6) for z in (0, 5)], float)
     inside = np.random.default_rng(1).uniform(-1, np.array(SHAPE), (n, 3))
     return np.concatenate([corners, inside]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Wood grain is broken, cut faces stay smooth, and the error is no smaller: Kye 2013, measured."""
+"""Does jitter break wood grain, keep cut faces smooth and leave the error unchanged? Kye 2013, measured."""
 
 from functools import cache
 
@@ -23,15 +23,15 @@ SEEDS = range(5)
 
 
 def rendered(scene, *transforms):
-    """Colour over black, with alpha correction in all images, so that the exit makes no difference."""
+    """Colour over black. All images use alpha correction, so that exits make no difference."""
     volume, transfer, camera, step = scene
     march = jv.March(step, (*transforms, jv.AlphaCorrection()))
-    rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba  # compiles the fastest
+    rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba  # compiles fastest
     return np.asarray(rgba[..., :3], np.float64)
 
 
 def converged(scene, refined):
-    """By the midpoint rule, whose error falls with the step's square."""
+    """A converged image, by the midpoint rule, whose error is of second order in the step."""
     volume, transfer, camera, step = scene
     march = jv.March(step / refined, (jv.AlphaCorrection(), jv.EarlyTermination(1e-6)), "midpoint")
     rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba
@@ -39,14 +39,14 @@ def converged(scene, refined):
 
 
 # -- inclined plane ---------------------------------------------------------------------------------------
-# The scene of the measurements in Kye's terms: the unit cube drawn as [-1, 1]³, so a step of 1/128 of it is
-# 2/128, and an extinction of 60 value is 30 value.
+# The scene is stated for the unit cube and rendered as [-1, 1]³, so that a step of 1/128 becomes 2/128 and an
+# extinction of 60 value becomes 30 value.
 
 SLOPE = 0.35
 
 
 class Plane(jv.Field):
-    """The field of `jv.phantom("plane")` itself in place of its voxels."""
+    """The field of `jv.phantom("plane")`, evaluated exactly instead of from voxels."""
 
     def value(self, volume, coordinate):
         x, _, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
@@ -54,7 +54,7 @@ class Plane(jv.Field):
 
 
 class Sphere(jv.Field):
-    """The field of `jv.phantom("sphere")` itself in place of its voxels."""
+    """The field of `jv.phantom("sphere")`, evaluated exactly instead of from voxels."""
 
     def value(self, volume, coordinate):
         x, y, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
@@ -62,7 +62,7 @@ class Sphere(jv.Field):
 
 
 def surface_transfer():
-    """Clear below 0.05, then colour 0.3 + 0.6 value and extinction 30 value."""
+    """Transparent below 0.05; above it, colour 0.3 + 0.6 value and extinction 30 value."""
     values = np.array([0, 0.04999, 0.05, 1])
     colors = np.tile((0.3 + 0.6 * values)[:, None], 3)
     return jv.TransferFunction(values, colors, [0, 0, 1.5, 30])
@@ -90,7 +90,7 @@ def test_jitter_breaks_the_comb_of_an_inclined_plane_and_leaves_the_error(name):
     scene, reference = plane()
     plain = rendered(scene)
     comb = comb_of(plain - reference)
-    # the ring's own energy is most of what the error holds beside its mean
+    # the rings are more than half of the error's variance
     assert comb > 0.5 * np.sum(np.var(plain - reference, axis=(0, 1)))
     for seed in SEEDS:
         image = rendered(scene, JITTERS[name](seed))
@@ -100,7 +100,7 @@ def test_jitter_breaks_the_comb_of_an_inclined_plane_and_leaves_the_error(name):
 
 
 def test_one_shift_for_all_pixels_moves_the_comb_and_does_not_break_it():
-    """The measure sees the jitter, not the shift: rays that all begin half a step later."""
+    """The metric responds to jitter, not to a common shift: here all rays begin half a step later."""
     (volume, transfer, camera, step), reference = plane()
     later = jv.Camera((0, 0, -1 + step / 2), (0, 0, 1), (0, 1, 0), size=camera.size, parallel_scale=0.5)
     combs = [comb_of(rendered((volume, transfer, c, step)) - reference) for c in (camera, later)]
@@ -125,9 +125,9 @@ def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
 @pytest.mark.parametrize(("scale", "bound"), [(0.125, 1 / 5), (0.5, 1 / 2.5)])
 @pytest.mark.parametrize("name", ["jitter", "empty space"])
 def test_blue_jitter_leaves_less_slow_error_where_the_rings_are_wide(name, scale, bound):
-    """The error is a function of ξ + φ, where φ runs through 0 … 1 once per ring. That moves the spectrum
-    of the noise by the comb's frequency, and rings that are narrow (0.5: 11 pixels) move fast noise to
-    where it is slow. At 46 pixels (0.125) the error is as blue as it should be."""
+    """The error is a function of ξ + φ, where φ runs from 0 to 1 once per ring. This shifts the spectrum of
+    the noise by the comb's frequency, so that narrow rings (scale 0.5: 11 pixels) move high frequencies to
+    low ones. With rings of 46 pixels (scale 0.125) the error is as blue as expected."""
     scene, reference = plane(scale)
     slow = {
         pattern: np.mean(
@@ -149,7 +149,7 @@ def head():
 
 
 def skin():
-    """The head's surface, opaque; with as many points as the preset has, so that programs are shared."""
+    """Opaque head surface, with as many control points as the preset, so that they share programs."""
     values = np.array([0, 40, 90, 120, 150, 180, 210, 230, 255])
     colors = np.tile(np.interp(values, [0, 40, 90, 255], [0.1, 0.2, 0.8, 1.0])[:, None], 3)
     return jv.TransferFunction(values, colors, np.where(values > 40, 60, 0))
@@ -176,7 +176,7 @@ def airway(real_volume):
 
 
 def airway_scene(real_volume):
-    """In the trachea, looking down it, magnified."""
+    """A magnified view down the trachea, from inside."""
     camera = jv.Camera((99.5, 43.7, 182), (99.0, 73.7, 150), (0, 1, 0), 70.0, size=SIZE).zoom(2)
     return airway(real_volume), jv.preset("ct_airway"), camera, 0.5
 
@@ -193,7 +193,7 @@ def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
     reference = converged(scene, 8)
     plain = rendered(scene)
     structure = wood_grain_energy(plain - reference)
-    # it is there: a tenth and more of what the error holds beside its mean
+    # there is wood grain: more than a tenth of the error's variance
     assert structure > 0.1 * np.sum(np.var(plain - reference, axis=(0, 1)))
     for kind in JITTERS.values():
         for seed in (0, 1):
@@ -202,13 +202,13 @@ def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
 
 
 def chest_scene(real_volume):
-    """Rays enter through tissue, and meet a bone before anything that is transparent."""
+    """Rays enter through tissue and meet bone before any transparent sample."""
     volume = airway(real_volume)
     return volume, jv.preset("ct_chest"), jv.Camera.looking_at(volume, size=SIZE).zoom(4), 2.0
 
 
 def cut_head_volume():
-    """The head without its face: its bounds cut through skin, bone and brain."""
+    """The head with its face cut off, so that the boundary cuts skin, bone and brain."""
     first = 40
     data = np.asarray(head().data)[:, first:, :]
     return jv.Volume(data, head().spacing, head().origin + np.array([0, first * 2 / 127, 0], np.float32))
@@ -221,7 +221,7 @@ def cut_skull_scene(_):
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [cut_skull_scene, chest_scene])
 def test_empty_space_jitter_leaves_wood_grain_behind_material_alone(make, real_volume):
-    """Its limit: a ray that meets nothing transparent is not jittered."""
+    """Its limitation: a ray that meets no transparent sample is not jittered."""
     scene = make(real_volume)
     reference = converged(scene, 8)
     plain, jitter, empty_space = (
@@ -245,7 +245,7 @@ def cut_block():
 
 def cut_head(transfer):
     volume = cut_head_volume()
-    # fine enough that the anatomy on the face is smooth from pixel to pixel
+    # fine enough for the anatomy on the cut face to be smooth from pixel to pixel
     camera = jv.Camera((0, -3.2, 0.1), (0, 0, 0.1), (0, 0, 1), size=(192, 192), parallel_scale=0.6)
     origins, _ = (np.asarray(part, np.float64) for part in camera.rays())
     x, z = (np.round((origins[..., axis] + 1) / (2 / 127)).astype(int) for axis in (0, 2))
@@ -260,7 +260,7 @@ CUTS = {
     "skin": lambda: cut_head(skin()),
 }
 
-# mean square that rounding to float32 leaves in colours up to 1
+# mean square error of colours up to 1, rounded to float32
 ROUNDING = 3 * (2.0**-23) ** 2
 
 

@@ -1,4 +1,4 @@
-"""The checker of annotations at run time: beartype, taking an int where a float is meant."""
+"""Run-time type checker: beartype, configured to accept int for float."""
 
 from beartype import BeartypeConf, beartype
 

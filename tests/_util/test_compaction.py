@@ -1,4 +1,4 @@
-"""What is chosen is put in front, in order, and comes back to its place."""
+"""Are chosen entries gathered in order, and scattered back to their places?"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +13,11 @@ from jaxvol._util.compaction import CHUNK, Chosen
 def test_the_chosen_ones_are_in_front_and_in_order(shape, share):
     masks = np.random.default_rng(0).random((2, *shape)) < share
     chosen = Chosen.of([jnp.asarray(mask) for mask in masks])
-    wanted = np.flatnonzero(masks)
-    assert chosen.number == len(wanted)
-    np.testing.assert_array_equal(chosen.place[: len(wanted)], wanted)
+    expected = np.flatnonzero(masks)
+    assert chosen.number == len(expected)
+    np.testing.assert_array_equal(chosen.place[: len(expected)], expected)
     assert chosen.place.size % CHUNK == 0
-    assert np.all(chosen.place[len(wanted) :] == masks.size)
+    assert np.all(chosen.place[len(expected) :] == masks.size)
 
 
 def test_each_chosen_one_is_taken_once_and_put_where_it_was():

@@ -1,6 +1,6 @@
-"""Does a number that is none reach the image? A fit that has diverged must not look like one that agrees.
+"""Do NaN and infinity reach the image and the gradient? A diverged fit must not look like a good one.
 
-What a constructor gets is checked there. Here leaves are replaced afterwards, as optimisers do, and traced.
+Constructors check their arguments. Here leaves are replaced afterwards, as optimisers do, and traced.
 """
 
 import equinox as eqx
@@ -25,7 +25,7 @@ WHOLE = {
 
 
 def scene(transforms=(), max_samples=None):
-    """A volume with something to see at its near end, and nothing behind."""
+    """A volume with a visible block at its near end and empty space behind it."""
     data = np.zeros((12, 40, 11), np.float32)
     data[2:5, 3:7, 3:8] = 0.8
     volume = jv.Volume(data, (0.1, 0.1, 0.1))
@@ -36,7 +36,7 @@ def scene(transforms=(), max_samples=None):
 
 
 def seen(transforms):
-    """The scene's floats, and under `jax.jit` (loss, image), and gradient, of them."""
+    """The scene's float leaves, and a jit-compiled function of them: ((loss, image), gradient)."""
     floats, rest = eqx.partition(scene(transforms), eqx.is_inexact_array)
 
     @jax.jit
@@ -55,7 +55,7 @@ def seen(transforms):
     [(jv.SpaceLeaping(),), pytest.param((), marks=pytest.mark.slow)],
     ids=["leaping", "not leaping"],
 )
-def test_what_is_no_number_reaches_image_and_gradient(transforms):
+def test_nan_and_infinity_reach_image_and_gradient(transforms):
     floats, both = seen(transforms)
     (_, whole), gradient = both(floats)
     assert 0.2 < float(whole[..., 3].max()) <= 1
@@ -77,22 +77,22 @@ def test_what_is_no_number_reaches_image_and_gradient(transforms):
         assert np.isnan(image).all(), step
         assert np.isnan(gradient[1].colors).any(), step
 
-    # voxels that are seen, and some in what is leapt over; several, since rays are few
+    # visible voxels, and some in the space that is leapt over; several each, since rays are few
     for place in (np.s_[2:5, 3:7, 3:8], np.s_[7:11, 28:38, 2:9]):
         bad = eqx.tree_at(lambda f: f[0].data, floats, floats[0].data.at[place].set(np.nan))
         (value, image), gradient = both(bad)
         assert np.isnan(value), place
         assert np.isnan(image).any(), place
-        # colour also where a ray leaves the volume beside it: what is sampled past the exit weighs 0
+        # colour alone may be NaN where a ray leaves the volume: samples past the exit weigh 0
         assert np.isnan(image[..., :3])[np.isnan(image[..., 3])].all()
         assert np.isnan(image[..., 3]).any(), place
-        assert not np.isnan(image).all(), "rays that do not meet it see what they saw"
+        assert not np.isnan(image).all(), "rays that do not meet the NaN keep their pixels"
         assert np.isnan(gradient[1].colors).any(), place
         assert np.isnan(gradient[0].data).any(), place
 
 
 @pytest.mark.parametrize("adjoint", ["direct", pytest.param("forward", marks=pytest.mark.slow)])
-def test_other_adjoints_have_no_number_either(adjoint):
+def test_nan_reaches_image_and_derivative_of_other_adjoints(adjoint):
     floats, rest = eqx.partition(scene(max_samples=16), eqx.is_inexact_array)
 
     def image(floats):
@@ -100,7 +100,7 @@ def test_other_adjoints_have_no_number_either(adjoint):
 
     @jax.jit
     def derivative(floats):
-        """Of the colours, as a user has it who fits them."""
+        """Derivative with respect to the colours, as in a fit."""
 
         def loss(colors):
             return jnp.sum(image(eqx.tree_at(WHOLE["colors"], floats, colors)) ** 2)
@@ -119,19 +119,19 @@ def test_other_adjoints_have_no_number_either(adjoint):
         value, found = derivative(eqx.tree_at(where, floats, leaf.at[(0,) * leaf.ndim].set(np.nan)))
         assert np.isnan(value), name
         assert np.isnan(found).any(), name
-    # where no program is told how long its loop is
+    # without max_samples
     broken = eqx.tree_at(WHOLE["step"], scene(), jnp.float32(np.nan))
     assert np.isnan(jv.render(*broken, adjoint=adjoint).rgba).all()
 
 
-def test_a_step_that_is_none_is_not_marched_in_the_gradient_either():
-    """Without leaps, each ray would take as many cells as it may: 131 072, in several minutes."""
-    asked = []
+def test_the_gradient_does_not_march_with_a_nan_step():
+    """Without leaping, each ray would take the maximum of 131 072 cells, which takes several minutes."""
+    calls = []
 
     def count():
-        asked.append(1)
-        if len(asked) > 1000:
-            raise RuntimeError("rays are marched on and on")
+        calls.append(1)
+        if len(calls) > 1000:
+            raise RuntimeError("the march does not end")
 
     class Counted(jv.Transform):
         def stop(self, stopped, transmittance):
@@ -141,16 +141,16 @@ def test_a_step_that_is_none_is_not_marched_in_the_gradient_either():
     floats, both = seen((Counted(),))
     jax.block_until_ready(both(floats))
     jax.effects_barrier()
-    assert len(asked) > 1
-    asked.clear()
+    assert len(calls) > 1
+    calls.clear()
     (value, _), gradient = both(eqx.tree_at(WHOLE["step"], floats, jnp.float32(np.nan)))
     assert np.isnan(value)
     assert np.isnan(gradient[0].data).any()
     jax.effects_barrier()
-    assert not asked
+    assert not calls
 
 
-def test_rays_that_are_none_are_refused_when_the_program_runs():
+def test_rays_that_are_not_finite_fail_when_the_program_runs():
     volume, transfer, camera, march = scene()
     origins, directions = camera.rays()
     image = jax.jit(lambda *rays: jv.render_rays(volume, transfer, *rays, march, outputs="rgba").rgba)

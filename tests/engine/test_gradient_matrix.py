@@ -1,11 +1,11 @@
-"""Is a gradient the same however it is computed? Every leaf of a scene, by each adjoint, under each method of
-space leaping, for each type of voxel.
+"""Is a gradient the same however it is computed? For every leaf of a scene, each adjoint, each method of
+space leaping and each type of voxel.
 
-The scene has what users' scenes have: empty space between what is seen, rays that miss the volume and rays
-that see nothing in it, several beams of rays, the last of them incomplete; and everything is at its default.
-Most gradients are taken as users take them, by `jax.grad` of `render` without a `jax.jit` around, since there
-small voxels are fetched from their packed copy. Nearly all the time goes to compiling: 10 to 15 CPU seconds
-for the two programs of a gradient, which all cameras, transfer functions and voxels of a type share.
+The scene resembles users' scenes: it has empty space between visible objects, rays that miss the volume, rays
+that see nothing in it, and several beams of rays, the last one incomplete. All options have their defaults.
+Most gradients are computed as users compute them, by `jax.grad` of `render` outside `jax.jit`, where small
+voxel types are fetched from their packed copy. Nearly all the time is compilation: 10 to 15 CPU seconds for
+the two programs of a gradient, which all cameras, transfer functions and voxels of one type share.
 """
 
 import functools
@@ -20,12 +20,12 @@ from hypothesis import given, settings, strategies as st
 import jaxvol as jv
 from experiments import scenes as real_scenes
 
-from ..scenes import LEAVES, doubled, in_float64
+from ..scenes import LEAVES, in_float64, to_float64
 
 
 SHAPE = (26, 21, 31)
 SIZE = (37, 21)
-"""More than one beam of 16 x 16 pixels each way."""
+"""More than one beam of 16 x 16 pixels along each axis."""
 
 SETS = {
     "plain": ("left", ()),
@@ -36,25 +36,25 @@ SETS = {
 }
 
 EXACT = ["hierarchy", "distance", "beam"]
-"""Methods that leap over nothing that is seen."""
+"""Methods that never leap over anything visible."""
 
 METHODS = [None, *EXACT, "min_distance"]
 
 TOPS = {"uint8": 255, "uint16": 60_000, "int16": 4000, "float32": 1, "float64": 1}
-"""The largest value of a volume of each type."""
+"""Largest value of a volume of each type."""
 
 CAMERAS = {
     "outside": ((3.1, -3.9, 2.4), (1.1, 0.5, 1.0), 30.0),
     "inside": ((1.15, 0.45, 1.0), (0.7, 0.6, 0.6), 70.0),
     "past it": ((3.1, -3.9, 2.4), (1.9, 0.9, 1.6), 30.0),
 }
-"""Position, focal point and view angle. `"parallel"` is the first without perspective."""
+"""Position, focal point and view angle. `"parallel"` is `"outside"` in parallel projection."""
 
 slow = pytest.mark.slow
 
 
 def blobs(dtype, seed=0):
-    """Two blobs far from each other, and a piece of a third one, which a corner of the volume cuts."""
+    """Two blobs far from each other, and a third one cut by a corner of the volume."""
     random = np.random.default_rng(seed)
     x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in SHAPE), indexing="ij")
     value = np.zeros(SHAPE)
@@ -66,12 +66,12 @@ def blobs(dtype, seed=0):
 
 
 def scene_of(name="jittered", method=None, dtype="uint8", camera="outside", max_samples=None):
-    """A scene of blobs under a set of transforms and a method of leaping, in the float type of the day."""
+    """A scene of blobs with a set of transforms and a method of leaping, in JAX's current float type."""
     quadrature, transforms = SETS[name]
     transforms = transforms if method is None else (*transforms, jv.SpaceLeaping(method, 4))
     volume = jv.Volume(blobs(dtype), (0.07, 0.09, 0.06), (0.2, -0.4, 0.1))
     values, extinction = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 1.0]), np.array([0.0, 0.0, 4.0, 12.0, 0.0, 36.0])
-    if name == "moving":  # as many points as are looked up by searching
+    if name == "moving":  # enough control points to be looked up by a search
         few, values = values, np.linspace(0, 1, 31)
         extinction = np.interp(values, few, extinction)
     colors = np.random.default_rng(2).random((len(values), 3))
@@ -80,12 +80,12 @@ def scene_of(name="jittered", method=None, dtype="uint8", camera="outside", max_
     position, target, angle = CAMERAS["outside" if parallel else camera]
     camera = jv.Camera(position, target, (0.1, 0.2, 1), angle, size=SIZE, parallel_scale=parallel)
     if jax.config.read("jax_enable_x64"):
-        transforms = doubled(transforms)
+        transforms = to_float64(transforms)
     return volume, transfer, camera, jv.March(0.043, transforms, quadrature, max_samples=max_samples)
 
 
 def loss(scene, adjoint="replay"):
-    """A scalar of image and depths, in which nothing cancels."""
+    """A scalar function of image and depths, without cancellation."""
     return loss_and_opacity(scene, adjoint)[0]
 
 
@@ -99,8 +99,8 @@ def loss_and_opacity(scene, adjoint):
 
 
 def gradient(scene, adjoint="replay", *, empty=False):
-    """That of every leaf by name; of extinctions, where there is any. `empty`: some rays must see nothing,
-    and others end early."""
+    """Gradients of all leaves by name, those of extinctions of 0 set to 0. `empty`: assert that some rays see
+    nothing and others become opaque."""
     take = eqx.filter_grad(functools.partial(loss_and_opacity, adjoint=adjoint), has_aux=True)
     found, opacity = take(scene)
     assert not empty or (0.05 < np.mean(opacity > 0) < 0.95 and opacity.max() > 0.95)
@@ -110,8 +110,8 @@ def gradient(scene, adjoint="replay", *, empty=False):
 
 
 def directions(scene, seed=0):
-    """For every leaf a direction along which to change it alone: (name, tangent of the scene). Extinctions of
-    0 stay."""
+    """For every leaf, a random direction that changes only this leaf: (name, tangent of the scene).
+    Extinctions of 0 do not change."""
     random = np.random.default_rng(seed)
     still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, scene)
     for name, where in LEAVES.items():
@@ -124,7 +124,7 @@ def directions(scene, seed=0):
 
 
 def slopes(scene, adjoint="forward"):
-    """How the loss changes along each direction, by forward mode."""
+    """Directional derivatives of the loss along each direction, by forward mode."""
 
     def slope(tangent):
         return eqx.filter_jvp(functools.partial(loss, adjoint=adjoint), (scene,), (tangent,))[1]
@@ -133,10 +133,10 @@ def slopes(scene, adjoint="forward"):
 
 
 def central(scene, h=1e-7):
-    """The same by central differences of what `jax.value_and_grad` calls the value.
+    """The same by central differences of the value that `jax.value_and_grad` returns.
 
-    At 1e-6 some of the 40 000 samples cross a face of voxels or a control point between the two ends, where
-    the slope changes; at 1e-9 rounding shows."""
+    With h = 1e-6, some of the 40 000 samples cross a voxel face or a control point, where the slope changes;
+    with 1e-9, rounding is visible."""
     value = eqx.filter_value_and_grad(loss)
 
     def moved(tangent, by):
@@ -154,7 +154,7 @@ def central(scene, h=1e-7):
 
 
 def assert_same(found, expected, tolerance, context=""):
-    """Each leaf's gradient to this part of its norm, which is not 0."""
+    """Each leaf's gradient agrees to `tolerance` times its norm, which is not 0."""
     assert found.keys() == expected.keys()
     for name, want in expected.items():
         norm = np.linalg.norm(want)
@@ -164,7 +164,7 @@ def assert_same(found, expected, tolerance, context=""):
 
 
 def assert_slopes(found, gradients, scene, tolerance, context=""):
-    """Slopes along `directions`, whose components are all 1 or -1, to this part of the gradient's norm."""
+    """Slopes along `directions`, whose components are ±1, agree to `tolerance` times the gradient's norm."""
     for name, tangent in directions(scene):
         along, norm = np.asarray(LEAVES[name](tangent)), np.linalg.norm(gradients[name])
         assert norm > 0, (context, name)
@@ -175,16 +175,17 @@ def assert_slopes(found, gradients, scene, tolerance, context=""):
 DEFAULT = "hierarchy"
 FAST = {("jittered", DEFAULT, "uint8")}
 TYPES = ["uint8", "uint16", "int16", "float32"]
-LEAPT = [
+LEAPING = [
     *((name, method, "uint8") for name in SETS for method in EXACT),
     *(("moving", "hierarchy", dtype) for dtype in TYPES[1:]),
 ]
 
 
 @pytest.mark.parametrize(
-    ("name", "method", "dtype"), [case if case in FAST else pytest.param(*case, marks=slow) for case in LEAPT]
+    ("name", "method", "dtype"),
+    [case if case in FAST else pytest.param(*case, marks=slow) for case in LEAPING],
 )
-def test_replay_does_not_see_the_leaps(name, method, dtype):
+def test_leaping_does_not_change_replay_gradients(name, method, dtype):
     for camera in CAMERAS:
         found, expected = (
             gradient(scene_of(name, leaps, dtype, camera), empty=True) for leaps in (method, None)
@@ -194,7 +195,7 @@ def test_replay_does_not_see_the_leaps(name, method, dtype):
 
 @pytest.mark.parametrize("method", [m if m == DEFAULT else pytest.param(m, marks=slow) for m in EXACT])
 def test_no_leap_shows_in_a_gradient_whatever_is_rendered(method):
-    """Invariant 2, for gradients: other cameras, transfer functions, voxels, seeds and steps."""
+    """Invariant 2 for gradients, with random cameras, transfer functions, voxels, seeds and steps."""
 
     @settings(max_examples=6, deadline=None, derandomize=True)
     @given(
@@ -219,7 +220,7 @@ def test_no_leap_shows_in_a_gradient_whatever_is_rendered(method):
         found, expected = map(gradient, scenes)
         for name, want in expected.items():
             assert np.isfinite(found[name]).all(), name
-            # float32 leaves this much of sums in which most cancels
+            # rounding in float32 of sums with strong cancellation
             rounding = 1e-6 * np.linalg.norm(expected["focal_point"])
             assert np.linalg.norm(found[name] - want) <= 1e-4 * np.linalg.norm(want) + rounding, name
 
@@ -238,8 +239,8 @@ FORWARD = [
     ("name", "method", "dtype"),
     [case if case in FAST else pytest.param(*case, marks=slow) for case in FORWARD],
 )
-def test_forward_is_replay(name, method, dtype):
-    """`"min_distance"`, whose image is another, too."""
+def test_forward_and_replay_gradients_agree(name, method, dtype):
+    """Also for `"min_distance"`, whose image differs from that of the other methods."""
     for camera in CAMERAS:
         scene = scene_of(name, method, dtype, camera)
         assert_slopes(slopes(scene), gradient(scene), scene, 1e-4, camera)
@@ -254,8 +255,8 @@ def test_forward_is_replay(name, method, dtype):
     ],
 )
 def test_gradients_are_central_differences(name, method, dtype):
-    """Where nothing jumps: no sample crosses the exit uncut, none ends a ray, and from inside the empty space
-    the first transparent sample of each ray stays the first."""
+    """In a scene without jumps: the last cell is cut at the exit, no ray ends early, and the camera is in
+    empty space, so that the first transparent sample of each ray stays the same."""
     with in_float64():
         scene = scene_of(name, method, dtype, "inside")
         assert_slopes(central(scene), gradient(scene), scene, 1e-5)
@@ -278,7 +279,7 @@ def test_adjoints_agree_to_rounding(name):
 @slow
 @pytest.mark.parametrize("method", EXACT)
 def test_gradients_under_jit_are_those_without(method):
-    """There the voxels are traced, and so not packed."""
+    """Under `jax.jit`, voxels are traced and therefore not packed."""
     scene = scene_of("moving", method)
     inside = eqx.filter_jit(eqx.filter_grad(loss))(scene)
     leaves = {name: np.asarray(where(inside)) for name, where in LEAVES.items() if where(inside) is not None}
@@ -306,7 +307,8 @@ def test_float32_gradients_are_those_of_float64():
 
 
 def assert_slopes_of(of, given, leaps, context=""):
-    """`of(parameters, method, adjoint)`: replay with leaps and without, forward and differences agree."""
+    """For `of(parameters, method, adjoint)`: replay with and without leaping, forward mode and differences
+    agree."""
     random = np.random.default_rng(0)
     signs = jax.tree.map(lambda leaf: jnp.asarray(random.choice([-1.0, 1.0], leaf.shape)), given)
     signs = jax.tree.map(lambda sign, leaf: jnp.where(leaf == 0, 0, sign), signs, given)
@@ -363,7 +365,7 @@ def test_rays_of_ones_own(method):
             return jnp.sum(rendering.rgba * jnp.asarray(weights))
 
         origins, directions = scene_of()[2].rays()
-        # of other lengths than 1, and not rectangular
+        # directions that are not normalized, and rays that are no rectangular image
         assert_slopes_of(of, (origins.reshape(-1, 3)[:500], 3 * directions.reshape(-1, 3)[:500]), method)
 
 

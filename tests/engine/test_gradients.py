@@ -1,5 +1,5 @@
-"""The gradient at the extremes; where a gradient is wrong by nature, that it is; and what it takes in memory.
-That it is right elsewhere is what `test_gradient_matrix` is about."""
+"""Gradients at extremes, gradients that are documented to be wrong, and the memory that gradients need.
+`test_gradient_matrix` tests that they are right elsewhere."""
 
 import equinox as eqx
 import jax
@@ -12,11 +12,11 @@ import jaxvol as jv
 from ..scenes import LEAVES, soft_transfer
 
 
-LEAPT = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05))
+LEAPING = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05))
 SETS = {
     "plain": ("left", ()),
     "aligned": ("midpoint", (jv.AlphaCorrection(),)),
-    "leapt": ("left", LEAPT),
+    "leaping": ("left", LEAPING),
     "jittered": ("left", (jv.Jitter(3), jv.AlphaCorrection(), jv.EarlyTermination(0.2))),
     "front residual": ("midpoint", (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())),
 }
@@ -30,18 +30,18 @@ WAYS = {
     "origin": 0.04,
     "step": 0.01,
 }
-"""What moves the samples, or the exit, and by how much, so that many cross it."""
+"""Leaves that move the samples or the exit, each with a change for which many samples cross the exit."""
 
 JUMPS = {("plain", leaf) for leaf in WAYS}
-"""Where the gradient is wrong by nature: the image jumps whenever a sample crosses the exit."""
+"""Cases whose gradient is wrong: the image jumps whenever a sample crosses the exit."""
 
 
 def summed_and_true(name):
-    """How a loss changes along the way of each leaf in `WAYS`: by its gradients, summed up, and in truth."""
+    """Change of a loss along each way in `WAYS`: the integral of its gradient, and the true difference."""
     quadrature, transforms = SETS[name]
     volume = jv.Volume(jnp.full((6, 5, 7), 0.2), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1))
     camera = jv.Camera((1.9, -1.3, 1.7), tuple(map(float, volume.center)), (0.1, 0, 1), 40.0, size=(6, 5))
-    # all rays hit: those that graze an edge change too steeply to be summed up
+    # all rays hit: rays that graze an edge change too steeply to integrate
     scene = volume, soft_transfer(), camera.zoom(3), jv.March(0.11, transforms, quadrature)
     weights = jnp.asarray(np.random.default_rng(5).normal(size=(5, 6, 4)), jnp.float32)
 
@@ -64,21 +64,21 @@ def summed_and_true(name):
 
 
 @pytest.mark.slow
-def test_gradients_that_are_wrong_by_nature_are():
-    """Over a distance at which samples cross the exit, the image changes by more than its gradient says;
-    and does not, once cells end at the exit."""
+def test_gradients_documented_to_be_wrong_are_wrong():
+    """Where samples cross the exit, the image changes by more than the integral of its gradient, unless the
+    last cell is cut at the exit."""
     found = {name: summed_and_true(name) for name in ("plain", "aligned")}
     for leaf in WAYS:
         change = abs(found["plain"][leaf][1])
-        for name, (told, true) in ((name, leaves[leaf]) for name, leaves in found.items()):
-            error = abs(told - true) / change
+        for name, (integral, true) in ((name, leaves[leaf]) for name, leaves in found.items()):
+            error = abs(integral - true) / change
             assert error > 0.5 if (name, leaf) in JUMPS else error < 0.02, (name, leaf)
 
 
 # the extremes
 
 BOX = (-2.0, -2.0, -2.0)
-"""Where a box of width 2 begins: it ends at 0, near which float32 resolves the thinnest cells."""
+"""Lower corner of a box of width 2. It ends at 0, where float32 resolves the thinnest cells."""
 
 RAYS = {
     "along an axis": ((-3, -1, -1), (1, 0, 0)),
@@ -110,7 +110,7 @@ EXTREMES = {
     "steps of 1e-7": (NOISE, np.ones(8), 1e-7),
     "a step through everything": (NOISE, np.ones(8), 1e3),
 }
-"""Voxels, extinction, and step."""
+"""Voxels, extinction and step of each case."""
 
 OF_RAYS = {
     **{leaf: LEAVES[leaf] for leaf in ("voxels", "spacing", "origin", "colors", "extinction")},
@@ -149,20 +149,20 @@ def test_values_and_gradients_are_finite_and_agree_at_the_extremes(name):
             of_leaf, random = where(gradient), np.random.default_rng(2)
             assert np.isfinite(of_leaf).all(), (case, leaf)
             along = jnp.asarray(random.normal(size=of_leaf.shape), jnp.float32)
-            if march.leaps and leaf == "extinction":  # one of 0 has no gradient there to agree on
+            if march.leaps and leaf == "extinction":  # an extinction of 0 has no gradient under leaping
                 along = jnp.where(scene[1].extinction > 0, along, 0)
             still = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, scene)
             again, slope = pushed(scene, eqx.tree_at(where, still, along))
             np.testing.assert_allclose(again, value, rtol=1e-6, err_msg=case)
-            # steps of 1e-7 leave a depth few digits past its entry
+            # with steps of 1e-7, depths beyond the entry have few significant digits
             largest = float(jnp.sum(jnp.abs(of_leaf * along)))
             np.testing.assert_allclose(
                 slope, jnp.vdot(of_leaf, along), rtol=0, atol=1e-2 * largest + 1e-6, err_msg=f"{case}, {leaf}"
             )
 
 
-def test_tables_pull_as_jax_does():
-    """Their scatter of whole rows, against what JAX makes of the look-up."""
+def test_vjp_of_tables_matches_jax():
+    """Compare their scatter of whole table rows with JAX's VJP of the look-up."""
     random = np.random.default_rng(0)
     value = jnp.asarray(random.uniform(-0.2, 1.2, 500), jnp.float32)
     color = tuple(jnp.asarray(random.normal(size=500), jnp.float32) for _ in range(3))
@@ -189,7 +189,7 @@ def test_tables_pull_as_jax_does():
 
 
 def workspace(samples, size=512, resolution=256):
-    """Bytes that the compiled gradient needs beside its inputs and outputs."""
+    """Bytes of temporary memory of the compiled gradient."""
     data = jnp.zeros((resolution,) * 3)
     small = jv.Volume(jnp.zeros((2, 2, 2)), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
     camera = jv.Camera((3, 2, 2.5), (0, 0, 0), size=(size, size))

@@ -1,4 +1,4 @@
-"""Tiles and batches do not show; nothing is compiled twice; memory does not grow with the image."""
+"""Tiles and batches do not change images, nothing is compiled twice, memory does not grow with the image."""
 
 from functools import partial
 
@@ -34,10 +34,10 @@ def test_tiles_do_not_show(size):
     whole = jv.render(volume, soft_transfer(), camera, MARCH)
     assert whole.rgba.shape == (size[1], size[0], 4)
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
-    Anew = counting()  # another type, so another program
-    scene = volume, Anew(*jax.tree.leaves(soft_transfer())), camera, MARCH, None
+    Other = counting()  # another type, hence another program
+    scene = volume, Other(*jax.tree.leaves(soft_transfer())), camera, MARCH, None
     assert_same(whole, _render(scene, "all", "replay", Tiling(tile=4)))
-    assert Anew.traces == 1
+    assert Other.traces == 1
 
 
 def test_rays_of_ones_own_see_what_the_camera_sees():
@@ -84,7 +84,7 @@ def test_an_image_alone_is_the_same_with_its_gradient(adjoint):
         rendering = seen(extinction, outputs)
         return jnp.mean(rendering.rgba**2), rendering
 
-    # the image comes out of the gradient's program, since one of its own would take as long to compile
+    # take the image from the gradient's program, since a separate program would take as long to compile
     differentiated = jax.jacfwd if adjoint == "forward" else jax.grad
     (of_whole, whole), (of_alone, alone) = (
         differentiated(partial(loss, outputs=outputs), has_aux=True)(transfer.extinction)
@@ -143,12 +143,12 @@ def test_memory_beside_the_image_does_not_grow_with_it():
 
     small, large = workspace(1024), workspace(2048)  # four tiles, and sixteen
     pixels = 2048**2 - 1024**2
-    bytes_per_pixel = 4 * 4 + 4 + 4 + 1 + 1  # of a Rendering, in tiles before they are put together
+    bytes_per_pixel = 4 * 4 + 4 + 4 + 1 + 1  # of a Rendering's tiles, before they are assembled
     assert large - small <= 1.1 * bytes_per_pixel * pixels
 
 
 def test_a_transform_that_is_not_asked_for_leaves_no_trace():
-    """The program of a plain march is smaller, in operations, than that of any other."""
+    """A plain march's program has fewer operations than that of any other."""
     volume = anisotropic_noise()
 
     def operations(*transforms):
@@ -167,7 +167,7 @@ def test_unknown_outputs_are_named():
 
 
 def test_an_unknown_adjoint_is_named():
-    # not through render, whose annotation the checker of the tests enforces first
+    # not through `render`, since the tests' type checker rejects its argument first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
         _render(
             (anisotropic_noise(), soft_transfer(), around(anisotropic_noise()), MARCH, None), "all", "reverse"

@@ -1,4 +1,4 @@
-"""Is what `jax.vmap` gives what a loop gives? Values and gradients, over every part of a scene."""
+"""Does `jax.vmap` agree with a loop? Values and gradients, over every part of a scene."""
 
 import functools
 
@@ -19,7 +19,7 @@ slow = pytest.mark.slow
 
 
 def voxels(i, dtype):
-    """Sparse blocks, others for each `i`."""
+    """Sparse random blocks, different for each `i`."""
     data = np.zeros((RESOLUTION,) * 3)
     random = np.random.default_rng(i)
     for low in random.integers(0, RESOLUTION - 6, (5, 3)):
@@ -29,7 +29,7 @@ def voxels(i, dtype):
 
 
 def scene(i, dtype="uint8", camera="around"):
-    """The i-th scene, which differs from the others in every part."""
+    """The i-th scene; scenes differ in every part."""
     volume = jv.Volume(voxels(i, dtype), (0.05 + 0.01 * i, 0.06, 0.05), (0.1 * i, 0, 0))
     transfer = soft_transfer(0.2 + 0.1 * i)
     if dtype == "uint8":
@@ -52,7 +52,7 @@ def loss(scene, adjoint="replay", lighting=None):
 
 
 def assert_each(batch, singles, tolerance):
-    """Leaf by leaf, to this part of its norm over the batch; images to this much."""
+    """Each leaf of the batch agrees with the single results, to `tolerance` times its norm."""
     for (path, many), *each in zip(
         jax.tree_util.tree_leaves_with_path(batch), *map(jax.tree.leaves, singles), strict=True
     ):
@@ -74,7 +74,7 @@ grad = eqx.filter_grad(loss)
 @slow
 @pytest.mark.parametrize("dtype", ["float32", "uint8"])
 def test_over_whole_scenes(dtype):
-    """Images, `vmap` of `grad`, and `grad` of `vmap`: of volumes, transfer functions, cameras, steps and
+    """Images, `vmap` of `grad`, and `grad` of `vmap`, over volumes, transfer functions, cameras, steps and
     seeds together."""
     scenes = [scene(i, dtype) for i in range(COUNT)]
     batch, gradients = stack(scenes), [grad(s) for s in scenes]
@@ -94,7 +94,7 @@ PARTS = {
 
 
 def over(part, dtype="uint8"):
-    """A scene as a function of one of its parts, and several of that."""
+    """A scene as a function of one of its parts, and several values of this part."""
     where, scenes = PARTS[part], [scene(i, dtype) for i in range(COUNT)]
     parts = [where(s) for s in scenes]
     first = scene(0, dtype)
@@ -110,7 +110,7 @@ def over(part, dtype="uint8"):
     ],
 )
 def test_over_one_part(part, dtype):
-    """The others are closed over, as they mostly are: voxels are concrete then, and so packed."""
+    """The other parts are closed over, as usual: their voxels are concrete and therefore packed."""
     made, parts = over(part, dtype)
 
     def both(part):
@@ -166,7 +166,7 @@ def test_other_adjoints(part, adjoint):
 
 @slow
 def test_forward_is_linearized():
-    """As optimistix's solvers do it."""
+    """`jax.linearize`, as optimistix's solvers use it."""
     made, parts = over("transfer functions")
 
     def seen(extinction):
@@ -183,7 +183,7 @@ def test_forward_is_linearized():
 
 @slow
 @pytest.mark.parametrize("wrapped", ["jit of vmap", "vmap of jit", "nested"])
-def test_whatever_is_wrapped_around(wrapped):
+def test_combinations_of_jit_and_vmap(wrapped):
     _, cameras = over("cameras")
     _, transfers = over("transfer functions")
     volume, _, _, march = scene(0)

@@ -1,4 +1,4 @@
-"""Volumes that measure in their own way, or keep their voxels in 16 bits: image and gradient see them so."""
+"""Images and gradients of volumes with custom fields, or with 16-bit voxels."""
 
 import equinox as eqx
 import jax
@@ -13,14 +13,14 @@ from ..scenes import around, soft_transfer
 
 
 class Inverted(jv.Field):
-    """Dense where its voxels are 0: what is known of the voxels alone is wrong for it."""
+    """Dense where voxels are 0, so that ranges computed from the voxels are wrong for it."""
 
     def value(self, volume, coordinate):
         return 1 - volume.interpolated(coordinate) / 255
 
 
 def inverted(dtype):
-    """Inside of what is seen are whole blocks of zeros, which the transfer function hides."""
+    """A visible object with blocks of zeros inside, voxels that the transfer function would hide."""
     data = np.full((14, 14, 14), 255)
     data[3:11, 3:11, 3:11] = np.random.default_rng(0).integers(0, 60, (8, 8, 8))
     data[4:9, 4:9, 4:9] = 0
@@ -28,12 +28,12 @@ def inverted(dtype):
 
 
 @pytest.mark.parametrize("dtype", ["uint8", pytest.param("float32", marks=pytest.mark.slow)])
-def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype):
-    """In the fast engine and in its gradient: as a volume of those values, by the reference engine."""
+def test_a_custom_field_is_used_for_image_and_gradient(dtype):
+    """Compare the fast engine and its gradient with the reference on a volume of the field's values."""
     volume = inverted(dtype)
     plain = jv.Volume(1 - np.asarray(volume.data, np.float32) / 255, volume.spacing)
     camera, transfer = around(volume), soft_transfer(1.0)
-    # by distances, since a beam of so small an image is as wide as the volume
+    # method "distance", since the beams of such a small image are as wide as the volume
     march = jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping("distance")))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(16, 20, 4)), jnp.float32)
 
@@ -62,7 +62,7 @@ def test_a_volume_that_measures_in_its_own_way_keeps_it(dtype):
 
 @pytest.mark.parametrize("dtype", ["float16", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype):
-    """Each of few voxels gets part of the gradient from thousands of samples, which 16 bits would lose."""
+    """Each voxel sums the gradients of thousands of samples, which 16 bits cannot hold."""
     data = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.9, (4, 4, 4)), dtype)
     transfer, whole = soft_transfer(0.2), jv.Volume(data.astype(jnp.float32))
     camera, march = around(whole, (48, 48)), jv.March(0.07, (jv.AlphaCorrection(),))
@@ -79,7 +79,7 @@ def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype):
 
 
 class Nearest(jv.Field):
-    """Of voxels, which it reads by itself."""
+    """Reads the voxels directly instead of interpolating them."""
 
     def value(self, volume, coordinate):
         i, j, k = (jnp.round(c).astype(jnp.int32) for c in coordinate)
@@ -99,7 +99,7 @@ def test_voxels_that_a_volume_reads_by_itself_have_no_gradient_by_replay():
         jax.eval_shape(jax.grad(loss), data)
 
 
-def test_nothing_is_known_of_the_blocks_of_a_field():
+def test_blocks_of_a_custom_field_count_as_visible():
     data = np.full((9, 9, 9), 0.5, np.float32)
     clear = jv.TransferFunction([0.0, 0.7, 1.0], np.ones((3, 3)), [0.0, 0.0, 1.0])
     for field, visible in ((None, False), (Inverted(), True)):

@@ -1,4 +1,4 @@
-"""Which values a parameter may take, and how a camera is turned."""
+"""Constraints on parameters, and poses of a camera."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Parameters that make images agree: found, told of truly, and found again after a kill."""
+"""Does a fit recover parameters, report their uncertainty correctly, and resume after it was killed?"""
 
 import os
 import signal
@@ -66,13 +66,13 @@ def triangle(problem, y):
 
 
 def same(tree, other):
-    """Equal to the last bit."""
+    """Whether two trees are equal to the last bit."""
     return all(
         np.array_equal(a, b) for a, b in zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
     )
 
 
-# A residual without a volume compiles in no time: a saturating curve, through points.
+# A residual without a volume, which compiles quickly: a saturating curve through points.
 X = jnp.linspace(0, 3, 40)
 CURVE = {"top": jnp.asarray(2.0), "rate": jnp.asarray([0.8])}
 DATA = CURVE["top"] * (1 - jnp.exp(-CURVE["rate"] * X)) + 0.01 * jnp.sin(37 * X)
@@ -85,13 +85,13 @@ def curve(p):
 BEGIN = {"top": jnp.asarray(1.5), "rate": jnp.asarray([0.5])}
 
 
-# what is found
+# results of fits
 
 
 @pytest.fixture(scope="module")
 def found():
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the colours of what is transparent are not determined
+        warnings.simplefilter("ignore")  # colours at transparent points are not determined
         return jv.fit(RESIDUAL, GREY, max_steps=40)
 
 
@@ -106,14 +106,14 @@ def test_a_transfer_function_is_recovered_from_grey_and_held_out_views_agree(fou
 
 
 def test_the_loss_is_half_the_mean_square_error(found):
-    errors = [image(GREY, view) - wanted for view, wanted in VIEWS]
+    errors = [image(GREY, view) - target for view, target in VIEWS]
     assert found.losses[0] == pytest.approx(float(np.mean(np.square(errors))) / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("solver", ["levenberg_marquardt", "gauss_newton", "bfgs"])
 def test_every_solver_finds_the_same_curve(solver):
     result = jv.fit(curve, BEGIN, solver=solver, rtol=1e-4, atol=1e-4, constraints=jv.Positive())
-    # the line search of BFGS ends against the rounding of the loss
+    # rounding of the loss stops BFGS's line search
     assert result.success or solver == "bfgs", result.message
     with in_float64():
         truth = np.asarray(X, float), np.asarray(DATA, float)
@@ -152,7 +152,7 @@ def test_gradient_of_the_loss_is_that_of_the_triangle():
 
 @pytest.mark.slow
 def test_tiles_make_no_difference():
-    """Three rows of a view at a time, of 20, so that the last piece reaches past the image."""
+    """Three of 20 rows of a view at a time, so that the last tile reaches past the image."""
     free, y = Free.of(GREY, None, None)
     whole = np.asarray(triangle(Problem(RESIDUAL, free, RESIDUAL.count()), y))
     tiled = np.asarray(triangle(Problem(RESIDUAL, free, 3 * 24 * 3), y))
@@ -169,7 +169,7 @@ def test_views_may_differ_in_size_and_channels():
     assert float(Problem(residual, free, residual.count()).loss(y)) < 1e-12
 
 
-# how much is known
+# uncertainty
 
 
 def test_covariance_of_a_line_is_that_of_the_textbook():
@@ -179,12 +179,12 @@ def test_covariance_of_a_line_is_that_of_the_textbook():
     result = jv.fit(lambda p: jnp.asarray(matrix) @ p - data, jnp.zeros(3))
     solution, square, *_ = np.linalg.lstsq(matrix.astype(float), data.astype(float))
     np.testing.assert_allclose(result.parameters, solution, rtol=1e-4)
-    wanted = square / (30 - 3) * np.linalg.inv(matrix.T.astype(float) @ matrix)
-    known = result.uncertainty
-    np.testing.assert_allclose(known.covariance, wanted, rtol=1e-3, atol=1e-3 * abs(wanted).max())
-    assert known.names == ["[0]", "[1]", "[2]"]
-    assert known.standard_errors["[1]"] == pytest.approx(np.sqrt(wanted[1, 1]), rel=1e-3)
-    assert known.undetermined == []
+    expected = square / (30 - 3) * np.linalg.inv(matrix.T.astype(float) @ matrix)
+    uncertainty = result.uncertainty
+    np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-3, atol=1e-3 * abs(expected).max())
+    assert uncertainty.names == ["[0]", "[1]", "[2]"]
+    assert uncertainty.standard_errors["[1]"] == pytest.approx(np.sqrt(expected[1, 1]), rel=1e-3)
+    assert uncertainty.undetermined == []
 
 
 def test_covariance_is_of_the_parameters_and_not_of_the_free_numbers():
@@ -200,7 +200,7 @@ def test_covariance_is_the_scatter_of_repeated_fits():
     noise = 0.05 * rng.normal(size=(200, 40)).astype(np.float32)
 
     class Noisy(eqx.Module):
-        """A module, so that a fit of other data is no other program."""
+        """A module, so that fits of different data share one program."""
 
         noise: jnp.ndarray
 
@@ -211,22 +211,22 @@ def test_covariance_is_the_scatter_of_repeated_fits():
     scatter = np.cov(
         [[float(f.parameters["rate"][0]), float(f.parameters["top"])] for f in fits], rowvar=False
     )
-    told = np.mean([f.uncertainty.covariance for f in fits], axis=0)
-    np.testing.assert_allclose(np.sqrt(np.diag(told)), np.sqrt(np.diag(scatter)), rtol=0.2)
+    reported = np.mean([f.uncertainty.covariance for f in fits], axis=0)
+    np.testing.assert_allclose(np.sqrt(np.diag(reported)), np.sqrt(np.diag(scatter)), rtol=0.2)
 
 
 def test_a_direction_that_nothing_shows_is_named():
-    """No voxel has a value as high as those of the last interval."""
+    """No voxel's value lies in the last interval."""
     values = [0, 40, 70, 100, 130, 170, 300, 400]
     start = jv.TransferFunction(values, GREY.colors, GREY.extinction)
     with pytest.warns(UserWarning, match=r"of 32 directions are not determined .*\.extinction\[7\]"):
         result = jv.fit(RESIDUAL, start, max_steps=3)
-    known = result.uncertainty
-    assert [".extinction[7]"] in known.undetermined
+    uncertainty = result.uncertainty
+    assert [".extinction[7]"] in uncertainty.undetermined
     for name in (".extinction[7]", ".colors[7, 0]", ".colors[7, 2]"):
-        assert known.standard_errors[name] == np.inf
+        assert uncertainty.standard_errors[name] == np.inf
     for name in (".extinction[3]", ".colors[3, 0]", ".extinction[6]"):
-        assert np.isfinite(known.standard_errors[name])
+        assert np.isfinite(uncertainty.standard_errors[name])
     assert np.array_equal(result.parameters.extinction[7:], GREY.extinction[7:])
 
 
@@ -236,7 +236,7 @@ def test_as_many_parameters_as_residuals_leave_the_variance_unknown():
     assert np.all(np.diag(result.uncertainty.covariance) == np.inf)
 
 
-# what is free
+# free parameters
 
 
 def test_where_chooses_what_is_free():
@@ -275,7 +275,7 @@ def test_constraints_may_be_the_beginning_of_a_tree():
 
 
 def unreachable(parameters):
-    raise AssertionError("the residual was asked for before the arguments were checked")
+    raise AssertionError("the residual was called before the arguments were checked")
 
 
 NAN = np.full((20, 24, 3), np.nan, np.float32)
@@ -296,7 +296,7 @@ BAD = {
     ),
     "checkpoint a folder": (
         lambda: jv.fit(unreachable, BEGIN, checkpoint=Path(__file__).parent),
-        r"checkpoint: .*tests cannot be written \(it is a folder\)",
+        r"checkpoint: .*fitting cannot be written \(it is a folder\)",
     ),
     "no views": (lambda: jv.ImageResidual(seen, []), "views must hold at least one pair"),
     "views": (lambda: jv.ImageResidual(seen, [VIEWS[0][1]]), "views must be pairs"),
@@ -375,7 +375,7 @@ def test_a_derivative_that_leads_uphill_stalls():
 
 
 def test_what_diverges_gives_back_the_best_seen():
-    """From 2, each step of Gauss and Newton on the arcus tangent goes farther than the one before."""
+    """From 2, Gauss–Newton steps on the arctangent diverge, each farther than the one before."""
     result = jv.fit(jnp.arctan, jnp.asarray([2.0]), solver="gauss_newton", max_steps=50)
     assert not result.success
     assert result.message
@@ -416,11 +416,11 @@ def test_a_fit_that_is_broken_off_goes_on_to_the_same_bits(tmp_path):
             jv.fit(curve, BEGIN, solver=solver, checkpoint=file, checkpoint_seconds=0, callback=stop)
         steps = []
 
-        def note(step, parameters, loss, steps=steps):
+        def record(step, parameters, loss, steps=steps):
             steps.append(step)
 
-        again = jv.fit(curve, BEGIN, solver=solver, checkpoint=file, max_steps=30, callback=note)
-        assert steps[0] == 4  # the callback came before the checkpoint
+        again = jv.fit(curve, BEGIN, solver=solver, checkpoint=file, max_steps=30, callback=record)
+        assert steps[0] == 4  # the callback is called before the checkpoint is written
         assert same(again.parameters, whole.parameters)
         assert np.array_equal(again.losses, whole.losses)
         assert again.message == whole.message
@@ -478,9 +478,9 @@ def test_with_both_checkpoints_damaged_a_fit_starts_anew(tmp_path):
     whole = jv.fit(curve, BEGIN, checkpoint=file, checkpoint_seconds=0)
     for damaged in (file, checkpoints.before(file)):
         damaged.write_bytes(b"")
-    with pytest.warns(UserWarning, match="damaged") as told:
+    with pytest.warns(UserWarning, match="damaged") as warned:
         again = jv.fit(curve, BEGIN, checkpoint=file)
-    assert len(told) == 2
+    assert len(warned) == 2
     assert same(again.parameters, whole.parameters)
 
 
@@ -551,7 +551,7 @@ def test_a_fit_that_is_killed_at_random_ends_with_the_same_bits(tmp_path):
     assert start("whole").wait() == 0
     for _ in range(3):
         run = start("killed")
-        run.stdout.readline()  # it is under way
+        run.stdout.readline()  # wait until it has started
         time.sleep(rng.uniform(0, 1))
         run.send_signal(signal.SIGKILL)
         run.wait()
@@ -568,11 +568,11 @@ def test_a_pose_is_found_from_ten_degrees_and_five_percent_off():
     volume = jv.phantom("head", 32)
     march = jv.March(0.04, (jv.AlphaCorrection(),), "midpoint")
     truth = jv.Camera((1.5, -4.0, 0.8), (0.05, 0.0, -0.1), (0.1, 0.0, 1.0), size=(48, 40))
-    wanted = jv.render(volume, TRUTH, truth, march).image()
+    target = jv.render(volume, TRUTH, truth, march).image()
     turn = np.deg2rad(10) * np.asarray([0.48, -0.6, 0.64])
     off = {"rotation": jnp.asarray(turn, jnp.float32), "translation": jnp.asarray([0.03, -0.03, 0.0265])}
     start = jv.Pose(truth).forward(off)
-    residual = jv.ImageResidual(lambda camera, _: (volume, TRUTH, camera, march), [(truth, wanted)])
+    residual = jv.ImageResidual(lambda camera, _: (volume, TRUTH, camera, march), [(truth, target)])
     result = jv.fit(residual, start, max_steps=40)
     back = jv.Pose(truth).inverse(result.parameters)
     assert np.rad2deg(np.linalg.norm(back["rotation"])) < 0.05

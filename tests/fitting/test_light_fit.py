@@ -1,4 +1,4 @@
-"""Mean free paths are found back from renders of templates, and said to be undetermined where they are."""
+"""Are mean free paths recovered from lit images, and reported as undetermined where they are?"""
 
 import jax.numpy as jnp
 import numpy as np

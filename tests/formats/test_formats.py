@@ -1,4 +1,4 @@
-"""Does a file become the volume that it says it is, and does a bad one say what is wrong with it?"""
+"""Are files loaded as the volumes that their headers describe, and bad files refused with the reason?"""
 
 import gzip
 import io
@@ -23,13 +23,13 @@ RAW_DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "float32")
 
 
 def ramp(dtype="uint8"):
-    """Every voxel another value, of both signs where the type has them, so no two axes can be confused."""
+    """A different value in every voxel, of both signs for signed types, so that no axes can be confused."""
     values = np.arange(60).reshape(SHAPE)
     return (values if np.dtype(dtype).kind == "u" else values - 20).astype(dtype)
 
 
 def raw_bytes(data, order="<"):
-    """x fastest, in this byte order."""
+    """The voxels' bytes, x fastest, in this byte order."""
     return data.astype(data.dtype.newbyteorder(order)).tobytes(order="F")
 
 
@@ -151,18 +151,18 @@ def test_npz_of_one_array_of_any_name(tmp_path):
     assert same(load(tmp_path / "a.npz"), ramp("float32"))
 
 
-# What is wrong with a file is said
+# Bad files
 
 
 class Bomb:
-    """What goes off when it is unpickled."""
+    """Fails the test if it is unpickled."""
 
     def __reduce__(self):
         return pytest.fail, ("a file was unpickled",)
 
 
 def npy_header(shape):
-    """A .npy file of bytes in this shape that ends where they should begin."""
+    """The header of a .npy file of bytes of this shape, without any data."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
     return stream.getvalue()
@@ -295,7 +295,7 @@ def test_a_second_header_is_refused(tmp_path, file, given):
 
 
 def sparse(path):
-    """8 GiB that take no room on the disk."""
+    """Write a sparse file of 8 GiB, which takes no disk space."""
     with path.open("wb") as stream:
         stream.truncate(2**33)
 
@@ -368,7 +368,7 @@ def test_itk_round_trip(sitk, tmp_path, ending, compress):
 
 @pytest.mark.parametrize("ending", ITK_ENDINGS)
 def test_a_turned_image_comes_out_along_left_back_and_head(sitk, tmp_path, ending):
-    # file axes: first towards the head, second to the right, third to the front
+    # axes of the file: toward the head, the right and the front
     direction = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     path = write_itk(sitk, tmp_path / f"a{ending}", ramp("int16"), (1, 2, 3), (10, 20, 30), direction)
     expected = ramp("int16").transpose(1, 2, 0)[::-1, ::-1, :]
@@ -431,7 +431,7 @@ def test_images_that_are_not_3d_or_not_scalar_are_refused(sitk, tmp_path):
 def test_an_itk_file_cut_short_is_refused(sitk, tmp_path, ending, compress):
     noise = np.random.default_rng(0).integers(0, 250, (20, 20, 20)).astype("uint8")
     path = write_itk(sitk, tmp_path / f"a{ending}", noise, compress=compress)
-    held = max(tmp_path.iterdir(), key=lambda file: file.stat().st_size)  # of .mhd, the other file
+    held = max(tmp_path.iterdir(), key=lambda file: file.stat().st_size)  # for .mhd, the data file
     held.write_bytes(held.read_bytes()[:-1000])
     with pytest.raises(ValueError, match=f"a{ending}"):
         load(path)

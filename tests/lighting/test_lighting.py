@@ -1,4 +1,4 @@
-"""Light: each step of the shading by hand, all engines alike, and gradients by differences."""
+"""Lighting: shading steps against hand calculations, agreement of the engines, gradients by differences."""
 
 import functools
 from functools import partial
@@ -12,7 +12,7 @@ import pytest
 import jaxvol as jv
 from jaxvol import reference
 from jaxvol._util.vec3 import apart
-from jaxvol.engine import shading as visible
+from jaxvol.engine import shading as engine_shading
 from jaxvol.engine.shading import shade_pixels
 from jaxvol.lighting import (
     ConstantLight,
@@ -24,14 +24,14 @@ from jaxvol.lighting import (
     ScattererTemplate,
     ScattererTemplates,
     scatterers,
-    shading as seam,
+    shading as lighting_shading,
 )
 from jaxvol.lighting.baked import BakedLighting
 from jaxvol.lighting.shading import Sample, Shading, Surroundings, lit
 from jaxvol.space import Affine, Line
 
 from ..half_space import chandrasekhar, reflected, under_sky
-from ..scenes import anisotropic_noise, around, doubled, in_float64, scaled_phantom, soft_transfer
+from ..scenes import anisotropic_noise, around, in_float64, scaled_phantom, soft_transfer, to_float64
 
 
 # ---------------------------------------------------------------- samples lit one by one
@@ -42,7 +42,7 @@ def look_around(volume, transfer):
 
 
 def sample_at(around, point, pixel, transmittance):
-    """The sample that a ray would take at a world point."""
+    """The sample of a ray at a world point."""
     seen, point = around.transfer.over(around.volume), apart(point)
     measured = seen.measure(around.space.coordinate(point))
     color, extinction = seen.classify(measured)
@@ -64,7 +64,7 @@ def lit_points(lighting, volume, transfer, points, pixels, transmittance):
 
 
 def shade(lighting, volume, transfer, points, *, pixels=None, transmittance=1.0):
-    """The colours of some points as lit."""
+    """The lit colours of some points."""
     points = jnp.asarray(points, float)
     pixels = jnp.zeros((len(points), 2), jnp.int32) if pixels is None else pixels
     return np.asarray(lit_points(lighting, volume, transfer, points, pixels, jnp.asarray(transmittance)))
@@ -72,8 +72,8 @@ def shade(lighting, volume, transfer, points, *, pixels=None, transmittance=1.0)
 
 # ---------------------------------------------------------------- the steps, by hand
 #
-# A grid of nodes a unit apart, its middle at the origin, of air but for single nodes, on which the sample and
-# its photons come to lie. A wall is seen, and of no material. Two lights of three are dark in each scene.
+# A grid of nodes with spacing 1, centred at the origin, is air except for single nodes, where the sample and
+# its photons lie. A wall is visible but has no material. In each scene, one of three lights shines.
 
 SKIN, OTHER_SKIN, BONE, OTHER_BONE, WALL = 1.0, 1.2, 2.0, 2.2, 3.0
 SEEN = {
@@ -95,7 +95,7 @@ IRRADIANCE = np.array([1.0, 2.0, 3.0])
 
 
 def radiance_of(opacity, irradiance=1.0):
-    """What a sample of a material makes of E b (c + s): 4 / (3π) times the reflectance of a half-space."""
+    """Factor of E b (c + s) in a sample's radiance: 4 / (3π) times the reflectance of a half-space."""
     gamma = np.sqrt(opacity)
     return 4 / (3 * np.pi) * (1 - gamma) / (1 + gamma) * (1 - gamma / (3 * (1 + gamma))) * irradiance
 
@@ -105,7 +105,7 @@ PAIR = (((2, 0, 0), 0.3), ((-2, 0, 0), 0.6))
 
 
 def nodes(places):
-    """A volume of these values at these nodes, and skin in the middle."""
+    """A volume with these values at these nodes, and skin at the origin."""
     data = np.zeros((9, 9, 9), np.float32)
     for (x, y, z), value in {(0, 0, 0): SKIN, **places}.items():
         data[x + 4, y + 4, z + 4] = value
@@ -113,13 +113,13 @@ def nodes(places):
 
 
 def given(*of_materials):
-    """Templates made by hand, one for each material: of photons (offset, intensity)."""
+    """Handmade templates of photons (offset, intensity), one for each material."""
     offset, intensity = zip(*(zip(*each, strict=True) for each in of_materials), strict=True)
     return ScattererTemplate(jnp.asarray(offset, float)[:, None], jnp.asarray(intensity, float)[:, None])
 
 
 def lights(*, sun=None, lamp=None, sky=False):
-    """A sun in a direction, a lamp at a place and a sky, of which one shines."""
+    """A sun, a lamp and a sky, one of which shines."""
     dark = np.zeros(3)
     return (
         DirectionalLight(
@@ -131,7 +131,7 @@ def lights(*, sun=None, lamp=None, sky=False):
 
 
 def middle(occlusion, places, photons, *, reach=(2.0,), transmittance=1.0, cutoff=1e-6, **of_lights):
-    """The colour of the node in the middle."""
+    """The lit colour of the node at the origin."""
     lighting = ScattererTemplates(
         MATERIALS,
         lights(**of_lights),
@@ -144,7 +144,7 @@ def middle(occlusion, places, photons, *, reach=(2.0,), transmittance=1.0, cutof
 
 
 def smooth(x):
-    """The ramp of the lit side under soft occlusion: from 0 at 0 to 1 at 1."""
+    """Smooth ramp of the lit side under soft occlusion, from 0 at 0 to 1 at 1."""
     x = np.clip(x, 0, 1)
     return x**2 * (3 - 2 * x)
 
@@ -174,20 +174,20 @@ def test_step_1_photons_nearer_to_the_lamp_are_lit_and_those_behind_it_are_not()
     photons, r = (((3, 0, 0), 0.3), ((2, 0, 0), 0.6)), 1.2
     arriving = COLOR[SKIN] * POWER / r**2
     same(middle("hard", {}, photons, lamp=(r, 0, 0)), arriving * 0.6)
-    # r - |r d - p|, to second order of p / r, over |p|
+    # (r - |r d - p|) / |p|, to second order in p / r
     parts = [smooth(0.5 + (1 - length / (2 * r)) / 0.5) for length in (3, 2)]
     assert parts[0] == 0
     same(middle("soft", {}, photons, lamp=(r, 0, 0)), arriving * 0.6 * parts[1])
 
 
 def test_step_1_the_lamp_lights_by_distance_exactly():
-    """A photon to the side of a lamp is nearer to it only if it is nearer by its distance."""
+    """A photon is lit by the lamp if its distance to the lamp is smaller than the sample's."""
     random = np.random.default_rng(0)
     for _ in range(20):
         lamp, photon = random.normal(size=3) * 2, random.normal(size=3)
         nearer = np.linalg.norm(lamp - photon) < np.linalg.norm(lamp)
         found = middle("hard", {}, ((photon, 0.4), (photon, 0.0)), lamp=lamp, reach=())
-        clear = np.abs(photon).max() > 1.01  # not beside the sample, in its own matter
+        clear = np.abs(photon).max() > 1.01  # not in the cells around the sample, which hold its own material
         if clear:
             same(found, COLOR[SKIN] * POWER / (lamp @ lamp) * 0.4 * nearer)
 
@@ -233,7 +233,7 @@ def test_step_4_a_photon_in_the_same_material_adds_its_colour(occlusion):
 
 @FORMS
 def test_step_4_inner_colour_comes_from_all_sides(occlusion):
-    """Of two photons the one in matter need not be on the lit side."""
+    """A photon in material adds its colour even if it is not on the lit side."""
     dense = {"hard": 1, "soft": 1 - np.exp(-0.6 * 0.7)}
     inner = 0.3 * dense[occlusion] * COLOR[OTHER_SKIN]
     expected = POWER * 0.6 * (COLOR[SKIN] + inner)
@@ -242,7 +242,7 @@ def test_step_4_inner_colour_comes_from_all_sides(occlusion):
 
 @FORMS
 def test_step_5_a_photon_in_another_material_is_moved_and_scaled(occlusion):
-    """The speeds are as 1.2 to 0.8, so that it comes to lie 3 away; the opacities as 0.8 to 0.5."""
+    """The refractive indices are 1.2 and 0.8, which moves it to distance 3; the opacities are 0.5 and 0.8."""
     places = {(2, 0, 0): BONE, (3, 0, 0): OTHER_BONE}
     hidden = {"hard": 0, "soft": np.exp(-3 * 0.9)}
     dense = {"hard": 1, "soft": 1 - np.exp(-0.9 * 0.4)}
@@ -276,7 +276,7 @@ def test_what_belongs_to_no_material_keeps_its_colour(occlusion):
 
 @FORMS
 def test_nothing_of_a_material_shines_by_itself(occlusion):
-    """From edge to edge of its values, where it comes and goes softly under soft occlusion."""
+    """Over the material's whole range of values; under soft occlusion its edges are soft."""
     low, high = 0.9, 1.3
     lighting = ScattererTemplates(
         MATERIALS, lights(sky=True), occlusion=occlusion, reach=(2.0,), cutoff=1e-6, given=given(PAIR, PAIR)
@@ -290,7 +290,7 @@ def test_nothing_of_a_material_shines_by_itself(occlusion):
 
 @FORMS
 def test_where_a_place_belongs_to_two_materials_the_first_counts(occlusion):
-    """They have templates of their own, of which one is twice as bright."""
+    """The materials have different templates, one twice as bright as the other."""
     brighter = tuple((offset, 2 * intensity) for offset, intensity in PAIR)
     everywhere = [Material(0.5, 0.7, 1.2, values=(0.0, 4.0)), MATERIALS[0]]
     for materials, part in ((everywhere, 0.9), (everywhere[::-1], 0.9), ([MATERIALS[1], everywhere[0]], 1.8)):
@@ -308,24 +308,24 @@ def test_where_a_place_belongs_to_two_materials_the_first_counts(occlusion):
 
 @pytest.mark.parametrize("occlusion", ["soft", pytest.param("hard", marks=pytest.mark.slow)])
 def test_materials_by_label_are_where_the_label_is(occlusion):
-    """Nodes of label 1 for x < 0, of label 2 elsewhere, which no material has."""
+    """Nodes have label 1 for x < 0, and elsewhere label 2, which belongs to no material."""
     data = np.full((9, 9, 9), SKIN, np.float32)
     labels = np.where(np.arange(9) < 4, 1, 2).astype(np.uint8)[:, None, None] * np.ones((1, 9, 9), np.uint8)
     volume = jv.Volume(data, origin=(-4, -4, -4), labels=labels)
     skin = Material(0.5, 0.7, label=1)
-    photons = ((8, 0, 0), 0.3), ((0, 8, 0), 0.6)  # outside of the volume, where they are not hidden
+    photons = ((8, 0, 0), 0.3), ((0, 8, 0), 0.6)  # outside the volume, where they are not occluded
     points = [(-2, 0, 0), (-0.75, 0, 0), (-0.4, 0, 0), (1, 0, 0)]
     lighting = ScattererTemplates(
         skin, ConstantLight(IRRADIANCE), occlusion=occlusion, reach=(2.0,), given=given(photons)
     )
-    # between the nodes the material has a share of 0.75, and of 0.4: from a half on, all is lit as its matter
+    # between the nodes, the material's share is 0.75 and 0.4; from a half on, the whole sample is lit
     parts = {"hard": (1, 1, 0, 0), "soft": (1, 1, 0.8, 0)}[occlusion]
     expected = [COLOR[SKIN] * (part * np.pi * POWER * 0.9 + 1 - part) for part in parts]
     same(shade(lighting, volume, TRANSFER, points), expected)
 
 
 def test_a_blend_is_the_mean_over_the_templates():
-    """In air, where the colour is linear in a template."""
+    """Photons lie in air, where the colour is linear in the template."""
     random = np.random.default_rng(1)
     offset = jnp.asarray(random.normal(size=(2, 2, 2, 3)) + 2.2, float)
     templates = ScattererTemplate(offset, jnp.asarray(random.uniform(0.1, 0.3, (2, 2, 2)), float))
@@ -339,7 +339,7 @@ def test_a_blend_is_the_mean_over_the_templates():
     same(seen(templates, blend=True), (each[0] + each[1]) / 2)
 
 
-# ---------------------------------------------------------------- what it looks like
+# ---------------------------------------------------------------- appearance
 
 PLAIN = jv.TransferFunction([0.0, 0.5, 1.0], np.full((3, 3), 0.7), [0.0, 0.0, 4.0])
 DENSE = jv.TransferFunction(PLAIN.values, PLAIN.colors, 10 * PLAIN.extinction)
@@ -355,7 +355,7 @@ def solid(inside):
 
 @functools.cache
 def pool():
-    """Many templates, (1, 256, photons), walked by hand: to grow them takes long to compile."""
+    """256 templates, (1, 256, photons), simulated in NumPy, since growing them takes long to compile."""
     random = np.random.default_rng(1)
 
     def anywhere(n):
@@ -385,7 +385,7 @@ def pool():
 
 
 def few():
-    """Four of these templates, of six photons."""
+    """Four of these templates, of six photons each."""
     return jax.tree.map(lambda leaf: leaf[:, :4], pool()).brightest(6)
 
 
@@ -394,7 +394,7 @@ def as_one(templates):
 
 
 def brightness(volume, points, light, *, reach=(2.0,)):
-    """The mean colour of 64 points under a sun and a sky."""
+    """Mean lit colour of 64 points."""
     lighting = ScattererTemplates(FLESH, light, reach=reach, given=as_one(few()))
     assert len(points) == 64
     return shade(lighting, volume, DENSE, points).mean()
@@ -439,7 +439,7 @@ def test_cavities_are_darker_than_open_faces():
 
 
 def test_a_thin_plate_shades_what_is_behind_it_within_reach():
-    """An ear before the head: photons come to lie between the two, and beyond the plate."""
+    """As an ear in front of the head: photons lie between the two, and beyond the plate."""
     plate = solid(
         lambda x, y, z: (np.maximum(np.maximum(abs(x), abs(y)), abs(z)) < 0.5) | (abs(z - 0.67) < 0.05)
     )
@@ -452,7 +452,7 @@ def test_a_thin_plate_shades_what_is_behind_it_within_reach():
 
 @pytest.mark.slow
 def test_noise_falls_as_templates_are_blended():
-    """Over pixels of a flat face that are alike but for their choice of a template: as one over the root."""
+    """Pixels of a flat face differ only in their template; noise falls as 1 / sqrt(number of templates)."""
     n = pool().intensity.shape[-1]
     pixels = jnp.asarray(np.indices((20, 20)).reshape(2, -1).T, jnp.int32)
     points = np.tile((0.03, 0.02, 0.46), (len(pixels), 1))
@@ -477,7 +477,7 @@ def test_noise_falls_as_templates_are_blended():
 
 
 def loss_of_points(lighting, scene):
-    """A sum over some lit points of a block, whose voxels rise smoothly."""
+    """A weighted mean over lit points of a smooth volume."""
     volume, transfer, points = scene
     pixels = jnp.zeros((len(points), 2), jnp.int32)
     found = lit_points(lighting, volume, transfer, points, pixels, jnp.ones(()))
@@ -491,14 +491,14 @@ def smooth_scene():
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (256, 3))
     return (
         volume,
-        doubled(jv.TransferFunction(PLAIN.values, PLAIN.colors, PLAIN.extinction)),
+        to_float64(jv.TransferFunction(PLAIN.values, PLAIN.colors, PLAIN.extinction)),
         jnp.asarray(points),
     )
 
 
 def slopes_in_the_path(occlusion, *steps):
-    """The adjoint's slope in λ, its mean over the way from a step below to a step above; and that of the
-    central difference; for each of these steps."""
+    """For each step h: the derivative with respect to λ, averaged from λ - h to λ + h, and the central
+    difference between these ends."""
     with in_float64():
         scene = smooth_scene()
         lighting = ScattererTemplates(
@@ -525,7 +525,7 @@ def slopes_in_the_path(occlusion, *steps):
 
 
 def test_the_soft_gradient_in_the_path_is_the_difference_at_any_step():
-    """A jump would be seen by the difference alone."""
+    """A jump would show only in the difference."""
     for (adjoint, difference), error in zip(
         slopes_in_the_path("soft", 2e-8, 1e-2), (1e-5, 0.01), strict=True
     ):
@@ -534,7 +534,7 @@ def test_the_soft_gradient_in_the_path_is_the_difference_at_any_step():
 
 @pytest.mark.slow
 def test_the_hard_gradient_in_the_path_is_wrong():
-    """It does not see photons that become hidden, which are the most of it."""
+    """It misses photons that become occluded, which are most of the change."""
     [(adjoint, difference)] = slopes_in_the_path("hard", 1e-2)
     assert abs(adjoint - difference) > 0.5 * abs(difference)
 
@@ -557,7 +557,7 @@ EXTREMES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("occlusion", ["soft", "hard"])
 def test_values_and_gradients_are_finite_at_extremes(occlusion):
-    """A lamp is at one of the samples throughout."""
+    """One of the samples coincides with a lamp."""
     volume, transfer, points = jax.tree.map(
         lambda leaf: jnp.asarray(leaf, jnp.float32) if eqx.is_array(leaf) else leaf, smooth_scene()
     )
@@ -597,12 +597,12 @@ def test_values_and_gradients_are_finite_at_extremes(occlusion):
             assert np.all(np.isfinite(leaf)), (name, jax.tree_util.keystr(path))
 
 
-# ---------------------------------------------------------------- one scale
+# ---------------------------------------------------------------- absolute brightness
 
 
 def half_space(opacity, light):
-    """Radiance, seen along the normal, of white matter that fills all below a face: of the points of one ray,
-    each as it is lit and by how much is seen of it."""
+    """Radiance along the normal of a white half-space: the lit colours of points along one ray, weighted by
+    their opacity and transmittance."""
     volume = jv.Volume(np.full((4, 4, 101), 0.5, np.float32), (20.0, 20.0, 0.2))
     x, y, _ = volume.center
     transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [1.0, 1.0])
@@ -617,7 +617,7 @@ def half_space(opacity, light):
     "opacity", [pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.3, marks=pytest.mark.slow), 0.6]
 )
 def test_templates_are_as_bright_as_path_tracing(opacity):
-    """In closed form: what a half-space reflects of light from all sides, and of parallel light."""
+    """Compared with closed forms for half-spaces under uniform and under parallel light."""
     albedo = np.array([1 - opacity])
     sky = half_space(opacity, (DirectionalLight((0, 0, 1), (0, 0, 0)), ConstantLight((2, 2, 2))))
     sun = half_space(opacity, (DirectionalLight((0, 0, 1), (2, 2, 2)), ConstantLight((0, 0, 0))))
@@ -626,7 +626,7 @@ def test_templates_are_as_bright_as_path_tracing(opacity):
 
 
 def test_the_reflectance_of_a_material_is_that_of_multiple_scattering():
-    """All light of a half-space of H, integrated over the directions in which it leaves."""
+    """Chandrasekhar's solution for a half-space, integrated over the outgoing directions."""
     nodes, weights = np.polynomial.legendre.leggauss(32)
     for opacity in (0.001, 0.05, 0.3, 0.7, 0.99):
         cosines = (nodes + 1) / 2
@@ -636,7 +636,7 @@ def test_the_reflectance_of_a_material_is_that_of_multiple_scattering():
 
 
 def test_the_threshold_does_not_show_in_the_brightness():
-    """What it cuts off is given back."""
+    """The energy that it cuts off is added back."""
 
     def templates(threshold):
         how = ScattererTemplates(Material(0.5, 1.0), SUN, threshold=threshold, templates=1, packets=1)
@@ -652,14 +652,14 @@ def test_the_threshold_does_not_show_in_the_brightness():
 
 
 def grown_in_the_program(occlusion="soft", **of_lights):
-    """By templates of a single photon, which are grown soon."""
+    """Lighting by templates of a single photon, which compile quickly."""
     how = {"templates": 1, "packets": 1, "levels": 1, "cutoff": 1e-6}
     return ScattererTemplates(MATERIALS, lights(**of_lights), occlusion=occlusion, **how)
 
 
 @pytest.mark.parametrize("occlusion", ["soft", "hard"])
 def test_nan_in_light_or_material_reaches_the_sample(occlusion):
-    """By `tree_at`, as an optimiser puts it there."""
+    """Inserted by `tree_at`, as an optimiser does."""
     lighting = grown_in_the_program(occlusion, sun=(1, 0, 0))
     volume, point = nodes({}), [(0, 0, 0)]
     assert np.isfinite(shade(lighting, volume, TRANSFER, point)).all()
@@ -693,7 +693,7 @@ def test_nan_in_what_is_baked_reaches_all_of_it():
 def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
     volume, space = nodes({}), Affine(nodes({}))
     lighting = ScattererTemplates(MATERIALS, lights(sky=True), given=given(PAIR, PAIR), reach=(2.0,))
-    seen = seam.classification(volume, TRANSFER, space, lighting)
+    seen = lighting_shading.classification(volume, TRANSFER, space, lighting)
     zero = jnp.zeros((), jnp.int32)
     line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
     rgba = jnp.asarray([[jnp.nan] * 4, [0.5] * 4, [0.0] * 4])
@@ -775,7 +775,7 @@ def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
     lighting = ScattererTemplates(FLESH, DAY, baked=5, **how)
     ready = lighting.prepared(volume, PLAIN, jv.March(0.1))
     expected = shade(ready, volume, PLAIN, points)
-    # under jit, where nothing is prepared
+    # under jit, where light is not prepared in advance
     np.testing.assert_allclose(shade(lighting, volume, PLAIN, points), expected, atol=2e-3)
     slope = eqx.filter_jit(eqx.filter_grad(lambda light: jnp.sum(shade_traced(light, volume, points))))(
         lighting
@@ -784,7 +784,7 @@ def test_baked_light_is_computed_in_a_traced_program_and_has_no_gradient():
 
 
 def loss_of_an_image(kind, lighting):
-    """Of (volume, transfer function, camera), with voxels of a kind; and these."""
+    """A loss of (volume, transfer function, camera), with voxels of this type, and these arguments."""
     sphere, transfer = scaled_phantom("sphere", 12), soft_transfer(0.1)
     data = np.asarray(sphere.data * (255 if kind == "uint8" else 1)).astype(kind)
     volume = jv.Volume(data, sphere.spacing, sphere.origin)
@@ -800,7 +800,7 @@ def loss_of_an_image(kind, lighting):
 
 @pytest.mark.parametrize("kind", ["float32", "uint8"])
 def test_there_is_a_gradient_of_an_image_by_baked_light(kind):
-    """Its values are below: to compile them takes minutes."""
+    """A slow test below checks its values, which take minutes to compile."""
     loss, scene = loss_of_an_image(kind, by_hand(baked=8))
     gradient = eqx.filter_eval_shape(eqx.filter_grad(loss), scene, "replay")
     expected = eqx.filter(scene, eqx.is_inexact_array)
@@ -810,7 +810,7 @@ def test_there_is_a_gradient_of_an_image_by_baked_light(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float32", "uint8"])
 def test_an_image_by_baked_light_has_the_gradient_of_all_but_the_light(kind):
-    """Replay, the default, against JAX's own derivative of the reference."""
+    """Compare replay, the default, with JAX's derivative of the reference engine."""
     loss, scene = loss_of_an_image(kind, templates(materials=Material(0.5, 0.15, 1.4), baked=8))
     replay, direct = (
         eqx.filter_jit(eqx.filter_grad(loss))(scene, adjoint) for adjoint in ("replay", "direct")
@@ -818,7 +818,7 @@ def test_an_image_by_baked_light_has_the_gradient_of_all_but_the_light(kind):
     for where in (
         *(() if kind == "uint8" else (lambda s: s[0].data,)),
         lambda s: s[1].colors,
-        lambda s: s[1].extinction[2:],  # where it is 0 nothing is lit
+        lambda s: s[1].extinction[2:],  # samples with an extinction of 0 are not lit
         lambda s: s[2].position,
         lambda s: s[2].view_angle,
     ):
@@ -842,8 +842,8 @@ MANY = (
 )
 PARTS = (Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.8, 0.1, 1.5, values=(0.5, 2.0)))
 SETS = {
-    "leapt": (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)),
-    "unleapt": (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05)),
+    "leaping": (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)),
+    "not leaping": (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05)),
     "plain": (),
     "aligned": (jv.AlphaCorrection(),),
     "jittered": (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection()),
@@ -856,7 +856,7 @@ def templates(occlusion="soft", materials=PARTS, light=MANY, **how):
 
 
 def by_hand(**how):
-    """One light and one material, with templates that are not grown: soon compiled."""
+    """Lighting with one light, one material and given templates, which compiles quickly."""
     random = np.random.default_rng(5)
     offset = jnp.asarray(random.normal(0, 0.1, (1, 2, 4, 3)), jnp.float32)
     pair = ScattererTemplate(offset, jnp.asarray(random.uniform(0.1, 0.4, (1, 2, 4)), jnp.float32))
@@ -864,7 +864,7 @@ def by_hand(**how):
 
 
 def both(volume, transfer, camera, march, lighting):
-    """The image by the fast engine and by the reference."""
+    """Images by the fast engine and by the reference engine."""
     fast, slow = (
         jv.render(volume, transfer, camera, march, lighting=lighting, adjoint=adjoint)
         for adjoint in ("replay", "direct")
@@ -878,7 +878,7 @@ ALL = [(name, occlusion) for occlusion in ("soft", "hard") for name in SETS]
 
 
 def image_of_the_reference(volume, transfer, camera, march, lighting):
-    """Ray by ray."""
+    """Render every pixel with the reference engine."""
     origins, directions = camera.rays()
 
     @jax.jit
@@ -892,23 +892,23 @@ def image_of_the_reference(volume, transfer, camera, march, lighting):
 
 
 def farthest(fast, slow, occlusion):
-    """How far apart two images are. Under hard occlusion rounding may hide a photon, by which single pixels
-    differ."""
+    """Largest difference of two images. Under hard occlusion it ignores a few pixels, in which rounding may
+    occlude a photon."""
     off = np.sort(np.abs(np.asarray(fast) - np.asarray(slow)).max(axis=-1).reshape(-1))
     return off[-5] if occlusion == "hard" else off[-1]
 
 
 def test_the_fast_engine_is_the_reference():
     volume = scaled_phantom("sphere", 12)
-    march = jv.March(0.07, SETS["leapt"], max_samples=80)
+    march = jv.March(0.07, SETS["leaping"], max_samples=80)
     fast, slow = both(volume, soft_transfer(0.1), around(volume, SIZE), march, by_hand())
     assert farthest(fast, slow, "soft") <= 2e-5
 
 
 def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
-    """Of the mean colour, hidden by nothing."""
+    """The sample has the ray's mean colour and is not attenuated."""
     volume, transfer, lighting = scaled_phantom("sphere", 12), soft_transfer(0.1), by_hand()
-    camera, march = around(volume, SIZE), jv.March(0.07, SETS["leapt"], max_samples=80)
+    camera, march = around(volume, SIZE), jv.March(0.07, SETS["leaping"], max_samples=80)
     unlit, found = (
         jv.render(volume, transfer, camera, march, lighting=how) for how in (None, Deferred(lighting))
     )
@@ -938,7 +938,7 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
 
 
 class Dimmed(Lighting):
-    """Half the light, everywhere."""
+    """Halves all colours."""
 
     class Half(Shading):
         def about(self, around, sample):
@@ -955,12 +955,12 @@ class Dimmed(Lighting):
 def test_where_all_samples_are_lit_alike_deferring_does_not_show(outputs):
     volume = scaled_phantom("sphere", 12)
     camera, transfer = around(volume, SIZE), soft_transfer(0.1)
-    march = jv.March(0.07, SETS["leapt"], max_samples=80)
+    march = jv.March(0.07, SETS["leaping"], max_samples=80)
     unlit, each, once = (
         jv.render(volume, transfer, camera, march, lighting=lighting, outputs=outputs, adjoint=adjoint)
         for lighting, adjoint in (
             (None, "replay"),
-            (Dimmed(), "direct"),  # the engines are compared above
+            (Dimmed(), "direct"),  # other tests compare the engines
             (Deferred(Dimmed()), "replay"),
         )
     )
@@ -1001,7 +1001,7 @@ def test_leaping_over_empty_space_changes_no_lit_pixel():
     camera, transfer = around(volume, SIZE), soft_transfer(0.1)
     leapt, other = (
         jv.render(volume, transfer, camera, jv.March(0.07, SETS[name], max_samples=80), lighting=templates())
-        for name in ("leapt", "unleapt")
+        for name in ("leaping", "not leaping")
     )
     np.testing.assert_allclose(leapt.rgba, other.rgba, atol=2e-5)
 
@@ -1039,7 +1039,7 @@ def test_a_curved_grid_and_labels_are_lit_alike():
 
 @pytest.mark.slow
 def test_a_baked_image_is_like_the_blended_one():
-    """The more so, the finer the grid."""
+    """The difference falls with a finer grid."""
     volume = scaled_phantom("sphere", 24)
     camera, transfer = around(volume, SIZE), soft_transfer(0.1)
     march = jv.March(0.05, (jv.AlphaCorrection(),), max_samples=128)
@@ -1061,7 +1061,7 @@ def test_a_baked_image_is_like_the_blended_one():
 
 @pytest.mark.slow
 def test_deferred_light_falls_on_rays_of_ones_own():
-    """As on those of a camera, with one template, which is for all pixels."""
+    """As on a camera's rays, with a single template for all pixels."""
     volume = scaled_phantom("sphere", 12)
     camera, march, lighting = around(volume, SIZE), jv.March(0.1), Deferred(templates(templates=1))
     expected = jv.render(volume, soft_transfer(0.1), camera, march, lighting=lighting)
@@ -1071,12 +1071,12 @@ def test_deferred_light_falls_on_rays_of_ones_own():
 
 @pytest.mark.slow
 def test_one_opaque_surface_is_lit_as_its_samples_are():
-    """The nearer, the more opaque it is, and the closer together its samples lie."""
+    """The difference falls with higher opacity and shorter steps."""
     volume = jv.phantom("constant", 8)
     lighting = templates(blend=True, materials=Material(0.5, 0.5, 1.4))
 
     def off(extinction):
-        """Over what light makes of the image."""
+        """Difference relative to the effect of lighting on the image."""
         transfer = jv.TransferFunction([0.0, 1.0], [[0.7, 0.5, 0.4]] * 2, [extinction] * 2)
         march = jv.March(0.25 / extinction, (jv.AlphaCorrection(), jv.EarlyTermination()))
         each, once, unlit = (
@@ -1092,18 +1092,18 @@ def test_one_opaque_surface_is_lit_as_its_samples_are():
 
 
 def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
-    """All of it goes through one of these, which the programs of images and gradients with a light call."""
+    """All lighting goes through these names, which the programs of lit images call."""
     called = []
-    for module in (seam, reference, visible):
+    for module in (lighting_shading, reference, engine_shading):
         for name in ("lit", "shaded_colors", "Chosen", "Sample"):
             if hasattr(module, name):
                 original = getattr(module, name)
 
-                def noted(*args, name=name, original=original, **how):
+                def recorded(*args, name=name, original=original, **how):
                     called.append(name)
                     return original(*args, **how)
 
-                monkeypatch.setattr(module, name, noted)
+                monkeypatch.setattr(module, name, recorded)
     volume = scaled_phantom("sphere", 12)
     transfer, camera, march = soft_transfer(0.1), around(volume, (9, 7)), jv.March(0.2, max_samples=32)
 
@@ -1121,7 +1121,7 @@ def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
 # ---------------------------------------------------------------- gradients of images
 
 IMAGE_STEP = 2e-8
-"""Of central differences in float64: among the kinks of a piecewise linear field, which lie densely."""
+"""Step of central differences in float64, small since a piecewise linear field has many kinks."""
 
 LEAVES = {
     "opacity": lambda s: s[4].materials[0].opacity,
@@ -1149,12 +1149,12 @@ LEAVES = {
 
 
 def image_scene():
-    """A small scene in float64, its materials meeting in the midst of its values."""
+    """A small scene in float64, with two materials that meet in the middle of its values."""
     noise = anisotropic_noise()
     volume = jv.Volume(
         jnp.asarray(np.asarray(noise.data[:6, :5, :7], float)), (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1)
     )
-    transfer = doubled(soft_transfer())
+    transfer = to_float64(soft_transfer())
     transfer = eqx.tree_at(lambda t: t.extinction, transfer, transfer.extinction + 0.1)
     camera = jv.Camera((1.9, -1.3, 1.7), tuple(map(float, volume.center)), (0.1, 0, 1), 40.0, size=(6, 5))
     march = jv.March(0.21, (jv.AlphaCorrection(),), "midpoint", max_samples=32)
@@ -1183,7 +1183,7 @@ def directions(scene):
 
 
 def differences(value, scene, names):
-    """Slopes of the loss along a direction of each leaf."""
+    """Slopes of the loss along a direction of each leaf, by central differences."""
     along, found = directions(scene), {}
     for leaf in names:
         where = LEAVES[leaf]
@@ -1204,7 +1204,7 @@ def check_slopes(gradient, scene, expected):
 
 @pytest.mark.slow
 def test_gradients_of_an_image_match_central_differences():
-    """By one program, which gives the value as well as the gradient."""
+    """One program gives the value and the gradient."""
     with in_float64():
         scene = image_scene()
         program = eqx.filter_jit(eqx.filter_value_and_grad(image_loss("replay")))
@@ -1224,17 +1224,17 @@ def test_gradients_of_deferred_light_match_central_differences():
 
 
 def test_rays_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
-    """Of their light alone; that of an image is below."""
+    """Here only the shading of pixels; a slow test below renders an image."""
     volume, space, zero = nodes({}), Affine(nodes({})), jnp.zeros((), jnp.int32)
     lighting = ScattererTemplates(MATERIALS[0], SUN, given=given(PAIR), reach=(2.0,))
 
     def loss(direction, rgba, depth):
         turned = eqx.tree_at(lambda how: how.lights[0].direction, lighting, direction)
-        seen = seam.classification(volume, TRANSFER, space, turned)
+        seen = lighting_shading.classification(volume, TRANSFER, space, turned)
         line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
         return jnp.sum(shade_pixels(Deferred(turned), seen, space, lambda _: line, rgba, depth) ** 2)
 
-    # one ray that ends where the skin comes in, toward a sun from the side, and one that sees nothing
+    # one ray ends at the skin's soft edge, lit by a sun from the side; the other sees nothing
     rgba, depth = jnp.asarray([[0.3, 0.2, 0.1, 0.5], [0.0] * 4]), jnp.asarray([0.11, jnp.inf])
     found = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(jnp.asarray([-0.1, -1.0, 0.0]), rgba, depth)
     assert all(np.all(np.isfinite(leaf)) for leaf in found)
@@ -1260,7 +1260,7 @@ def test_pixels_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
 
 
 def test_there_is_a_gradient_of_an_image_by_deferred_light():
-    """Its values are above, in slow tests."""
+    """Slow tests above check its values."""
     loss, scene = loss_of_an_image("float32", Deferred(by_hand()))
     gradient = eqx.filter_eval_shape(eqx.filter_grad(loss), scene, "replay")
     expected = eqx.filter(scene, eqx.is_inexact_array)

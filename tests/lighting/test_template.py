@@ -1,4 +1,4 @@
-"""Scatterer templates: where the light of a simulated packet goes, and that none of it is lost or made."""
+"""Scatterer templates: where the energy of simulated packets goes, and whether it is conserved."""
 
 import math
 
@@ -33,13 +33,13 @@ OPACITIES = (0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99)
 INDEX = 1.4
 TEMPLATES = 256
 
-# compiled as a whole, with numbers of the material as arguments
+# one compiled program, with the material's parameters as arguments
 grow = eqx.filter_jit(scatterer_template)
 KEY = jax.random.key(0)
 
 
 def in_turn(function):
-    """For each of what is given: compiled in half the time that `jax.vmap` takes."""
+    """Map `function` by `jax.lax.map`, which compiles in half the time of `jax.vmap`."""
     return jax.jit(lambda each: jax.lax.map(function, each))
 
 
@@ -49,8 +49,8 @@ def totals(template):
 
 
 def simulated_total(opacity, *, packets, threshold, index, templates=20_000):
-    """The mean energy of so many templates, of which all packets are followed at once until none is left.
-    Where they fly to does not matter."""
+    """Mean energy of templates, by following all their packets at once until none is left. Positions do not
+    matter."""
     random, cone = np.random.default_rng(0), math.sqrt(1 - 1 / index**2)
     light, total = np.full(templates * packets, 1 / packets), 0.0
     while light.size:
@@ -66,7 +66,7 @@ def simulated_total(opacity, *, packets, threshold, index, templates=20_000):
 
 @pytest.fixture(scope="module")
 def grown():
-    """Conserving templates of all opacities: (opacities, templates, photons)."""
+    """Energy-conserving templates: (opacities, templates, photons)."""
     levels = max(template_levels(Material(a, 1.0)) for a in OPACITIES)
 
     def one(opacity, key):
@@ -105,7 +105,7 @@ def test_the_capacity_is_that_of_the_paper():
 
 @pytest.mark.parametrize("opacity", [0.5, 0.9, *(pytest.param(a, marks=slow) for a in (0.3, 0.7))])
 def test_the_printed_form_makes_and_loses_energy(opacity):
-    """By a narrow cone nearly all light is refracted, so that little of it falls below the threshold."""
+    """In a narrow cone nearly all light is refracted, so that little of it falls below the threshold."""
     template = grow(
         Material(opacity, 1.0),
         KEY,
@@ -122,7 +122,7 @@ def test_the_printed_form_makes_and_loses_energy(opacity):
 
 
 def test_the_printed_form_loses_most_light_on_its_flights():
-    """A flight leaves exp(-Δx/λ) cos θ, a quarter in the mean, and α of that is passed on: three times."""
+    """Each of three flights leaves exp(-Δx/λ) cos θ, a quarter on average, and passes on α of that."""
     printed = in_turn(
         lambda key: scatterer_template(
             Material(0.9, 1.0),
@@ -141,7 +141,7 @@ def test_the_printed_form_loses_most_light_on_its_flights():
 
 
 def test_first_flights_are_exponential_with_the_mean_free_path():
-    """The share of flights longer than x is exp(-x/λ)."""
+    """The fraction of flights longer than x is exp(-x/λ)."""
     path, number = 0.7, 200_000
     flown = jax.jit(
         jax.vmap(lambda key: scatterer_template(Material(1.0, path), key, packets=1, levels=1, merge=0))
@@ -151,21 +151,21 @@ def test_first_flights_are_exponential_with_the_mean_free_path():
     np.testing.assert_allclose(length.mean(), path, rtol=0.01)
     part = (np.arange(number) + 0.5) / number
     assert np.abs(1 - np.exp(-np.sort(length) / path) - part).max() < 2 / np.sqrt(number)
-    # and they go everywhere alike: each coordinate of a direction is uniform
+    # and directions are isotropic: each coordinate is uniform
     direction = np.sort(offset / length[:, None], axis=0)
     assert np.abs((direction + 1) / 2 - part[:, None]).max() < 2 / np.sqrt(number)
 
 
 def test_four_packets_are_half_as_lopsided_as_one(grown):
-    """By how far the middle of the light lies from the origin, on average."""
+    """Lopsidedness is the mean distance of the energy's centroid from the origin."""
     one = in_turn(
         lambda key: scatterer_template(Material(0.5, 1.0, INDEX), key, packets=1, merge=0, levels=3)
     )
     four = jax.tree.map(lambda leaf: leaf[OPACITIES.index(0.5)], grown)
 
     def lopsided(template):
-        middle = np.einsum("tn,tnx->tx", template.intensity, template.offset) / totals(template)[:, None]
-        return np.linalg.norm(middle, axis=-1).mean()
+        centroid = np.einsum("tn,tnx->tx", template.intensity, template.offset) / totals(template)[:, None]
+        return np.linalg.norm(centroid, axis=-1).mean()
 
     assert lopsided(four) <= 0.5 * lopsided(one(jax.random.split(KEY, 512)))
 
@@ -182,7 +182,7 @@ def test_another_key_draws_another_template():
 
 
 def test_light_is_refracted_within_the_critical_angle():
-    """Of a packet's two successors the brighter one flies on within the cone, where that is narrow."""
+    """In a narrow cone, the brighter of a packet's two successors continues within the cone."""
     angle = 5.0
     template = grow(
         Material(0.3, 1.0), KEY, packets=1, critical_angle=angle, threshold=1e-3, merge=0, levels=3
@@ -206,7 +206,7 @@ def test_by_default_the_cone_is_that_of_total_reflection():
 
 
 def photons(*each):
-    """A template of (offset, intensity)."""
+    """A template of photons (offset, intensity)."""
     offset, intensity = zip(*each, strict=True)
     return ScattererTemplate(jnp.asarray(offset), jnp.asarray(intensity))
 
@@ -237,7 +237,7 @@ def test_merging_keeps_the_total():
 
 @pytest.mark.parametrize(("energy", "lowest"), [("conserving", 0.11), ("printed", 6e-3)])
 def test_gradients_match_central_differences(energy, lowest):
-    """Photons fade at the threshold, as one at least does here, so that a sum over them is smooth."""
+    """Photons fade out at the threshold, so that sums over them are smooth; at least one fades here."""
     with in_float64():
 
         @jax.jit
@@ -265,7 +265,7 @@ def test_gradients_match_central_differences(energy, lowest):
 
 
 def test_the_total_is_continuous_where_a_photon_fades():
-    """Over an opacity at which photons come and go, it changes by no more than its slope tells."""
+    """As the opacity passes values at which photons appear or vanish, the total does not jump."""
     with in_float64():
         opacities = jnp.linspace(0.2, 0.4, 4001)
         several = in_turn(
@@ -275,7 +275,7 @@ def test_the_total_is_continuous_where_a_photon_fades():
         )
         grown = several(opacities)
         assert len(set(np.sum(np.asarray(grown.intensity) > 0, axis=-1))) > 1
-        # were they to vanish at once, the total would jump by a threshold
+        # if photons vanished abruptly, the total would jump by a threshold
         assert np.abs(np.diff(totals(grown))).max() < 0.05 / 50
 
 

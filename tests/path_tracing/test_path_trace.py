@@ -1,7 +1,8 @@
-"""Does path tracing give the light that is there, and the error that it has?
+"""Does path tracing give the right radiance, and the right standard error?
 
-Held against closed forms (absorption, a white furnace, Chandrasekhar's diffuse reflection) and quadrature in
-NumPy, by z-scores of pixels and of means over regions. Seeds are fixed, so that a test that passes stays so.
+Results are compared with closed forms (absorption, a white furnace, Chandrasekhar's diffuse reflection) and
+with quadrature in NumPy, by z-scores of pixels and of means over regions. Seeds are fixed, so that results
+are repeatable.
 """
 
 from typing import Any
@@ -32,7 +33,7 @@ PATHS = 128
 
 
 def lit(*lights: Light) -> tuple[Light, ...]:
-    """These lights, and one of each other kind that is out: one compiled program serves all tests."""
+    """These lights, and a dark one of every other kind, so that all tests share one compiled program."""
     return tuple(next((one for one in lights if type(one) is type(out)), out) for out in NIGHT)
 
 
@@ -44,7 +45,7 @@ def trace(volume, transfer, camera, lights, **how: Any) -> jv.PathTraced:
 
 
 def often(times: int, *scene: Any, **how: Any) -> jv.PathTraced:
-    """So many times PATHS."""
+    """Trace `times` · PATHS paths, in successive calls."""
     traced = None
     for _ in range(times):
         traced = trace(*scene, **how, onto=traced)
@@ -53,19 +54,19 @@ def often(times: int, *scene: Any, **how: Any) -> jv.PathTraced:
 
 
 def cube(labels=None) -> jv.Volume:
-    """The same everywhere, with sides of length 1."""
+    """A constant volume with sides of length 1."""
     return jv.Volume(np.full((24,) * 3, 0.5, np.float32), (1 / 23,) * 3, labels=labels)
 
 
 def far(volume: jv.Volume, height: float) -> jv.Camera:
-    """A view of so much of a volume, along +z, almost parallel."""
+    """An almost parallel view along +z of a square of this height around the centre."""
     center = np.asarray(volume.center)
     angle = np.rad2deg(2 * np.arctan(height / 2 / 200))
     return jv.Camera(center - [0, 0, 200], center, (0, 1, 0), angle, size=(20, 16))
 
 
 def spiky(factor: float = 1.0) -> jv.TransferFunction:
-    """Clear, thin and dense by turns."""
+    """Alternately transparent, thin and dense."""
     return jv.TransferFunction(POINTS, COLORS, factor * EXTINCTION)
 
 
@@ -76,12 +77,12 @@ def regions(image) -> np.ndarray:
 
 
 def z_of_regions(difference, variance) -> np.ndarray:
-    """How many standard errors the regions' differences are. 0 where both are 0."""
+    """Regions' differences in standard errors; 0 where both are 0."""
     return regions(difference) / np.sqrt(np.maximum(regions(variance), 1e-30))
 
 
 def matter(volume, transfer):
-    """In NumPy: the value and the extinction at points, and where rays enter and leave."""
+    """NumPy functions for the value and the extinction at points, and for the entry and exit of rays."""
     data, spacing, origin = (np.asarray(a, float) for a in (volume.data, volume.spacing, volume.origin))
     low, high = (np.asarray(corner, float) for corner in volume.corners)
     values, table = np.asarray(transfer.values, float), np.asarray(transfer.extinction, float)
@@ -102,7 +103,7 @@ def matter(volume, transfer):
 
 
 def middles_of(camera, exits, samples):
-    """Points in the middle of equal parts of each ray, the directions of the rays, and the parts' lengths."""
+    """Midpoints of equal intervals along each ray, the rays' directions, and the intervals' lengths."""
     origins, directions = (np.asarray(a, float).reshape(-1, 3) for a in camera.rays())
     near, far = exits(origins, directions)
     width = np.maximum(far - near, 0) / samples
@@ -132,7 +133,7 @@ def test_the_opacity_of_a_constant_volume_is_its_closed_form():
     expected = -np.expm1(-extinction)
     error = np.sqrt(expected * (1 - expected) / (PATHS * traced.opacity.size))
     assert abs(float(traced.opacity.mean()) - expected) < 3 * error
-    # nothing is scattered, and what stands behind is seen through what is left
+    # nothing is scattered, and the background is attenuated by the transmittance
     assert float(traced.radiance.max()) == 0
     behind, left = np.array([2.0, 1.0, 0.5], np.float32), 1 - np.asarray(traced.opacity)
     np.testing.assert_allclose(traced.image(behind), left[..., None] * behind, rtol=1e-6)
@@ -149,7 +150,7 @@ def test_in_a_white_furnace_nothing_is_to_be_seen(anisotropy):
 
 
 def once_scattered(volume, transfer, camera, lights, anisotropy, samples=256, toward=64) -> np.ndarray:
-    """Light scattered a single time, by the midpoint rule along the ray and along the way to each light."""
+    """Singly scattered light, by the midpoint rule along the ray and along the path to each light."""
     value, extinction, exits = matter(volume, transfer)
     values, colors, table = (
         np.asarray(a, float) for a in (transfer.values, transfer.colors, transfer.extinction)
@@ -187,7 +188,7 @@ def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_tol
     camera = around(volume)
     how: Any = {"anisotropy": anisotropy, "max_scatterings": 1}
     traced = often(2, volume, transfer, camera, lit(SUN, LAMP), **how)
-    assert traced.exhausted.any()  # what was scattered once would have gone on
+    assert traced.exhausted.any()  # paths are cut off after one scattering
     expected = once_scattered(volume, transfer, camera, (SUN, LAMP), anisotropy)
     difference, error = np.asarray(traced.radiance) - expected, np.asarray(traced.standard_error)
     assert abs(z_of_regions(difference, error**2)).max() < 4
@@ -204,7 +205,7 @@ def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_tol
 
 @pytest.mark.parametrize("albedo", [(0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
 def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(albedo):
-    # a half-space is a cube of 60 mean free paths, seen in the middle of a side
+    # approximate a half-space by the middle of a face of a cube of 60 mean free paths
     albedo, cosine, volume = np.array(albedo), 0.6, cube()
     sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
     traced = often(8, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lit(sun))
@@ -226,7 +227,7 @@ def test_of_light_from_all_sides_a_half_space_reflects_its_closed_form():
 
 
 def scene_of(volume, **changed):
-    """All that an image is made of, as one tree."""
+    """All inputs of an image, as one tree."""
     whole = {
         "volume": volume,
         "transfer": spiky(),
@@ -319,7 +320,7 @@ def test_lights_add_up():
     difference = all_.radiance - each[0].radiance - each[1].radiance
     variance = sum(np.asarray(image.standard_error) ** 2 for image in (*each, all_))
     assert abs(z_of_regions(difference, variance)).max() < 4
-    np.testing.assert_array_equal(each[0].opacity, each[1].opacity)  # the camera's rays are the same
+    np.testing.assert_array_equal(each[0].opacity, each[1].opacity)  # the primary rays are the same
 
 
 @pytest.mark.slow
@@ -332,7 +333,7 @@ def test_more_paths_are_those_of_all_at_once_however_many_go_on_side_by_side():
     for name in ("radiance", "opacity", "standard_error", "scatterings"):
         np.testing.assert_allclose(getattr(more, name), getattr(once, name), rtol=1e-3, atol=1e-5)
     assert float(abs(more.radiance - some.radiance).max()) > 1e-3
-    # but another key does show
+    # another key gives another image
     assert float(abs(trace(volume, spiky(), camera, lights, key=4).radiance - some.radiance).max()) > 1e-3
 
 
@@ -340,15 +341,15 @@ def test_more_paths_are_those_of_all_at_once_however_many_go_on_side_by_side():
 def test_how_many_paths_go_on_side_by_side_does_not_show():
     volume, camera, lights = anisotropic_noise(), around(anisotropic_noise()), lit(SUN, LAMP, SKY)
     usual = trace(volume, spiky(), camera, lights, key=3)
-    other = trace(volume, spiky(), camera, lights, key=3, lanes=250)  # and in two waves
+    other = trace(volume, spiky(), camera, lights, key=3, lanes=250)  # and in two waves of pixels
     np.testing.assert_array_equal(usual.opacity, other.opacity)
     np.testing.assert_allclose(usual.radiance, other.radiance, rtol=1e-4, atol=1e-6)
 
 
 NOWHERE = Material(0.5, 1.0, values=(5.0, 6.0))
 LABELLED = 2
-"""One compiled program serves both tests of materials: two by values, and one by label, of a labelled
-volume."""
+"""Both tests of materials use two materials by values and one by label, and a labelled volume, so that they
+share one compiled program."""
 
 
 def test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_its_opacity():
@@ -357,7 +358,7 @@ def test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_i
     nowhere = Material(0.9, 0.1, label=LABELLED)
     materials = Material(0.25, 0.4, values=(0.4, 0.7)), Material(0.5, 0.2, values=(0.6, 2.0)), nowhere
     labelled = jv.Volume(volume.data, volume.spacing, volume.origin, np.zeros(volume.shape, np.uint8))
-    # the same by hand, as steps of the transfer function
+    # the same, as steps of a transfer function
     gap, color = 1e-6, np.array([0.8, 0.9, 1.0])
     values = np.array([0.0, 0.2, 0.4 - gap, 0.4, 0.7, 0.7 + gap, 0.9, 1.0])
     kept = np.array([1.0, 1.0, 1.0, 0.75, 0.75, 0.5, 0.5, 0.5])[:, None]
@@ -376,13 +377,13 @@ def test_materials_are_found_by_label():
     labels[12:] = LABELLED
     volume, materials = cube(labels), (NOWHERE, NOWHERE, Material(0.9, 0.5, label=LABELLED))
     traced = trace(volume, uniform_transfer(0.5), far(volume, 0.6), FURNACE, materials=materials)
-    right, left = np.s_[:, :8], np.s_[:, 12:]  # seen along +z, x grows to the left
+    right, left = np.s_[:, :8], np.s_[:, 12:]  # in a view along +z, x increases to the left
     for half, extinction in ((left, 0.5), (right, 2.0)):
         opacity = np.asarray(traced.opacity)[half]
         expected = -np.expm1(-extinction)
         error = np.sqrt(expected * (1 - expected) / (PATHS * opacity.size))
         assert abs(opacity.mean() - expected) < 3.5 * error
-    # a scattering of the material keeps a tenth of the light, one of the rest all of it
+    # the albedo is a tenth in the material, and 1 elsewhere
     seen = np.asarray(traced.radiance)[..., 0] / np.asarray(traced.opacity)
     assert seen[right].mean() < 0.1
     assert seen[left].mean() > 0.6
@@ -420,10 +421,10 @@ def test_the_error_of_an_image_counts_the_noise_of_its_background():
         trace(volume, spiky(), camera, lit(SUN, LAMP), key=key, max_scatterings=2) for key in range(24)
     ]
     images = np.stack([image.image(background) for image in several])
-    told = np.stack([image.image_error(background) for image in several])
+    reported = np.stack([image.image_error(background) for image in several])
     thick = np.mean([image.opacity for image in several], axis=0) > 0.3
     assert thick.sum() > 50
-    ratio = images.var(axis=0, ddof=1)[thick].mean(axis=0) / (told**2).mean(axis=0)[thick].mean(axis=0)
+    ratio = images.var(axis=0, ddof=1)[thick].mean(axis=0) / (reported**2).mean(axis=0)[thick].mean(axis=0)
     assert np.all(abs(ratio - 1) < 0.15)
 
 

@@ -1,4 +1,4 @@
-"""Are directions drawn as the phase function says?"""
+"""Are directions sampled from the phase function?"""
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +21,17 @@ def test_the_phase_function_is_a_density_of_mean_cosine_g(g):
 
 
 @pytest.mark.parametrize("g", ANISOTROPIES)
-def test_cosines_are_drawn_by_it(g):
-    """The distribution function of what is drawn, by quadrature of the density, is the number drawn with."""
+def test_cosines_are_sampled_from_the_phase_function(g):
+    """The cumulative distribution at the sampled cosine is the uniform number that it was sampled with."""
     uniform = np.linspace(0.005, 0.995, 199)
     drawn = np.asarray(scattered_cosine(jnp.float32(g), jnp.asarray(uniform, jnp.float32)), float)
-    # the distribution function of Henyey and Greenstein in closed form, in float64
+    # cumulative distribution of the Henyey–Greenstein phase function, in closed form, float64
     g64 = float(np.float32(g))
     if abs(g64) > 1e-3:
         below = (1 - g64**2) / (2 * g64) * (1 / np.sqrt(1 + g64**2 - 2 * g64 * drawn) - 1 / (1 + g64))
     else:
         below = (1 + drawn) / 2 + g64 * (drawn**2 - 1) * 3 / 4
-    # a sharp peak makes more of the last digit of a float32 cosine
+    # a sharp peak amplifies the rounding of a float32 cosine
     slope = (1 + abs(g)) / (2 * (1 - abs(g)) ** 2)
     np.testing.assert_allclose(below, uniform, atol=5e-6 + 2 * slope * 1.2e-7)
 
@@ -45,5 +45,5 @@ def test_directions_turn_around_the_one_before(axis):
     direction = np.stack([x, y, z], axis=-1).astype(float)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-6)
     np.testing.assert_allclose(direction @ axis, around[2], atol=1e-6)
-    # of the 40 000, the mean is g times the axis, within 4 standard errors
+    # the mean of the 40 000 is g times the axis, within 4 standard errors
     np.testing.assert_allclose(direction.mean(axis=0), 0.4 * axis, atol=4 / np.sqrt(40_000))

@@ -1,4 +1,4 @@
-"""Are majorants bounds, and is what is tracked under them unbiased?"""
+"""Are majorants upper bounds of the extinction, and is tracking with them unbiased?"""
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ def random_materials(random: np.random.Generator) -> tuple[Material, ...]:
 
 
 def places(random: np.random.Generator) -> np.ndarray:
-    """Grid coordinates: anywhere, at nodes, and on the faces of blocks."""
+    """Grid coordinates: anywhere, at nodes, and on faces of blocks."""
     last = np.array(SHAPE) - 1
     anywhere = random.random((1500, 3)) * last
     nodes = random.integers(0, last + 1, (300, 3)).astype(float)
@@ -106,14 +106,14 @@ def test_bounds_are_no_larger_than_need_be():
         ends = jnp.asarray(low), jnp.asarray(high)
         bound = jax.jit(upper_bound_between)(transfer.values, transfer.extinction, *ends)
         values, extinction = (np.asarray(a, float) for a in (transfer.values, transfer.extinction))
-        for a, b, told in zip(low, high, np.asarray(bound), strict=True):
+        for a, b, upper in zip(low, high, np.asarray(bound), strict=True):
             inside = values[(values >= a) & (values <= b)]
             least = np.interp([a, b, *inside], values, extinction).max()
-            assert least <= told <= least * 1.0001 + 1e-5 * extinction.max()
+            assert least <= upper <= least * 1.0001 + 1e-5 * extinction.max()
 
 
 FLIGHTS = {
-    # from a grid coordinate in a world direction over a world length
+    # start (grid coordinate), direction (world), length (world)
     "across": ((0.0, 3.2, 1.0), (0.7, 0.5, 0.6), np.inf),
     "backwards": ((22.9, 20.0, 21.5), (-0.6, -0.7, -0.2), np.inf),
     "along an axis, in a face": ((8.0, 8.0, 0.0), (0.0, 0.0, 1.0), np.inf),
@@ -125,7 +125,7 @@ COUNT = 40_000
 
 @jax.jit
 def tracked(volume, transfer, start, direction, length):
-    """Transmittances by ratio tracking, whether delta tracking passes, and steps taken."""
+    """Transmittances by ratio tracking, whether delta tracking passes, which flights are done, and steps."""
     medium = Medium.of(volume, transfer)
     majorants = Majorants.of(volume, Blocks.of(volume), transfer)
     triples = [tuple(jnp.full(COUNT, a) for a in apart(vector)) for vector in (start, direction)]

@@ -1,4 +1,4 @@
-"""Do the phantoms show what their descriptions say, at every resolution?"""
+"""Do the phantoms match their descriptions, at every resolution?"""
 
 import functools
 
@@ -29,13 +29,13 @@ def axes(resolution):
 
 
 def at(data, points):
-    """Trilinear values at world points."""
+    """Trilinearly interpolated values at world points."""
     coordinates = (np.asarray(points).reshape(-1, 3) + 1) / 2 * (np.array(data.shape) - 1)
     return ndimage.map_coordinates(data.astype(np.float64), coordinates.T, order=1)
 
 
 def sizes(mask):
-    """Voxels of every 6-connected component, the largest first."""
+    """Numbers of voxels of all 6-connected components, the largest first."""
     labels, _ = ndimage.label(mask)
     return np.sort(np.bincount(labels.ravel())[1:])[::-1]
 
@@ -70,15 +70,15 @@ def test_the_same_seed_gives_the_same_voxels_and_another_seed_another_scene_wher
 
 @pytest.mark.parametrize("name", UINT8)
 def test_resolutions_show_one_scene_and_finer_ones_agree_better(name):
-    """Nodes of n and 2n - 1 coincide; only the ramps of the boundaries, 2 voxels wide, may differ."""
+    """The nodes of resolution n are among those of 2n - 1; only boundary ramps, 2 voxels wide, may differ."""
 
     def difference(n):
         fine = voxels(name, 2 * n - 1)[::2, ::2, ::2].astype(float)
         return np.abs(fine - voxels(name, n)).mean() / voxels(name, 2 * n - 1).std()
 
     coarse, fine = difference(33), difference(65)
-    assert fine < 0.1  # in units of the standard deviation of the values
-    assert fine <= 0.75 * coarse  # the voxels near a surface are a fraction ~ 1/n of all
+    assert fine < 0.1  # relative to the standard deviation of the values
+    assert fine <= 0.75 * coarse  # the fraction of voxels near a surface is ~ 1/n
 
 
 @pytest.mark.parametrize("name", FLOAT)
@@ -145,7 +145,7 @@ def test_the_head_has_closed_sinuses_and_an_open_airway():
 
 
 def test_the_brain_lies_inside_a_closed_vault_of_bone():
-    """A ray from the middle of the brain crosses bone before it leaves the head, but below."""
+    """Upward rays from the middle of the brain cross bone before they leave the head."""
     head = voxels("head", 96)
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(300, 3))
@@ -167,7 +167,7 @@ def test_the_engine_has_three_materials_of_increasing_density_and_stays_inside()
     for value in (90, 150, 240):
         assert counts[value] > 2000
         assert counts[value] > 3 * counts[value - 20]  # materials are plateaus, ramps are thin
-    assert at(engine, [(x, 0.12, 0.25) for x in (-0.42, 0.42)]).max() < 60  # room above a piston
+    assert at(engine, [(x, 0.12, 0.25) for x in (-0.42, 0.42)]).max() < 60  # the space above a piston
     assert at(engine, [(-0.7, 0, -0.52), (0.7, 0, -0.52)]).min() > 220  # the crankshaft passes both walls
 
 
@@ -249,11 +249,11 @@ def test_where_touching_organs_meet_the_labels_jump_and_the_intensity_does_not()
     steps = []
     for axis in range(3):
         before, after = (np.take(labels, np.arange(95) + side, axis) for side in (0, 1))
-        meet = (before > 1) & (after > 1) & (before != after)
-        steps.append(np.abs(np.diff(data, axis=axis))[meet])
+        boundary = (before > 1) & (after > 1) & (before != after)
+        steps.append(np.abs(np.diff(data, axis=axis))[boundary])
     steps = np.concatenate(steps)
     assert len(steps) > 200
-    # the largest contrast of two organs falls over a ramp 0.06 wide; a hard edge would be 120
+    # the largest contrast, 120, is spread over a ramp 0.06 wide; a hard edge would jump by 120
     assert steps.max() < 120 * (2 / 95) / 0.06 + 1
 
 

@@ -1,4 +1,4 @@
-"""Back faces: bumpy where the last cell reaches past the exit, smooth where it is cut."""
+"""Back faces: uneven if the last cell reaches past the exit, smooth if it is cut there."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from ..scenes import around, scaled_phantom, soft_transfer, uniform_transfer
 
 
 def translucent_cube():
-    """A cube whose value rises along x; rays enter and leave it through material."""
+    """A cube whose value rises along x, so that rays enter and leave it through material."""
     return scaled_phantom("linear"), jv.TransferFunction.from_points(
         [(0, (0.9, 0.3, 0.1), 0.2), (1, (0.1, 0.3, 0.9), 0.6)]
     )
@@ -22,7 +22,7 @@ def images(transforms, quadrature, camera, step=0.11):
     return rendering, np.asarray(rendering.rgba - exact.rgba)
 
 
-# along z the value is constant on each ray, so that what is left is the error of the exit alone
+# along z the value is constant on each ray, so that the exit is the only source of error
 ALONG_Z = jv.Camera((0.3, 0.2, -4.0), (0.3, 0.2, 0.0), (0, 1, 0), size=(40, 32), parallel_scale=0.5)
 OBLIQUE = around(scaled_phantom("linear"), (40, 32))
 
@@ -41,7 +41,7 @@ def test_the_error_of_the_exit_falls_by_more_than_twenty(quadrature, camera):
 
 
 def test_without_it_the_exit_is_bumpy():
-    """The error is a sawtooth over the image: it jumps between neighbours, by up to the weight of a cell."""
+    """The error is a sawtooth over the image: it jumps between neighbours by up to the weight of a cell."""
     _, bumpy = images((), "midpoint", OBLIQUE)
     _, smooth = images((jv.AlphaCorrection(),), "midpoint", OBLIQUE)
     jumps = [np.abs(np.diff(error[..., 3], axis=1)).max() for error in (bumpy, smooth)]
@@ -69,7 +69,7 @@ def test_a_constant_volume_is_exact_under_jitter(pattern, quadrature):
 
 
 def test_aligned_marks_rays_that_reach_a_last_cell_with_something_in_it():
-    """Not those that end before, nor those whose last cell is transparent: Kye 2013, Fig. 13."""
+    """Not rays that end earlier, nor those whose last cell is transparent (Kye 2013, Fig. 13)."""
     volume = scaled_phantom("head")
     camera = around(volume)
     opaque = jv.render(volume, soft_transfer(0.01), camera, jv.March(0.05, (jv.AlphaCorrection(),)))

@@ -1,4 +1,4 @@
-"""Random numbers of pixels, and where they move the samples."""
+"""Random numbers of pixels, and the samples that they shift."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def drawn(noise, column, row):
 
 
 def spectrum(image):
-    """Energy by frequency, and the frequencies in cycles per pixel."""
+    """Power spectrum, and its frequencies in cycles per pixel."""
     power = np.abs(np.fft.fft2(image - image.mean())) ** 2
     frequency = np.fft.fftfreq(SIDE)
     return power, np.hypot(*np.meshgrid(frequency, frequency))
@@ -41,7 +41,7 @@ def test_numbers_are_uniform_in_0_1(kind, pattern):
         assert image.min() >= 0
         assert image.max() < 1
         counts = np.histogram(image, bins=16, range=(0, 1))[0]
-        # chi-squared with 15 degrees of freedom: beyond 45 once in ten thousand times
+        # chi-squared with 15 degrees of freedom exceeds 45 with probability 1e-4
         assert ((counts - SIDE**2 / 16) ** 2 / (SIDE**2 / 16)).sum() < 45
 
 
@@ -79,7 +79,7 @@ def test_a_number_depends_on_seed_and_pixel_alone():
 
 
 def see(transforms, extinction=1.0, count=200):
-    """Many rays along x through the box."""
+    """Render many rays along x through the box."""
     origins = np.tile([-1.0, 1.0, 1.0], (count, 1))
     directions = np.tile([1.0, 0.0, 0.0], (count, 1))
     march = jv.March(STEP, transforms)
@@ -117,7 +117,7 @@ def test_empty_space_jitter_leaves_rays_without_empty_space_alone():
 
 
 def test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample():
-    """Material, a gap, material again: the first part is sampled as without, the last one shifted once."""
+    """Material, gaps, material again: samples up to the first gap stay, those behind it are shifted once."""
     data = np.ones((41, 2, 2), np.float32)  # 40 long
     data[10:20] = 0
     data[25:30] = 0
@@ -129,7 +129,7 @@ def test_empty_space_jitter_shortens_one_step_at_the_first_transparent_sample():
     march = jv.March(1.0, (jitter, jv.AlphaCorrection()))
     rendering = jv.render_rays(volume, transfer, *rays, march)
     shift = parts(jitter, count)
-    # whole steps to sample 10, the first transparent one; then from 10 + ξ by whole steps
+    # whole steps up to sample 10, the first transparent one, then whole steps from 10 + ξ
     samples = [np.concatenate([np.arange(11.0), np.arange(10 + part, 40)]) for part in shift]
     inside = [np.interp(s, np.arange(41), data[:, 0, 0]) >= 0.5 for s in samples]
     widths = [np.minimum(1, 40 - s) for s in samples]

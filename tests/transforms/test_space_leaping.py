@@ -1,4 +1,4 @@
-"""Do speed-ups show? Leaping over empty space, sizes of tiles, packed voxels and devices change no pixel."""
+"""Do speed-ups change the image? Leaping over empty space, tile sizes and packed voxels must not."""
 
 import equinox as eqx
 import jax
@@ -9,12 +9,12 @@ from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
-from jaxvol.engine import packing as packed
+from jaxvol.engine import packing
 from jaxvol.engine.tiling import Tiling
 from jaxvol.phantoms import toroidal_phantom
 from jaxvol.render import _render
 
-from ..scenes import CAMERAS, around, counting, doubled, in_float64, inside, orthographic, scaled_phantom
+from ..scenes import CAMERAS, around, counting, in_float64, inside, orthographic, scaled_phantom, to_float64
 
 
 SHAPE = (24, 20, 28)
@@ -37,7 +37,7 @@ def leaping(transforms, method, cell=4):
 
 
 def assert_same(leapt, whole, tolerance=1e-6, fewer=True):
-    """The same image, from no more samples."""
+    """Assert the same image, from at most as many samples."""
     np.testing.assert_allclose(leapt.rgba, whole.rgba, atol=tolerance, rtol=0)
     np.testing.assert_allclose(leapt.depth, whole.depth, rtol=1e-5)
     np.testing.assert_array_equal(leapt.aligned, whole.aligned)
@@ -45,7 +45,7 @@ def assert_same(leapt, whole, tolerance=1e-6, fewer=True):
     assert not fewer or np.all(np.asarray(leapt.samples) <= np.asarray(whole.samples))
 
 
-# ---- scenes: contents differ, shapes do not ----
+# ---- scenes of different contents and equal shapes ----
 
 
 def places(shape=SHAPE):
@@ -73,7 +73,7 @@ def bytes_of(values):
 
 
 def table(seed, top):
-    """Eight control points, of which some runs are not seen; none where a voxel's value is likely."""
+    """Eight control points, some runs of them transparent, and none at a likely voxel value."""
     rng = np.random.default_rng(seed)
     values = np.sort(rng.choice(254, 8, replace=False)) + 0.37
     extinction = rng.uniform(0.2, 6, 8) * (rng.random(8) < rng.choice([0.2, 0.5, 1]))
@@ -82,7 +82,7 @@ def table(seed, top):
 
 
 def far(volume, size):
-    """From 300 sizes away."""
+    """A camera at 300 times the volume's diagonal."""
     low, high = volume.corners
     position = volume.center + 300 * jnp.linalg.norm(high - low) * jnp.asarray([0.48, -0.6, 0.64])
     return jv.Camera(position, volume.center, (0, 0, 1), 0.15, size=size)
@@ -92,7 +92,7 @@ PERSPECTIVE = {"around": around, "inside": inside, "far": far}
 
 
 def drawn_camera(view, volume, seed):
-    """A view, enlarged somewhere: so beams come small and large."""
+    """A view, zoomed at random, so that beams differ in size."""
     rng = np.random.default_rng(seed)
     return view(volume, SIZE).zoom(rng.uniform(0.7, 5), tuple(rng.uniform(0.3, 0.7, 2)))
 
@@ -150,7 +150,7 @@ def test_leaping_does_not_show_whatever_the_transforms(view, transforms, quadrat
 
 
 @pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
-def test_samples_fall_where_there_is_nothing(method):
+def test_leaping_takes_fewer_samples(method):
     volume = jv.Volume(bytes_of(contents("blobs", 3)), SPACING)
     camera, step = around(volume, SIZE).zoom(2), 0.01
     transfer = Counting(np.arange(8) * 30 + 0.5, np.ones((8, 3)), [0, 0, 0, 0, 1, 2, 3, 4])
@@ -162,7 +162,7 @@ def test_samples_fall_where_there_is_nothing(method):
 @pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
 @pytest.mark.parametrize("name", ["sphere", "head"])
 def test_the_jitter_happens_at_the_same_sample(name, method):
-    """In a head there is air in front, within and behind: the first transparent sample is mostly in front."""
+    """A head has air in front, inside and behind; the first transparent sample is mostly in front."""
     data = np.asarray(jv.phantom(name, 28).data)[2:26, 4:24].astype(float)
     volume = jv.Volume(bytes_of((data - data.min()) / np.ptp(data)), SPACING)
     transfer = Counting(np.arange(8) * 35 + 0.5, np.ones((8, 3)), [0, 0, 1, 2, 2, 4, 5, 9])
@@ -176,7 +176,7 @@ def test_the_jitter_happens_at_the_same_sample(name, method):
 
 @pytest.mark.parametrize("method", ["hierarchy", *SLOWLY])
 def test_the_jitter_happens_at_the_same_sample_where_air_lies_beyond_the_last_point(method):
-    """Its extinction must be exactly the last point's, 0: rounding would make it other than transparent."""
+    """Beyond the last point, the extinction must be exactly 0: a rounded one would not be transparent."""
     volume = jv.Volume(bytes_of(1 - contents("blobs", 3)), SPACING)
     for last in np.linspace(150, 250, 7):
         values = np.linspace(0, last, 8) + 0.3
@@ -208,7 +208,7 @@ def test_tilings_do_not_show(tiling):
 @pytest.mark.parametrize(
     ("name", "size"), [("cells", 4), ("cells", 16), ("batch", 4), ("batch", 64), ("tile", 2), ("tile", 16)]
 )
-def test_no_size_shows_under_jitter_and_termination(name, size, method):
+def test_tiling_does_not_show_under_jitter_and_termination(name, size, method):
     volume = jv.Volume(bytes_of(contents("blobs", 1)), SPACING)
     camera = around(volume, (70, 66))
     march = jv.March(0.013, leaping(MOVING, method))
@@ -218,7 +218,7 @@ def test_no_size_shows_under_jitter_and_termination(name, size, method):
     assert_same(other, whole, fewer=False)
 
 
-# ---- nothing that is seen is missed ----
+# ---- nothing visible is missed ----
 
 
 BRIGHT = Counting(np.array([0, 10, 40, 80, 120, 160, 200, 250]) + 0.5, np.ones((8, 3)), [0, 0, *[3.0] * 6])
@@ -238,7 +238,7 @@ def where(condition):
 
 
 def vessel(first, last):
-    """One voxel wide, from corner to corner."""
+    """A vessel one voxel wide, from corner to corner."""
     data, places = np.zeros(SHAPE, np.uint8), np.linspace(first, last, 200).round().astype(int)
     data[tuple(places.T)] = 255
     return data
@@ -250,7 +250,9 @@ FACES = [(12, 0, 14), (23, 9, 13), (7, 19, 21), (11, 10, 27)]
 BORDERS = [(4, 4, 4), (8, 7, 12), (3, 3, 3), (5, 8, 11), (20, 16, 24), (19, 17, 25)]
 ADVERSARIAL = {
     **{f"voxel {place}": (voxel(*place), BRIGHT) for place in CORNERS + FACES + BORDERS},
-    **{f"voxel {place}, its slopes alone": (voxel(*place), BETWEEN) for place in CORNERS[:1] + BORDERS[:2]},
+    **{
+        f"voxel {place}, only slopes visible": (voxel(*place), BETWEEN) for place in CORNERS[:1] + BORDERS[:2]
+    },
     **{f"sheet x = {x}": (where(x == X), BRIGHT) for x in (0, 4, 7, 23)},
     **{f"sheet y = {y}": (where(y == Y), BRIGHT) for y in (4, 19)},
     **{f"sheet z = {z}": (where(z == Z), BRIGHT) for z in (8, 27)},
@@ -260,20 +262,20 @@ ADVERSARIAL = {
     "edge at a block's nodes": (where(Y > 4), BETWEEN),
     "diagonal edge": (where(X + Y - Z > 8), BETWEEN),
     "vessel": (vessel((0, 1, 2), (23, 17, 26)), BRIGHT),
-    "vessel, its slopes alone": (vessel((23, 0, 27), (1, 19, 3)), BETWEEN),
+    "vessel, only slopes visible": (vessel((23, 0, 27), (1, 19, 3)), BETWEEN),
 }
 SPACINGS = [(1.0, 1.0, 1.0), (0.5, 1.3, 2.0)]
 
 
 def visible_places(data, transfer, count, rng):
-    """Nodes next to which something is seen."""
+    """Random nodes next to something visible."""
     low, high = (10, 255) if transfer is BRIGHT else (0, 255)
     differing = (data > low) & (data <= high)
     return np.argwhere(differing)[rng.integers(0, differing.sum(), count)]
 
 
 def random_rays(volume, data, transfer, seed):
-    """10 000 rays: to what is seen, anywhere, and along axes and the borders of blocks."""
+    """10 000 rays: toward visible voxels, anywhere, and along axes and block boundaries."""
     rng = np.random.default_rng(seed)
     spacing = np.asarray(volume.spacing)
     diagonal = np.linalg.norm(spacing * SHAPE)
@@ -328,12 +330,12 @@ def test_no_pixel_of_a_hierarchy_misses_what_is_seen(view):
             assert_same(leapt, whole)
 
 
-# ---- what the published method misses, and errors ----
+# ---- what the published method misses, and invalid arguments ----
 
 
 @pytest.mark.slow
 def test_min_distance_misses_what_is_thin_and_a_beam_does_not():
-    """A voxel in front of a wall, between the corners of a cell of 32 x 32 pixels."""
+    """A single voxel in front of a wall, between the corners of a cell of 32 x 32 pixels."""
     data = where(Z == 3)
     data[12, 10, 24] = 255
     volume = jv.Volume(data)
@@ -406,7 +408,7 @@ def test_leaping_does_not_show_with_labels_and_leaps_over_hidden_ones(method, cu
     transforms = (jv.AlphaCorrection(labels=True),) if cut else PLAIN
     rng = np.random.default_rng(0)
     data = rng.integers(60, 200, SHAPE).astype(np.uint8)
-    labels = (X > 3).astype(int) + (X > 8) + 34 * (X + Y > 35)  # 35 and 36, which are not seen, among them
+    labels = (X > 3).astype(int) + (X > 8) + 34 * (X + Y > 35)  # includes 35 and 36, which are invisible
     volume = jv.Volume(data, SPACING, labels=labels.astype(np.int32))
     see = jv.TransferFunction(np.linspace(0.5, 250, 8), np.ones((8, 3)), [0, 1, 1, 2, 2, 3, 3, 3])
     for shown in ([see, None, None], [None, see, None], [None, None, see]):
@@ -461,7 +463,7 @@ def test_inside_jit_data_and_transfer_function_are_those_of_the_call(method):
     for seed in range(4):
         fresh, transfer = contents("blobs", 70 + seed).astype(np.float32), table(seed, 1.0)
         whole = jv.render(jv.Volume(fresh, SPACING), transfer, camera, jv.March(step, PLAIN))
-        # another program than `whole`, and rounded otherwise; stale blocks would show as holes
+        # a different program from `whole`, which rounds differently; stale blocks would show as holes
         assert_same(image(jnp.asarray(fresh), transfer), whole, 1e-5)
 
 
@@ -488,7 +490,7 @@ def leaves_of():
 
 
 def assert_same_gradients(leapt, whole):
-    """But for those to extinctions of 0: those of what is leapt over are not looked at."""
+    """Compare all gradients except those of extinctions of 0, which leaping omits."""
     shown = np.asarray(leaves_of()["extinction"]) > 0
     for name in whole:
         a, b = (np.asarray(tree[name]) for tree in (leapt, whole))
@@ -560,8 +562,8 @@ def test_ten_thousand_samples_in_float32_lose_nothing_that_is_seen():
         transfer = Counting(values, rng.random((8, 3)), extinction * np.array([0, 1, 1, 1, 1, 1, 1, 1]))
         rendering = jv.render_rays(volume, transfer, origin, np.float32(direction), march)
         with in_float64():
-            exact = doubled(jv.March(march.step, march.transforms[:1], max_samples=18_000))
-            truth = reference_rays(doubled(volume), doubled(transfer), *unit(origin, direction), exact)
+            exact = to_float64(jv.March(march.step, march.transforms[:1], max_samples=18_000))
+            truth = reference_rays(to_float64(volume), to_float64(transfer), *unit(origin, direction), exact)
         assert int(np.asarray(truth.samples).max()) > 8000
         np.testing.assert_allclose(rendering.rgba, truth.rgba, atol=2e-5, rtol=0)
 
@@ -622,7 +624,7 @@ def test_under_vmap_each_is_as_it_is_alone(over, method):
     for i, (camera, transfer) in enumerate(zip(cameras, transfers, strict=True)):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], images)
         whole = jv.render(volume, transfer, camera, jv.March(0.02, PLAIN))
-        assert_same(one, whole, 5e-6)  # another program, whose rays are rounded otherwise
+        assert_same(one, whole, 5e-6)  # another program, which rounds rays differently
 
 
 # ---- packed voxels ----
@@ -647,7 +649,7 @@ def whole_range(dtype, shape, seed=0):
 @pytest.mark.parametrize("dtype", INTEGERS)
 def test_packed_voxels_are_the_same_values(dtype, shape):
     volume = jv.Volume(whole_range(dtype, shape))
-    fast = packed.with_words(volume, packed.words_of(volume))
+    fast = packing.with_words(volume, packing.words_of(volume))
     assert type(fast) is not type(volume)
     plain = jv.Volume(np.asarray(volume.data, np.float32))
     last = np.array(shape) - 1
@@ -680,9 +682,9 @@ def test_images_of_integers_are_those_of_the_same_floats(dtype, shape):
 
 
 def test_a_part_of_an_image_leaps_as_the_whole():
-    """What cells of pixels know is looked up by the pixel's place in the part, not in the whole."""
+    """Start distances are looked up by the pixel's position in the crop, not in the whole image."""
     volume, transfer = jv.Volume(contents("blobs", 1).astype(np.float32), SPACING), table(1, 1.0)
-    # in whose far corner there is nothing to be seen
+    # nothing is visible in the far corner of the crop
     camera = orthographic(volume, (44, 40)).zoom(0.6).crop(23, 19, *SIZE)
     whole = compare_methods(volume, transfer, camera, 0.05, PLAIN, ["beam"])
     assert float(whole.rgba[..., 3].max()) > 0.1

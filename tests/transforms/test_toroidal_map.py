@@ -1,4 +1,4 @@
-"""The toroidal map: is it the paper's, where do rays meet the sector, and is the picture the world's?"""
+"""The toroidal map: does it match the paper's formula, where do rays meet the sector, are images right?"""
 
 import itertools
 
@@ -35,7 +35,7 @@ def probe_of(name):
 
 
 def printed_map(points, a, b):
-    """Equation 1 as the paper prints it, float64; it holds where z > 0 and R > 0."""
+    """Equation 1 as printed in the paper, in float64; it holds where z > 0 and R > 0."""
     x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
     away = np.sqrt(y**2 + z**2) - a
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -45,7 +45,7 @@ def printed_map(points, a, b):
 
 
 def is_inside(points, probe):
-    """By the paper's formula."""
+    """Which points are inside the sector, by the paper's formula."""
     a, b, *ranges = probe
     y, z = points[..., 1], points[..., 2]
     inside = (z > 0) & (np.sqrt(y**2 + z**2) > a)
@@ -55,7 +55,7 @@ def is_inside(points, probe):
 
 
 def pieces_inside(origin, direction, probe, reach=400.0, behind=0.0, dense=8001):
-    """(n, 2) distances between which a ray is inside, by looking everywhere and bisecting."""
+    """(n, 2) distances between which a ray is inside, by dense sampling and bisection."""
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
 
     def inside(t):
@@ -84,7 +84,7 @@ def nodes(probe, shape):
 
 
 def world_of(toroidal, a, b):
-    """The inverse, from the picture: along the beam, then turned about the x axis."""
+    """The inverse map, from the geometry: along the beam, then rotated about the x axis."""
     beta, sigma, gamma = np.moveaxis(np.asarray(toroidal, np.float64), -1, 0)
     rho = a + (b + gamma) * np.cos(sigma - HALF)
     return np.stack(
@@ -153,7 +153,7 @@ def test_derivatives_of_the_map_match_finite_differences():
 
 
 def singular_points(probe):
-    """On and around the motor axis, the apex, behind it, and the sector's corners and edges."""
+    """Points on and around the motor axis, at and behind the apex, and at the sector's corners and edges."""
     a, b, *_ranges = probe
     special = [(x, 0, 0) for x in (-3, 0, 7)] + [(0, 0, a), (0, a, 0), (0, a * 0.6, a * 0.8), (0, 0, -a)]
     special += [tuple(p) for p in world_of(nodes(probe, (3, 3, 3)), a, b).reshape(-1, 3)]
@@ -200,8 +200,8 @@ def test_rays_through_the_singular_points_see_finite_things():
         rgba = jv.render_rays(volume, uniform_transfer(0.01), origins, directions, march).rgba
         return jnp.sum(rgba), rgba
 
-    made = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    (_, rgba), gradients = made(probe_of("across the middle"), jnp.asarray(origins, jnp.float32))
+    compute = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    (_, rgba), gradients = compute(probe_of("across the middle"), jnp.asarray(origins, jnp.float32))
     assert np.isfinite(rgba).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
@@ -224,7 +224,7 @@ def test_bounds_are_tight(name):
 
 
 def random_rays(probe, count, seed):
-    """From outside, from inside and from the hollow, towards the sector and past it; some along axes."""
+    """Rays from outside, inside and the hollow, toward the sector and past it, some along axes."""
     random = np.random.default_rng(seed)
     points = world_of(nodes(probe, (9, 9, 9)), *probe[:2]).reshape(-1, 3)
     middle, size = points.mean(axis=0), np.ptp(points, axis=0)
@@ -248,14 +248,14 @@ def test_entry_and_exit_are_the_first_and_last_place_inside(name):
         pieces = pieces_inside(origin, direction, probe, reach=3 * size + np.linalg.norm(origin))
         if len(pieces) == 0:
             missed += 1
-            # what grazes the sector may be given a stretch of nothing
+            # a ray that grazes the sector may get an empty interval
             if extent > 0:
                 t = np.linspace(near, near + extent, 101)[:, None]
                 away = np.abs(world_of_clipped(origin + t * direction, probe)).max(axis=1)
                 assert away.min() < 1e-3 * size
             continue
         if (pieces[:, 1] - pieces[:, 0]).min() < 0.01 * size:
-            continue  # grazes
+            continue  # a grazing ray
         found, within = found + 1, within + (pieces[0, 0] == 0)
         gaps += len(pieces) > 1
         np.testing.assert_allclose([near, near + extent], [pieces[0, 0], pieces[-1, 1]], atol=1e-4 * size / 4)
@@ -266,7 +266,7 @@ def test_entry_and_exit_are_the_first_and_last_place_inside(name):
 
 
 def world_of_clipped(points, probe):
-    """From points to the nearest (in β, σ, γ) of the sector."""
+    """Vectors from points to the nearest points (in β, σ, γ) of the sector."""
     a, b, *ranges = probe
     place = printed_map(points, a, b)
     inside = np.stack([np.clip(place[..., i], *ends) for i, ends in enumerate(ranges)], -1)
@@ -291,7 +291,7 @@ def test_a_ray_from_the_hollow_begins_at_the_near_face():
 @pytest.mark.slow
 @pytest.mark.parametrize("away", [3e2, 3e4, 1e6])
 def test_a_far_camera_finds_the_faces_and_their_gradients(away):
-    """Near its entry a ray begins anew, even where rounding brought it past the face."""
+    """A ray is restarted near its entry, even if rounding moved it past the face."""
     probe = probe_of("across the middle")
     targets = world_of(nodes(PROBES["across the middle"], (5, 5, 5))[1:-1, 1:-1, 1:-1], 20, 30).reshape(-1, 3)
     direction = np.array([0.48, -0.6, 0.64])
@@ -303,7 +303,7 @@ def test_a_far_camera_finds_the_faces_and_their_gradients(away):
     close = np.asarray(origins, np.float64) + (away - 200) * np.float64(directions)
     for origin, d, extent in zip(close, np.asarray(directions), length, strict=True):
         ends = pieces_inside(origin, d, PROBES["across the middle"])
-        # the ray itself is rounded
+        # the ray itself has been rounded
         np.testing.assert_allclose(extent, ends[-1, 1] - ends[0, 0], atol=1e-3 + 8e-7 * away)
 
 
@@ -342,11 +342,11 @@ def test_gradients_of_entry_and_length_match_finite_differences(name):
         np.testing.assert_allclose(slope, jnp.vdot(weights, changed(leaves, change)), rtol=1e-9)
 
 
-# ---- what is seen ----
+# ---- images ----
 
 
 def gap_rays():
-    """Across the hollow near side, in and out twice."""
+    """Rays across the hollow at the near side, which enter and leave the sector twice."""
     z, tilt = (part.ravel() for part in np.meshgrid([36.0, 40, 44, 47], [0.0, 0.03, -0.05]))
     origins = np.stack([2 + 0 * z, -150 + 0 * z, z], -1)
     directions = np.stack([tilt, 1 + 0 * z, tilt / 2], -1)
@@ -366,7 +366,7 @@ def test_a_gap_is_left_out_of_a_constant_volume_exactly(step, quadrature):
     ]
     assert sum(len(p) == 2 for p in pieces) >= 8
     inside = np.array([(p[:, 1] - p[:, 0]).sum() for p in pieces])
-    # a gap of less than a quarter of a step may be missed
+    # gaps shorter than a quarter of a step may be missed
     sure = np.array([len(p) < 2 or p[1, 0] - p[0, 1] > step / 4 for p in pieces])
     assert sure.sum() >= 11
     np.testing.assert_allclose(rendering.rgba[sure, 3], -np.expm1(-0.02 * inside[sure]), atol=1e-4)
@@ -393,7 +393,7 @@ CENTER, RADIUS, DENSITY = np.array([4.0, -5.0, 82.0]), 16.0, 0.05
 
 
 def acquired_sphere(refine):
-    """A sphere as the probe samples it, its edge a ramp about one node wide; and the widest node spacing."""
+    """A sphere sampled by the probe, its edge a ramp about one node wide, and the largest node spacing."""
     probe = PROBES["across the middle"]
     shape = tuple(n * refine + 1 for n in (12, 12, 10))
     points = world_of(nodes(probe, shape), *probe[:2])
@@ -416,7 +416,7 @@ def rays_past_the_sphere(impact):
 
 
 def seen_past_the_sphere(volume, impact, extinction, step):
-    """Opacity, by extinctions at the values 0, ½, just above it, and 1: one program for a size of volume."""
+    """Opacity, given extinctions at the values 0, ½, 0.501 and 1, by one program per volume shape."""
     transfer = jv.TransferFunction([0.0, 0.5, 0.501, 1.0], np.ones((4, 3)), extinction)
     march = jv.March(step, (probe_of("across the middle"),), "midpoint")
     return np.asarray(jv.render_rays(volume, transfer, *rays_past_the_sphere(impact), march).rgba[..., 3])
@@ -424,8 +424,8 @@ def seen_past_the_sphere(volume, impact, extinction, step):
 
 @pytest.mark.slow
 def test_a_sphere_acquired_by_a_probe_renders_as_a_sphere():
-    """At the silhouette a ramp of width h adds a chord of about sqrt(R h), over a ring of width h: so the
-    largest error falls with h^½, and the root mean square with h."""
+    """At the silhouette, a ramp of width h adds a chord of about sqrt(R h) in a ring of width h. So the
+    largest error falls as h^½, and the root mean square error as h."""
     impact = (np.arange(160) + 0.5) / 8
     exact = -np.expm1(-DENSITY * 2 * np.sqrt(np.maximum(RADIUS**2 - impact**2, 0)))
     ramp = DENSITY * np.array([0, 0.5, 0.501, 1])
@@ -452,12 +452,12 @@ def test_the_silhouette_lies_within_half_a_sample():
 
 
 def noise_volume():
-    """Independent values at every node. The spacing means nothing under the map."""
+    """Independent random values at every node. Under the map, the spacing is ignored."""
     return jv.Volume(np.random.default_rng(2).random(SHAPE, np.float32), spacing=(0.5, 2.0, 7.0))
 
 
 def ramp_transfer(top=0.06):
-    """Clear below 0.3; red is 1, so that its channel is the sum of the weights."""
+    """Transparent below 0.3; red is 1, so that its channel is the sum of the weights."""
     colors = [(1, 0.1, 0.9), (1, 0.3, 0.7), (1, 0.9, 0.1)]
     return jv.TransferFunction([0.0, 0.3, 1.0], np.array(colors, float), [0.0, 0.0, top])
 
@@ -471,7 +471,7 @@ COMBINED = {
 
 
 def view(probe, size=(9, 7)):
-    """Rays from aside, several of which cross the hollow."""
+    """A camera at the side, several of whose rays cross the hollow."""
     return jv.Camera(
         (40.0, -190.0, 20.0), probe.center - jnp.asarray([0.0, 0.0, 18.0]), (0, 0, -1), 30.0, size=size
     )
@@ -517,7 +517,7 @@ def test_its_place_among_other_transforms_does_not_show():
 
 
 def independent_march(data, probe, points, origins, directions, d, midpoint, align):
-    """(rays, 4): float64 NumPy, ray by ray and cell by cell, values by scipy."""
+    """(rays, 4) colour and opacity: float64 NumPy, ray by ray and cell by cell, values by scipy."""
     values, colors, extinction = points
     a, b, *ranges = probe
     images = []
@@ -575,7 +575,7 @@ def test_an_independent_marcher_sees_the_same(align, quadrature):
             quadrature == "midpoint",
             align,
         )
-    # a face in a gap is found to 2⁻¹⁶ of a step
+    # faces of gaps are located to 2⁻¹⁶ of a step
     np.testing.assert_allclose(rgba, expected, atol=2e-6)
 
 
@@ -607,7 +607,7 @@ def test_world_gradient_is_the_slope_of_the_value_in_the_world():
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["replay", "forward"])
 def test_image_gradients_in_the_probe_match_central_differences(adjoint):
-    """From behind the probe, where no ray meets a gap; those faces' motion is not in the gradient."""
+    """From behind the probe, where no ray meets a gap: the motion of gap faces is not in the gradient."""
     with in_float64():
         names = ("a", "b", "beta", "sigma", "gamma")
         leaves = dict(zip(names, map(jnp.asarray, PROBES["across the middle"]), strict=True))
@@ -647,7 +647,7 @@ def test_a_phantom_is_one_scene_at_every_shape(name):
     assert fine.data.dtype == jnp.uint8
     assert fine.shape == (17, 21, 33)
     difference = np.asarray(fine.data, int)[::2, ::2, ::2] - np.asarray(coarse.data, int)
-    assert np.abs(difference).max() <= 1  # of rounding to uint8
+    assert np.abs(difference).max() <= 1  # from rounding to uint8
     spot, again, other = (toroidal_phantom(name, (9, 11, 17), seed=s)[0].data for s in (0, 0, 1))
     np.testing.assert_array_equal(spot, again)
     assert np.any(spot != other)
