@@ -59,7 +59,7 @@ def pytest_unconfigure(config):
         shutil.rmtree(config.stash[PROGRAMS], ignore_errors=True)
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def room_for_programs():
     """Forget programs before a worker holds 3 GB of them, and long before their memory maps are as many as
     Linux gives a process (65 530), past which XLA crashes. What is asked for again lies in the folder."""
