@@ -58,7 +58,7 @@ def pytest_unconfigure(config):
         shutil.rmtree(config.stash[PROGRAMS], ignore_errors=True)
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def limit_programs_in_memory():
     """Drop compiled programs before a worker holds 3 GB of them, and long before their memory maps reach
     Linux's limit per process (65 530), where XLA crashes. Programs needed again are in the cache folder."""

@@ -1159,7 +1159,7 @@ def image_scene():
     camera = jv.Camera((1.9, -1.3, 1.7), tuple(map(float, volume.center)), (0.1, 0, 1), 40.0, size=(6, 5))
     march = jv.March(0.21, (jv.AlphaCorrection(),), "midpoint", max_samples=32)
     materials = Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.7, 0.1, 1.2, values=(0.5, 2.0))
-    return volume, transfer, camera, march, templates(materials=materials)
+    return volume, transfer, camera, march, templates(materials=materials, light=to_float64(MANY))
 
 
 def deferred(scene):
