@@ -35,8 +35,8 @@ def render(
     march: March | Any,
     *,
     lighting: Lighting | Any | None = None,
-    outputs: Asked = "all",
-    adjoint: Adjoint = "replay",
+    outputs: Asked | Any = "all",
+    adjoint: Adjoint | Any = "replay",
 ) -> Rendering:
     """Renders an image of a volume.
 
@@ -88,8 +88,8 @@ def render_rays(
     *,
     pixels: Arrayable | None = None,
     lighting: Lighting | Any | None = None,
-    outputs: Asked = "all",
-    adjoint: Adjoint = "replay",
+    outputs: Asked | Any = "all",
+    adjoint: Adjoint | Any = "replay",
 ) -> Rendering:
     """Renders arbitrary rays. As `render`, except:
 
@@ -122,7 +122,7 @@ def render_rays(
     return _render((volume, transfer, source, march, lighting), outputs, adjoint)
 
 
-def _render(scene: Scene, outputs: Asked, adjoint: Adjoint, tiling: Tiling | None = None) -> Rendering:
+def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None) -> Rendering:
     """The image of a scene whose parts are what they should be. `tiling`: by default that of the backend."""
     for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from .._util.checks import integer, is_traced, number
 from .._util.memory import require_room
 from .._util.npy import read_arrays
-from .._util.vec3 import Scalar
+from .._util.vec3 import Scalar, golden_spiral, orthonormal
 from .materials import Material, Optics, materials_of, smoothstep
 
 
@@ -384,23 +384,14 @@ def _fade(x: Scalar) -> Scalar:
 
 def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
     """Directions spread evenly over the sphere and rotated at random: each alone is uniformly distributed."""
-    golden = math.pi * (1 + math.sqrt(5))
-    z = 1 - (2 * np.arange(n) + 1) / n
-    around, across = golden * np.arange(n), np.sqrt(1 - z**2)
-    even = np.stack([across * np.cos(around), across * np.sin(around), z], axis=-1)
     q, r = jnp.linalg.qr(jax.random.normal(key, (3, 3)))
-    return jnp.asarray(even, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
+    return jnp.asarray(golden_spiral(n), q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
 
 
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
     """Directions at an angle to `direction` given by its cosine; `u` in [0, 1) selects the azimuth."""
     x, y, z = direction.T
-    # Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017
-    sign = jnp.where(z >= 0, 1.0, -1.0)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=-1)
-    second = jnp.stack([b, sign + y * y * a, -y], axis=-1)
+    first, second = (jnp.stack(axis, axis=-1) for axis in orthonormal((x, y, z)))
     sine = _root(1 - cosine**2)
     around = 2 * jnp.pi * u
     turned = (sine * jnp.cos(around))[:, None] * first + (sine * jnp.sin(around))[:, None] * second
