@@ -89,7 +89,7 @@ def path_trace(
     **Arguments:**
 
     - `volume`: on its own grid; curved grids (`ToroidalMap`) are not supported.
-    - `transfer`: a `TransferFunction` or `LabelTransferFunction`.
+    - `transfer`: a `TransferFunction`, a `LabelTransferFunction`, or another one with a `majorant`.
     - `camera`: its rays pass through the centres of pixels, as in `render`; with `antialias`, through random
       points in them.
     - `lights`: those with a position or a direction are sampled at every scattering, one of them at random;
@@ -108,10 +108,10 @@ def path_trace(
       is that of all paths at once, up to rounding.
     - `lanes`: paths that are traced side by side. Memory grows with it; the result does not change.
 
-    **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function of another
-    kind, labels where the volume has none, `onto` of another size or key, and lanes or paths that do not fit
-    into memory; `RuntimeError` if it is differentiated (grad or jvp) with respect to any of its inputs. It
-    may be called in a function that is differentiated with respect to something else.
+    **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function without
+    a majorant, labels where the volume has none, `onto` of another size or key, and lanes or paths that do
+    not fit into memory; `RuntimeError` if it is differentiated (grad or jvp) with respect to any of its
+    inputs. It may be called in a function that is differentiated with respect to something else.
 
     NaN or infinity in any input makes the whole image NaN, since any path may reach it.
 

@@ -19,7 +19,7 @@ class EarlyTermination(Transform):
 
     **Arguments:**
 
-    - `opacity_left`: in (0, 1); 1/255 is below one step of an 8-bit image.
+    - `opacity_left`: in (0, 1); 1/255 is one level of an 8-bit image.
 
     **Raises:** `ValueError` outside that range.
 
