@@ -35,7 +35,7 @@ def pytest_configure(config):
         return  # a worker of pytest-xdist inherits the environment variables
     if config.option.markexpr == "not slow":
         # The fast tests spend most of their time compiling. Optimization level 1 of LLVM, without expensive
-        # passes, and XLA's older emitter of fused kernels halve that time. The programs are somewhat slower
+        # passes, and XLA's older emitter of fused kernels make it shorter. The programs are somewhat slower
         # and compute the same numbers. The slow tests, and any other selection, compile as users do.
         flags = (
             "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true "

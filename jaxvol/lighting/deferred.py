@@ -4,7 +4,7 @@ Light varies more slowly than what it falls on, and the samples that make up a s
 they can share the light of one place, at a fraction of the cost.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -41,7 +41,6 @@ class Deferred(Lighting):
     **Raises:** `ValueError` for something that is no lighting.
     """
 
-    shades_pixels: ClassVar[bool] = True
     lighting: Lighting
 
     def __init__(self, lighting: Lighting | Any):

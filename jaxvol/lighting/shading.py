@@ -6,7 +6,7 @@ for each image; and engines call `lit`, which looks at places around a sample, o
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -121,10 +121,12 @@ class Shading(eqx.Module):
 
 
 class Lighting(eqx.Module):
-    """How samples are shaded; or, where `shades_pixels`, finished pixels."""
+    """How samples are shaded; or finished pixels, by a lighting that overrides `shade_pixel`."""
 
-    shades_pixels: ClassVar[bool] = False
-    """Whether rays are marched without light, and `shade_pixel` is called once for each of them."""
+    @property
+    def shades_pixels(self) -> bool:
+        """Whether rays are marched without light, and `shade_pixel` is called once for each of them."""
+        return type(self).shade_pixel is not Lighting.shade_pixel
 
     @abstractmethod
     def over(self, around: Surroundings) -> Shading:
@@ -138,10 +140,8 @@ class Lighting(eqx.Module):
         self, seen: Classification, space: Space, line: Line, rgba: Float[Array, "4"], depth: Scalar
     ) -> Float[Array, "4"]:
         """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
-        depth. `seen.light` shades samples. To be overridden where `shades_pixels`."""
-        raise NotImplementedError(
-            f"{type(self).__name__} must override shade_pixel, as it has shades_pixels."
-        )
+        depth. `seen.light` shades samples. Not called unless overridden."""
+        return rgba
 
 
 def classification(
