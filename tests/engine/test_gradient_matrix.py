@@ -132,11 +132,11 @@ def slopes(scene, adjoint="forward"):
     return {name: float(slope(tangent)) for name, tangent in directions(scene)}
 
 
-def central(scene, h=1e-7):
+def central(scene, h=1e-8):
     """The same by central differences of the value that `jax.value_and_grad` returns.
 
-    With h = 1e-6, some of the 40 000 samples cross a voxel face or a control point, where the slope changes;
-    with 1e-9, rounding is visible."""
+    With h = 1e-7, a few of the 40 000 samples cross a voxel face or a control point, where the slope changes:
+    a change of the spacing by h moves the far samples by 250 h voxels. With 1e-9, rounding is visible."""
     value = eqx.filter_value_and_grad(loss)
 
     def moved(tangent, by):
@@ -153,23 +153,25 @@ def central(scene, h=1e-7):
     }
 
 
-def assert_same(found, expected, tolerance, context=""):
-    """Each leaf's gradient agrees to `tolerance` times its norm, which is not 0."""
+def assert_same(found, expected, tolerance, context="", absent=()):
+    """Each leaf's gradient agrees to `tolerance` times its norm, which is not 0, except for the `absent`
+    leaves, on which nothing depends."""
     assert found.keys() == expected.keys()
     for name, want in expected.items():
         norm = np.linalg.norm(want)
-        assert norm > 0, (context, name)
-        error = np.linalg.norm(found[name] - want) / norm
-        assert error <= tolerance, f"{context} {name}: off by {error:.1e} of its norm {norm:.3g}"
+        assert (norm == 0) == (name in absent), (context, name)
+        error = np.linalg.norm(found[name] - want)
+        assert error <= tolerance * norm, f"{context} {name}: off by {error:.1e}, norm {norm:.3g}"
 
 
-def assert_slopes(found, gradients, scene, tolerance, context=""):
-    """Slopes along `directions`, whose components are ±1, agree to `tolerance` times the gradient's norm."""
+def assert_slopes(found, gradients, scene, tolerance, context="", absent=()):
+    """Slopes along `directions`, whose components are ±1, agree to `tolerance` times the gradient's norm, as
+    `assert_same` has it."""
     for name, tangent in directions(scene):
         along, norm = np.asarray(LEAVES[name](tangent)), np.linalg.norm(gradients[name])
-        assert norm > 0, (context, name)
-        error = abs(found[name] - np.vdot(gradients[name], along)) / norm
-        assert error <= tolerance, f"{context} {name}: off by {error:.1e} of its norm {norm:.3g}"
+        assert (norm == 0) == (name in absent), (context, name)
+        error = abs(found[name] - np.vdot(gradients[name], along))
+        assert error <= tolerance * norm, f"{context} {name}: off by {error:.1e}, norm {norm:.3g}"
 
 
 DEFAULT = "hierarchy"
@@ -269,11 +271,12 @@ def test_adjoints_agree_to_rounding(name):
         for camera in (*CAMERAS, "parallel"):
             scene = scene_of(name, None, "float64", camera, max_samples=128)
             expected = gradient(scene, "direct")
-            assert_same(gradient(scene), expected, 1e-9, camera)
-            assert_slopes(slopes(scene), expected, scene, 1e-9, camera)
+            absent = ("view_angle",) if camera == "parallel" else ()
+            assert_same(gradient(scene), expected, 1e-9, camera, absent)
+            assert_slopes(slopes(scene), expected, scene, 1e-9, camera, absent)
             for method in EXACT:
                 leapt = scene_of(name, method, "float64", camera)
-                assert_same(gradient(leapt), expected, 1e-9, (camera, method))
+                assert_same(gradient(leapt), expected, 1e-9, (camera, method), absent)
 
 
 @slow
