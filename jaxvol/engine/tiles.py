@@ -42,6 +42,7 @@ class OwnRays(eqx.Module):
     def pixel(self, place: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
         """The pixels of the rays at these indices."""
         if self.pixels is None:
+            place = place.astype(jnp.int32)  # from 64 bits under x64
             return self.first + place, jnp.zeros_like(place)
         flat = self.pixels.reshape(-1, 2)
         return flat[place, 0], flat[place, 1]

@@ -12,7 +12,7 @@ import jaxvol as jv
 from jaxvol.engine.tiling import Tiling
 from jaxvol.render import _render
 
-from ..scenes import anisotropic_noise, around, counting, soft_transfer
+from ..scenes import anisotropic_noise, around, counting, in_float64, soft_transfer, to_float64
 
 
 MARCH = jv.March(0.07, (jv.AlphaCorrection(),))
@@ -46,6 +46,20 @@ def test_rays_of_ones_own_see_what_the_camera_sees():
     origins, directions = camera.rays()
     rays = jv.render_rays(volume, soft_transfer(), origins, 3 * directions, MARCH)
     assert_same(rays, jv.render(volume, soft_transfer(), camera, MARCH), 2e-5)
+
+
+def test_rays_of_ones_own_draw_the_same_numbers_in_float64():
+    """By index, without pixels."""
+    volume = anisotropic_noise()
+    origins, directions = (np.asarray(rays, np.float64) for rays in around(volume).rays())
+    origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    march = jv.March(0.07, (jv.Jitter(3), jv.AlphaCorrection()))
+    single = jv.render_rays(volume, soft_transfer(), origins, directions, march)
+    with in_float64():
+        volume, march = to_float64((volume, march))
+        double = jv.render_rays(volume, to_float64(soft_transfer()), origins, directions, march)
+    assert double.rgba.dtype == jnp.float64
+    assert_same(single, double, 2e-5)
 
 
 @pytest.mark.slow
