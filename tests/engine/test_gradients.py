@@ -69,10 +69,13 @@ def test_gradients_documented_to_be_wrong_are_wrong():
     last cell is cut at the exit."""
     found = {name: summed_and_true(name) for name in ("plain", "aligned")}
     for leaf in WAYS:
-        change = abs(found["plain"][leaf][1])
+        changes = {name: np.abs(leaves[leaf]).max() for name, leaves in found.items()}
         for name, (integral, true) in ((name, leaves[leaf]) for name, leaves in found.items()):
-            error = abs(integral - true) / change
-            assert error > 0.5 if (name, leaf) in JUMPS else error < 0.02, (name, leaf)
+            error = abs(integral - true)
+            if (name, leaf) in JUMPS:
+                assert error > 0.5 * changes[name], (name, leaf)
+            else:  # of both, since the one with a cut does not depend on the step
+                assert error < 0.02 * max(changes.values()), (name, leaf)
 
 
 # the extremes
