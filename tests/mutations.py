@@ -281,6 +281,13 @@ MUTATIONS = [
         "return alpha",
         (f"{RENDERED}[plain-left]",),
     ),
+    Mutation(
+        "rays: index of 64 bits added to one of 32 under x64",
+        "engine/tiles.py",
+        "place = place.astype(jnp.int32)  # from 64 bits under x64",
+        "pass",
+        ("engine/test_tiling.py::test_rays_of_ones_own_draw_the_same_numbers_in_float64",),
+    ),
     # fetching, transfer functions, lighting, path tracing
     Mutation(
         "packing: sign of int16 and int8 lost",

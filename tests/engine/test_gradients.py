@@ -32,6 +32,10 @@ WAYS = {
 }
 """Leaves that move the samples or the exit, each with a change for which many samples cross the exit."""
 
+POINTS = 200
+"""Number of points at which a gradient is integrated along its way. With 40, the integral for `view_up` is
+off by 2.5 % of the change."""
+
 JUMPS = {("plain", leaf) for leaf in WAYS}
 """Cases whose gradient is wrong: the image jumps whenever a sample crosses the exit."""
 
@@ -58,7 +62,7 @@ def summed_and_true(name):
         def at(part, where=where, way=way):
             return eqx.tree_at(where, scene, where(scene) + part * way)
 
-        slopes = [jnp.vdot(where(gradient(at((i + 0.5) / 40))), way) for i in range(40)]
+        slopes = [jnp.vdot(where(gradient(at((i + 0.5) / POINTS))), way) for i in range(POINTS)]
         found[leaf] = float(np.mean(slopes)), float(loss(at(1.0)) - loss(at(0.0)))
     return found
 
@@ -69,13 +73,10 @@ def test_gradients_documented_to_be_wrong_are_wrong():
     last cell is cut at the exit."""
     found = {name: summed_and_true(name) for name in ("plain", "aligned")}
     for leaf in WAYS:
-        changes = {name: np.abs(leaves[leaf]).max() for name, leaves in found.items()}
+        change = abs(found["plain"][leaf][1])
         for name, (integral, true) in ((name, leaves[leaf]) for name, leaves in found.items()):
-            error = abs(integral - true)
-            if (name, leaf) in JUMPS:
-                assert error > 0.5 * changes[name], (name, leaf)
-            else:  # of both, since the one with a cut does not depend on the step
-                assert error < 0.02 * max(changes.values()), (name, leaf)
+            error = abs(integral - true) / change
+            assert error > 0.5 if (name, leaf) in JUMPS else error < 0.02, (name, leaf)
 
 
 # the extremes
