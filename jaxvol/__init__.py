@@ -7,6 +7,7 @@ composited front to back into a `Rendering`.
 
 from . import lighting as lighting, metrics as metrics
 from .camera import Camera as Camera
+from .compositing import Compositing as Compositing, Over as Over
 from .display import (
     from_srgb as from_srgb,
     save_image as save_image,

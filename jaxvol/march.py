@@ -11,6 +11,7 @@ passes through all transforms in turn, so that they compose.
 | `start` | how many steps past the entry is the first cell? | 0 |
 | `shift` | by what part of a step do samples behind the first transparent one move? | 0 |
 | `empty_space` | where is nothing visible? | unknown |
+| `stride` | how many steps long may this cell be? | 1 |
 | `cut` | which part of its cell does a sample stand for? | all of it |
 | `stop` | is this ray finished? | not before the exit |
 """
@@ -108,6 +109,20 @@ class Transform(eqx.Module):
         image; None for `render_rays`."""
         return None
 
+    @property
+    def longest(self) -> int:
+        """The longest stride that `stride` may give, a static power of two."""
+        return 1
+
+    def stride(self, ray: Ray, depth: Scalar) -> Int[Array, ""]:
+        """The binary logarithm of the number of steps that the cell at this depth may be long.
+
+        It depends on the ray and the scene alone. A march clips it, so that a cell is at most `longest` steps
+        long, and a cell of n steps begins a multiple of n steps behind the first one. Rays leap to multiples
+        of `longest`, so that leaps do not move cells. Of several transforms the shortest stride counts.
+        Gradients take strides as given."""
+        return jnp.zeros(jnp.shape(depth), jnp.int32)
+
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
         is fixed; a piece may have width 0."""
@@ -188,6 +203,14 @@ class March(eqx.Module):
         """Whether any transform overrides `shift`."""
         return any(type(transform).shift is not Transform.shift for transform in self.transforms)
 
+    @property
+    def longest(self) -> int:
+        """The longest stride of a cell, in steps."""
+        return min((transform.longest for transform in self._striding()), default=1)
+
+    def _striding(self) -> list[Transform]:
+        return [t for t in self.transforms if type(t).stride is not Transform.stride]
+
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""
         space: Space = Affine(volume)
@@ -209,6 +232,17 @@ class March(eqx.Module):
             shift = shift + transform.shift(ray)
         # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
+
+    def stride(self, ray: Ray, depth: Scalar, index: Int[Array, ""]) -> Int[Array, ""] | int:
+        """How many steps long the cell is that begins at this depth, `index` steps behind the first one."""
+        longest = self.longest
+        if longest == 1:
+            return 1
+        exponents = [jnp.asarray(transform.stride(ray, depth), index.dtype) for transform in self._striding()]
+        exponent = jnp.clip(jnp.min(jnp.stack(exponents), axis=0), 0, longest.bit_length() - 1)
+        # the largest power of two that divides the index
+        aligned = jnp.where(index == 0, longest, index & -index)
+        return jnp.minimum(jnp.left_shift(1, exponent), aligned)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""

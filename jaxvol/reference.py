@@ -6,7 +6,7 @@ extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` say
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,28 +16,38 @@ from jaxtyping import Array, Bool, Float, Int
 from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, along, apart
-from .compositing import Over
+from .arguments import check_arguments
+from .compositing import Composite, Compositing, Mode, compositing_of
 from .lighting.shading import Lighting, Sample, classification
 from .march import Cell, March
 from .rendering import Details, Outputs, Rendering
-from .scene import check_scene
 from .space import Line, Ray, enter, invalid
 from .transfer import Classification, Measured, Transfer
 from .volume import Volume, without_voxels
+
+
+class Pipeline(NamedTuple):
+    """What turns the rays of an image into pixels: how they step, through which volume; how its samples are
+    measured, classified and shaded; how cells are composited."""
+
+    march: March
+    volume: Volume
+    classification: Classification
+    compositing: Compositing
 
 
 class Progress(eqx.Module):
     """How far a ray has come.
 
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
-    ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `seen` is the
-    composite of all cells so far. `shift`, in steps, is added to `offset` behind the first transparent cell,
-    and is 0 from then on. What is not asked for is None.
+    ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
+    that of all cells so far. `shift`, in steps, is added to `offset` behind the first transparent cell, and
+    is 0 from then on. What is not asked for is None.
     """
 
     index: Int[Array, ""]
     offset: Scalar
-    seen: Over
+    composite: Composite
     met: "Met | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
@@ -50,11 +60,11 @@ class Met(eqx.Module):
     aligned: Bool[Array, ""]
 
 
-def has_fault(volume: Volume, transfer: Transfer, march: March, lighting: Lighting | None) -> Bool[Array, ""]:
+def has_fault(volume: Volume, march: March, *others: Any) -> Bool[Array, ""]:
     """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
     Comparisons with NaN are false and would make it invisible, so that a fit that diverged would look
     converged. Rays and voxels are checked ray by ray."""
-    return ~(all_finite((without_voxels(volume), transfer, march, lighting)) & (march.step > 0))
+    return ~(all_finite((without_voxels(volume), march, others)) & (march.step > 0))
 
 
 def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
@@ -64,21 +74,24 @@ def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
     return Progress(
         index=count,
         offset=march.start(ray),
-        seen=Over.begin(zero, color=outputs is not None, moment=outputs in ("all", "depth")),
+        composite=Composite.begin(zero, color=outputs is not None, moment=outputs in ("all", "depth")),
         met=Met(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
     )
 
 
-def pieces(march: March, ray: Ray, volume: Volume, front: Scalar) -> tuple[Cell, ...]:
-    """The pieces of the cell that begins at depth `front`."""
-    return march.cut(Cell(front, march.step, jnp.zeros(front.shape, bool)), ray, volume)
+def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] | int) -> tuple[Cell, ...]:
+    """The pieces of the cell that begins at depth `front`, and is so many steps long."""
+    march = pipeline.march
+    cell = Cell(front, jnp.asarray(stride, march.step.dtype) * march.step, jnp.zeros(front.shape, bool))
+    return march.cut(cell, ray, pipeline.volume)
 
 
-def measure(march: March, ray: Ray, seen: Classification, piece: Cell) -> Measured:
+def measure(pipeline: Pipeline, ray: Ray, piece: Cell) -> Measured:
     """The measured values at a piece's sample, and what the transfer function's search finds for them."""
-    return seen.searched(seen.measure(ray.path(march.sample(piece))))
+    classification = pipeline.classification
+    return classification.searched(classification.measure(ray.path(pipeline.march.sample(piece))))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
@@ -87,24 +100,26 @@ def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
     return inside & ray.path.contains(ray.path(depth)) if ray.path.gaps else inside
 
 
-def opacity(march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured) -> Scalar:
+def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     """Opacity of a piece; 0 past the exit, and in gaps."""
-    _, extinction = seen.classify(measured)
-    optical_depth = jnp.where(contained(ray, march.sample(piece)), extinction, 0) * piece.width
+    _, extinction = pipeline.classification.classify(measured)
+    inside = contained(ray, pipeline.march.sample(piece))
+    optical_depth = jnp.where(inside, extinction, 0) * piece.width
     # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
     t = jnp.tanh(optical_depth / 2)
     return 2 * t / (1 + t)
 
 
-def color(
-    march: March, ray: Ray, seen: Classification, piece: Cell, measured: Measured, transmittance: Scalar
-) -> Vec3:
+def color(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured, transmittance: Scalar) -> Vec3:
     """Colour of a piece behind this transmittance, shaded where there is a lighting."""
-    color, extinction = seen.classify(measured)
-    if seen.light is None:
+    classification = pipeline.classification
+    color, extinction = classification.classify(measured)
+    if classification.light is None:
         return color
-    point = along(ray.entry, ray.direction, march.sample(piece))
-    return seen.light(Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel))
+    point = along(ray.entry, ray.direction, pipeline.march.sample(piece))
+    return classification.light(
+        Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
+    )
 
 
 def counts(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
@@ -113,31 +128,28 @@ def counts(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
 
 
 def blend(
-    march: March,
-    ray: Ray,
-    at: Progress,
-    cell: tuple[tuple[Cell, Vec3, Scalar], ...],
+    pipeline: Pipeline, ray: Ray, at: Progress, cell: tuple[tuple[Cell, Vec3, Scalar], ...]
 ) -> Progress:
     """Composites a cell, given its pieces with their colours and opacities."""
-    seen, met = at.seen, at.met
+    march, _, _, compositing = pipeline
+    composite, met = at.composite, at.met
     for piece, own, alpha in cell:
-        weight = jnp.where(at.finished, 0, seen.weight(alpha))
-        seen = seen.add(weight, own, march.sample(piece))
+        weight = jnp.where(at.finished, 0, compositing.weight(composite.opacity, alpha))
+        composite = composite.add(weight, own, march.sample(piece))
         if met is not None:
             taken = ~at.finished & counts(march, ray, piece)
             met = Met(
                 met.samples + taken.astype(met.samples.dtype),
                 met.aligned | (piece.cut & (weight > 0)),
             )
-    return replace(at, seen=seen, met=met, finished=at.finished | march.stop(seen.transmittance))
+    stopped = march.stop(compositing.transmittance(composite.opacity))
+    return replace(at, composite=composite, met=met, finished=at.finished | stopped)
 
 
-def move(
-    march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, cells: Any = 1
-) -> Progress:
-    """Moves on by this many cells. `transparent`: whether the last one, or all of them, are, so that the ray
+def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
+    """Moves on by this many steps. `transparent`: whether the last cell, or all of them, are, so that the ray
     shifts; None where no shift is ahead. The ray is finished if the next cell begins past the exit."""
-    at = replace(at, index=at.index + cells)
+    at = replace(at, index=at.index + steps)
     if at.shift is not None and transparent is not None:
         shift = jnp.where(transparent, at.shift, 0)
         at = replace(at, offset=at.offset + shift, shift=jnp.where(transparent, 0, at.shift))
@@ -145,31 +157,34 @@ def move(
 
 
 def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
-    """Depth at which the next cell begins, or the one so many cells ahead of it."""
+    """Depth at which the next cell begins, or the one so many steps ahead of it."""
     return (at.offset + (at.index + ahead).astype(at.offset.dtype)) * march.step
 
 
-def step(march: March, ray: Ray, volume: Volume, seen: Classification, at: Progress) -> Progress:
+def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on. Changes nothing once the ray is finished."""
-    cut = pieces(march, ray, volume, front(march, at))
-    measured = [measure(march, ray, seen, piece) for piece in cut]
-    alphas = [opacity(march, ray, seen, piece, read) for piece, read in zip(cut, measured, strict=True)]
+    march, _, _, compositing = pipeline
+    stride = march.stride(ray, front(march, at), at.index)
+    cut = pieces(pipeline, ray, front(march, at), stride)
+    measured = [measure(pipeline, ray, piece) for piece in cut]
+    alphas = [opacity(pipeline, ray, piece, read) for piece, read in zip(cut, measured, strict=True)]
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    before, colors = at.seen, []
+    before, colors = at.composite, []
     for piece, read, alpha in zip(cut, measured, alphas, strict=True):
-        colors.append(color(march, ray, seen, piece, read, before.transmittance))
-        before = before.add(before.weight(alpha))
-    after = blend(march, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
-    return move(march, ray, after, transparent)
+        transmittance = compositing.transmittance(before.opacity)
+        colors.append(color(pipeline, ray, piece, read, transmittance))
+        before = before.add(compositing.weight(before.opacity, alpha))
+    after = blend(pipeline, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
+    return move(march, ray, after, transparent, stride)
 
 
 def end(ray: Ray, at: Progress) -> Rendering:
     """The rendering of a ray, with the outputs that it was begun with."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
     # a product, since the derivative of a `where` would be 0
-    rgba = at.seen.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
-    if at.seen.moment is not None:
-        mean = at.seen.mean_depth()
+    rgba = at.composite.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
+    if at.composite.moment is not None:
+        mean = at.composite.mean_depth()
         details = Details(jnp.where(valid & jnp.isinf(mean), jnp.inf, ray.t_in + mean))
     if at.met is not None:
         details = details._replace(samples=at.met.samples, aligned=at.met.aligned)
@@ -184,6 +199,7 @@ def render_ray_reference(
     march: March | Any,
     *,
     pixel: tuple[Any, Any] = (0, 0),
+    compositing: Mode | Compositing | Any = "over",
     lighting: Lighting | Any | None = None,
 ) -> Rendering:
     """What one ray sees, by a plain scan over its cells.
@@ -195,6 +211,7 @@ def render_ray_reference(
 
     - `origin`, `direction`: world point and unit direction of the ray.
     - `pixel`: (column, row), which keys random numbers.
+    - `compositing`: how cells become a pixel.
     - `lighting`: how samples are shaded.
 
     **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
@@ -203,19 +220,20 @@ def render_ray_reference(
     the length of the scan cannot be known.
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
-    check_scene(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
+    check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
+    mode = compositing_of(compositing)
     origin, direction = _vector("origin", origin), _vector("direction", direction)
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
-    ray = invalid(enter(space, *line), has_fault(volume, transfer, march, lighting))
+    ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
     lit = classification(volume, transfer, space, lighting)
     of_pixels = lighting is not None and lighting.shades_pixels
-    seen = lit._replace(light=None) if of_pixels else lit
+    pipeline = Pipeline(march, volume, lit._replace(light=None) if of_pixels else lit, mode)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
-        return step(march, ray, volume, seen, at), None
+        return step(pipeline, ray, at), None
 
     at, _ = jax.lax.scan(one, varying(begin(march, ray), ray), None, length=steps_across(volume, march))
     rendering = end(ray, at)

@@ -10,16 +10,18 @@ from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, finite_array, require
 from ._util.sharding import shard_number, varying
+from .arguments import check_arguments
 from .camera import Camera
-from .engine.acceleration import Scene, VolumeAcceleration
+from .compositing import Compositing, Mode, compositing_of
+from .engine.acceleration import VolumeAcceleration
 from .engine.adjoints import AbstractAdjoint, Adjoint, adjoint_of
 from .engine.image import RenderOptions
+from .engine.scene import Scene
 from .engine.tiles import OwnRays
 from .engine.tiling import Tiling
 from .lighting.shading import Lighting
 from .march import March
 from .rendering import Rendering
-from .scene import check_scene
 from .transfer import Transfer
 from .volume import Volume
 
@@ -34,6 +36,7 @@ def render(
     camera: Camera | Any,
     march: March | Any,
     *,
+    compositing: Mode | Compositing | Any = "over",
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     adjoint: Adjoint | Any = "replay",
@@ -45,6 +48,7 @@ def render(
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
     - `march`: step and transforms.
+    - `compositing`: how the cells of a ray become a pixel: `"over"`, or a `Compositing`.
     - `lighting`: how samples are shaded, such as `lighting.ScattererTemplates`. Without, colours are those of
       the transfer function.
     - `outputs`: `"rgba"` computes the image and `exhausted` only, in some 5 % less time; `"all"` everything
@@ -75,8 +79,9 @@ def render(
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
     order = "render(volume, transfer, camera, march)"
-    check_scene(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    return _render((volume, transfer, camera, march, lighting), outputs, adjoint)
+    check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
+    scene = Scene(volume, transfer, camera, march, compositing_of(compositing), lighting)
+    return _render(scene, outputs, adjoint)
 
 
 def render_rays(
@@ -87,6 +92,7 @@ def render_rays(
     march: March | Any,
     *,
     pixels: Arrayable | None = None,
+    compositing: Mode | Compositing | Any = "over",
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     adjoint: Adjoint | Any = "replay",
@@ -106,7 +112,7 @@ def render_rays(
     infinity, and directions of length 0.
     """
     order = "render_rays(volume, transfer, origins, directions, march)"
-    check_scene(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
+    check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
     origins = finite_array("origins", origins, (..., 3))
     directions = finite_array("directions", directions, (..., 3))
     if origins.shape != directions.shape:
@@ -119,7 +125,8 @@ def render_rays(
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
     source = OwnRays(origins, directions, _pixels(pixels, origins), first)
-    return _render((volume, transfer, source, march, lighting), outputs, adjoint)
+    scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
+    return _render(scene, outputs, adjoint)
 
 
 def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None) -> Rendering:
@@ -127,14 +134,13 @@ def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = No
     for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
-    volume, transfer, source, march, lighting = scene
+    volume, transfer, _, march, _, lighting = scene
     how = adjoint_of(adjoint, volume, march)
     if lighting is not None:
         lighting = lighting.prepared(volume, transfer, march)
     options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
-    scene, acceleration = varying(
-        ((volume, transfer, source, march, lighting), VolumeAcceleration.of(volume, march))
-    )
+    acceleration = VolumeAcceleration.of(volume, march)
+    scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
     if lighting is not None and lighting.shades_pixels:
         return _shaded_afterwards(scene, options, how, acceleration)
     return how.render(scene, options, acceleration)
@@ -146,7 +152,7 @@ def _shaded_afterwards(
     """The image is rendered without light, and shaded as a whole."""
     all_ = options.outputs == "all"
     unlit = replace(options, outputs="all" if all_ else "depth")
-    rendering = how.render((*scene[:-1], None), unlit, acceleration)
+    rendering = how.render(scene._replace(lighting=None), unlit, acceleration)
     rgba = how.shade(scene, acceleration, rendering.rgba, rendering.depth)
     return replace(rendering, rgba=rgba) if all_ else Rendering(rgba, rendering.exhausted)
 

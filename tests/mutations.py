@@ -277,7 +277,7 @@ MUTATIONS = [
     Mutation(
         "compositing: samples not attenuated by those in front",
         "compositing.py",
-        "return (1 - self.opacity) * alpha",
+        "return (1 - opacity) * alpha",
         "return alpha",
         (f"{RENDERED}[plain-left]",),
     ),
@@ -327,8 +327,8 @@ MUTATIONS = [
     Mutation(
         "NaN: a NaN leaf gives a black image",
         "engine/image.py",
-        "return one(number, invalid(tiles.rays(source, space, number), fault))",
-        "return one(number, tiles.rays(source, space, number))",
+        "return one(number, invalid(tiles.rays(scene.source, space, number), fault))",
+        "return one(number, tiles.rays(scene.source, space, number))",
         (NAN,),
     ),
     Mutation(
@@ -348,8 +348,8 @@ MUTATIONS = [
     Mutation(
         "NaN: a NaN image has derivative 0",
         "reference.py",
-        "rgba = at.seen.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)",
-        "rgba = jnp.where(valid, at.seen.rgba(), jnp.nan)",
+        "rgba = at.composite.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)",
+        "rgba = jnp.where(valid, at.composite.rgba(), jnp.nan)",
         ("engine/test_faults.py::test_nan_reaches_image_and_derivative_of_other_adjoints[direct]",),
     ),
     Mutation(

@@ -32,7 +32,7 @@ ORDER = [
     "lighting",
     "compositing",
     "rendering",
-    "scene",
+    "arguments",
     "reference",
     "engine",
     "render",

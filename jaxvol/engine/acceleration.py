@@ -1,28 +1,22 @@
 """What is found out about a scene before any ray is marched?"""
 
-from typing import TypeAlias
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from ..camera import Camera
-from ..lighting.shading import Lighting
+from ..compositing import Over
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
-from ..reference import end
-from ..transfer import Transfer
+from ..reference import Pipeline, end
 from ..transforms.space_leaping import FirstHit
 from ..volume import Volume
 from .batch import Beams
 from .packing import words_of
+from .scene import Scene
 from .tiles import OwnRays, RayTiles, lines, vmap_rays
 from .tiling import Tiling
 from .wavefront import march_rays
-
-
-Scene: TypeAlias = tuple[Volume, Transfer, Camera | OwnRays, March, Lighting | None]
 
 
 class VolumeAcceleration(eqx.Module):
@@ -39,7 +33,7 @@ class VolumeAcceleration(eqx.Module):
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
     """Where the scene is empty; None where the march does not leap. It carries no gradient."""
-    volume, transfer, source, march, _ = jax.lax.stop_gradient(scene)
+    volume, transfer, source, march, *_ = jax.lax.stop_gradient(scene)
     blocks = acceleration.blocks
     if blocks is None:
         return None
@@ -55,7 +49,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         tiles, only = RayTiles.of(own, tiling._replace(tile=columns.size)), jnp.zeros((), jnp.int32)
         rays = tiles.rays(own, space, only)
         beams = Beams(rays, tiles.beams, tiles.box(own, rays, only))
-        at, _ = march_rays(first, volume, transfer.over(volume), index, beams, tiling, "depth")
+        pipeline = Pipeline(first, volume, transfer.over(volume), Over())
+        at, _ = march_rays(pipeline, index, beams, tiling, "depth")
         seen = vmap_rays(end)(rays, at)
         return tiles.assemble(seen.depth[None]).reshape(columns.shape)
 

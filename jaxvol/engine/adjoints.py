@@ -17,9 +17,10 @@ from ..march import March
 from ..reference import steps_across
 from ..rendering import Rendering
 from ..volume import Volume
-from .acceleration import Scene, VolumeAcceleration
+from .acceleration import VolumeAcceleration
 from .gradients import render_vjp
 from .image import RenderOptions, march_image, scan_image, shade_image
+from .scene import Scene
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]

@@ -14,10 +14,8 @@ from .._util.xla import gather
 from ..beams import Box
 from ..march import EmptySpaceIndex, March
 from ..occupancy import Occupancy
-from ..reference import Progress, front, move
+from ..reference import Pipeline, Progress, front, move
 from ..space import Ray
-from ..transfer import Classification
-from ..volume import Volume
 from .segment import SampleVisitor, march_segment, regular_from_here
 from .tiling import Tiling
 
@@ -59,9 +57,7 @@ class Job(NamedTuple):
     - `any_order`: whether the first pass takes all rays.
     """
 
-    march: March
-    volume: Volume
-    seen: Classification
+    pipeline: Pipeline
     beams: Beams
     tiling: Tiling
     visitor: SampleVisitor | None
@@ -71,13 +67,13 @@ class Job(NamedTuple):
 
     def alive(self, at: Progress) -> Bool[Array, "*rays"]:
         """Rays that are not finished, and may take more samples."""
-        return ~at.finished & (at.index < self.march.most_samples)
+        return ~at.finished & (at.index < self.pipeline.march.most_samples)
 
     def wanted(self, at: Progress, regular: bool) -> Bool[Array, "*rays"]:
         """Rays to march in this pass: in the `regular` one, or where samples are limited, all that are alive;
         otherwise those that may still shift, or all if `any_order`."""
         alive = self.alive(at)
-        if regular or self.march.max_samples is not None:
+        if regular or self.pipeline.march.max_samples is not None:
             return alive
         return alive & (self.any_order | ~regular_from_here(at))
 
@@ -121,7 +117,7 @@ def march_batch(
         here, (mine, more, total) = state
         if job.empty_space is not None:
             here = _leap(job, job.empty_space, beam, rays, here)
-        after, samples = march_segment(job.march, job.volume, job.seen, tiling, rays, here, regular=regular)
+        after, samples = march_segment(job.pipeline, tiling, rays, here, regular=regular)
         if visitor is not None:
             mine, found, total = visitor.visit(rays, here, samples, given, mine, total)
             more = jax.tree.map(jnp.add, more, found)
@@ -140,10 +136,10 @@ def with_fields(at: Progress, **changes: Array) -> Progress:
     return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
 
 
-def over_transparent(march: March, ray: Ray, at: Progress, cells: Int[Array, ""]) -> Progress:
-    """Moves a ray on by so many cells, all of which are transparent."""
-    moved = move(march, ray, at, jnp.ones((), bool), cells)
-    return jax.tree.map(lambda a, b: jnp.where((cells > 0) & ~at.finished, a, b), moved, at)
+def over_transparent(march: March, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
+    """Moves a ray on by so many steps, over which all cells are transparent."""
+    moved = move(march, ray, at, jnp.ones((), bool), steps)
+    return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
 
 def finished_after(range_: CellRange | None, at: Progress) -> Progress:
@@ -156,12 +152,13 @@ def _leap(
 ) -> Progress:
     """Moves rays on to the first cell that is not proven empty. A ray with nothing ahead of it is
     finished."""
-    march = job.march
+    march = job.pipeline.march
     here = front(march, at)
     there = empty_space.skip_to(job.prepared, beam, rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     # clipped before it becomes an integer, whose range it may exceed
-    cells = jnp.minimum(
-        jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype), march.most_samples - at.index
-    )
-    return jax.vmap(partial(over_transparent, march))(rays, at, cells)
+    steps = jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype)
+    if march.longest > 1:  # to where a cell begins also without the leap
+        steps = jnp.maximum((at.index + steps) // march.longest * march.longest - at.index, 0)
+    steps = jnp.minimum(steps, march.most_samples - at.index)
+    return jax.vmap(partial(over_transparent, march))(rays, at, steps)

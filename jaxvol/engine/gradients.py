@@ -15,15 +15,16 @@ from jaxtyping import Array, PyTree
 from .._util.sharding import varying
 from .._util.trees import added, floats
 from ..lighting.shading import Surroundings
-from ..reference import has_fault
+from ..reference import Pipeline
 from ..rendering import Rendering
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
-from .acceleration import Scene, VolumeAcceleration, empty_space_of
+from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
-from .image import RenderOptions
+from .image import RenderOptions, fault_of
 from .packing import with_words
 from .replay import Cotangents, Replay, Total
+from .scene import Scene
 from .shading_gradient import Lit
 from .tiles import RayTiles
 from .wavefront import march_rays
@@ -65,14 +66,14 @@ def _pulled(
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
-    volume, transfer, source, march, lighting = scene
-    of_voxels = eqx.is_inexact_array(volume.data) and perturbed[0].data
-    places = any(jax.tree.leaves((perturbed[0], *perturbed[2:4])))
+    volume, transfer, source, march, compositing, lighting = scene
+    of_voxels = eqx.is_inexact_array(volume.data) and perturbed.volume.data
+    places = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
     packed, tiling = with_words(volume, acceleration.words), options.tiling
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
         index = index.within_ranges()
-    seen, fault = transfer.over(packed), has_fault(volume, transfer, march, lighting)
+    pipeline, fault = Pipeline(march, packed, transfer.over(packed), compositing), fault_of(scene)
     light, pull_light = None, None
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
@@ -90,13 +91,13 @@ def _pulled(
         moving = floats((without_voxels(volume), source, march))
         rays, pull = eqx.filter_vjp(made, moving)
         replay = Replay(
-            (volume, acceleration.words, transfer, march),
-            seen,
+            pipeline,
+            (volume, acceleration.words, transfer),
             *(rays, Cotangents.of(rays, rendering, cotangent), total, light, tiling),
             places=places,
         )
         beams = Beams(rays, tiles.beams, tiles.box(source, rays, number), range_)
-        _, (_, of_rays, total) = march_rays(march, packed, seen, index, beams, tiling, None, replay)
+        _, (_, of_rays, total) = march_rays(pipeline, index, beams, tiling, None, replay)
         if not places:
             return (total, of_source), None
         if cotangent.details.depth is not None:
@@ -119,25 +120,26 @@ def _pulled(
     (total, of_source), _ = jax.lax.scan(
         tile, varying(start, image), (jnp.arange(tiles.number), ranges, *image)
     )
-    return _cotangents(volume, total, of_source, pull_light)
+    return _cotangents(scene, total, of_source, pull_light)
 
 
 def _cotangents(
-    volume: Volume, total: Total, of_source: PyTree, pull_light: Callable[[PyTree], Any] | None
-) -> tuple[PyTree, ...]:
-    """The cotangents of volume, transfer function, source of rays, march and lighting."""
-    of_volume = total.volume
+    scene: Scene, total: Total, of_source: PyTree, pull_light: Callable[[PyTree], Any] | None
+) -> Any:
+    """The cotangents of a scene's parts."""
+    of_volume, compositing = total.volume, scene.compositing  # which has no leaves
     if total.voxels is not None:
-        voxels = total.voxels.reshape(volume.data.shape).astype(volume.data.dtype)
-        of_volume = with_voxels(of_volume, voxels)
+        data = scene.volume.data
+        of_volume = with_voxels(of_volume, total.voxels.reshape(data.shape).astype(data.dtype))
     if pull_light is None:
-        return of_volume, total.transfer, of_source, total.march, None
+        return Scene(of_volume, total.transfer, of_source, total.march, compositing, None)
     more_volume, more_transfer, more_march, of_lighting = pull_light(total.light)[0]
-    return (
+    return Scene(
         added(of_volume, more_volume),
         added(total.transfer, more_transfer),
         of_source,
         added(total.march, more_march),
+        compositing,
         of_lighting,
     )
 
@@ -145,7 +147,7 @@ def _cotangents(
 def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable[[PyTree], Any]]:
     """What shades an image; and the pull-back of its leaves to volume, transfer function, march and
     lighting."""
-    volume, transfer, _, march, lighting = scene
+    volume, transfer, _, march, _, lighting = scene
     parts = volume if voxels else without_voxels(volume), transfer, march, lighting
     moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
 

@@ -5,14 +5,15 @@ k has weight w_k, colour c_k and depth s_k past the entry. Then a unit of its we
 
     q_k = c̄ · c_k + ā + (d̄ / A) (s_k - (D - t_in))
 
-to the loss and, with T_k the transmittance behind sample k and τ_k its optical depth (extinction × width),
+to the loss, and
 
-    ∂L/∂τ_k = T_k q_k - Σ_{j>k} w_j q_j        ∂L/∂c_k = w_k c̄        ∂L/∂s_k = w_k d̄ / A
+    ∂L/∂c_k = w_k c̄        ∂L/∂s_k = w_k d̄ / A        ∂L/∂τ_k = Σ_j q_j ∂w_j/∂τ_k
 
-The sum over j > k is Σ w_j q_j = c̄ · C + ā A, known from the image, minus the sum over j ≤ k. So nothing is
-kept from the first march, and nothing is divided by a transmittance, which may be 0. JAX pulls optical
-depths, colours and depths back to the transfer function, the voxels, the ray and the step, one segment at a
-time.
+with the optical depth τ_k (extinction × width). The last is the compositing mode's to say
+(`Compositing.slope`) from q_k and Σ_{j>k} w_j q_j, which is Σ w_j q_j = c̄ · C + ā A, known from the image,
+minus the sum over j ≤ k. So nothing is kept from the first march, and nothing is divided by a transmittance,
+which may be 0. JAX pulls optical depths, colours and depths back to the transfer function, the voxels, the
+ray and the step, one segment at a time.
 
 Where rays leap over empty space, the first march records each ray's first and last visible cell, and the
 second one leaps over all others, which saves two fifths of the samples in the head.
@@ -28,16 +29,15 @@ from jaxtyping import Array, Float, PyTree, UInt32
 from .._util.fetching import Recording, scatter_add
 from .._util.trees import added, floats
 from .._util.vec3 import Scalar, Vec3, along
-from ..compositing import pull_over
 from ..march import March
-from ..reference import Progress, contained, front, pieces
+from ..reference import Pipeline, Progress, contained
 from ..rendering import Rendering
 from ..space import Ray
-from ..transfer import Classification, Transfer
+from ..transfer import Transfer
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .batch import CellRange
 from .packing import with_words
-from .segment import Samples, SampleVisitor, vmap_cells
+from .segment import Ahead, Samples, SampleVisitor, pieces_ahead, vmap_cells
 from .shading import Weights, weights_of
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
 from .tiling import Tiling
@@ -57,11 +57,10 @@ class VisibleRangeRecorder(SampleVisitor):
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: None, kept: CellRange, total: None
     ) -> tuple[CellRange, None, None]:
-        count = samples.opacity[0].shape[0]
-        cells = at.index[None] + jnp.arange(count, dtype=at.index.dtype)[:, None]
-        seen = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
-        first = jnp.min(jnp.where(seen, cells, kept.first[None]), axis=0)
-        until = jnp.max(jnp.where(seen, cells + 1, kept.until[None]), axis=0)
+        begin, end = samples.ahead.ends(at.index)
+        visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
+        first = jnp.min(jnp.where(visible, begin, kept.first[None]), axis=0)
+        until = jnp.max(jnp.where(visible, end, kept.until[None]), axis=0)
         return CellRange(jnp.minimum(kept.first, first), until), None, None
 
 
@@ -79,12 +78,12 @@ class Cotangents(NamedTuple):
     def of(cls, ray: Ray, rendering: Rendering, gradient: Rendering) -> "Cotangents":
         """Of rays (groups, rays in a group), from their part of the image and of its cotangent."""
         red, green, blue, opacity = (gradient.rgba[..., i] for i in range(4))
-        worth = jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
+        final, worth = rendering.rgba[..., 3], jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
         if gradient.details.depth is None:
             return cls((red, green, blue), opacity, worth)
-        seen = rendering.rgba[..., 3] > 0
-        middle = jnp.where(seen, rendering.depth - ray.t_in, 0)
-        depth = jnp.where(seen, gradient.depth, 0) / jnp.where(seen, rendering.rgba[..., 3], 1)
+        visible = final > 0
+        middle = jnp.where(visible, rendering.depth - ray.t_in, 0)
+        depth = jnp.where(visible, gradient.depth, 0) / jnp.where(visible, final, 1)
         return cls((red, green, blue), opacity, worth, depth, middle)
 
 
@@ -120,7 +119,8 @@ class Replay(SampleVisitor):
 
     **Arguments:**
 
-    - `scene`: volume, the packed copy of its voxels, transfer function and march.
+    - `pipeline`: of the rays. `volume`, `transfer`: where the gradient is taken, `words`: the packed copy of
+      the volume's voxels.
     - `given`: cotangents of the rays.
     - `total`: to be added to.
     - `light`: what shades the samples.
@@ -129,8 +129,8 @@ class Replay(SampleVisitor):
 
     def __init__(
         self,
-        scene: tuple[Volume, UInt32[Array, " voxels"] | None, Transfer, March],
-        seen: Classification,
+        pipeline: Pipeline,
+        scene: tuple[Volume, UInt32[Array, " voxels"] | None, Transfer],
         rays: Ray,
         given: Cotangents,
         total: Total,
@@ -139,8 +139,8 @@ class Replay(SampleVisitor):
         *,
         places: bool,
     ):
-        self.volume, self.words, self.transfer, self.march = scene
-        self.seen, self.places, self.light = seen, places, light
+        self.volume, self.words, self.transfer = scene
+        self.pipeline, self.places, self.light = pipeline, places, light
         self.given, self.total, self.tiling = given, total, tiling
         self.kept = jnp.zeros_like(given.worth)  # what the samples in front are worth
         self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if places else None
@@ -150,17 +150,17 @@ class Replay(SampleVisitor):
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
         red, green, blue = each.color
-        classify = vmap_cells(self.seen.classify)
+        classify = vmap_cells(self.pipeline.classification.classify)
         classified = [classify(measured) for measured in samples.measured]
-        depths = [self.march.sample(cell) for cell in samples.cells]
-        weights = weights_of(self.march, at, samples.opacity)
+        depths = [self.pipeline.march.sample(cell) for cell in samples.cells]
+        weights = weights_of(self.pipeline, at, samples.opacity)
         of_color = [(weight * red, weight * green, weight * blue) for weight in weights.weight]
         lit: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
         if self.light is not None:
             sums = LightTotal(total.light, total.transfer, total.voxels)
             lit, sums = shading_vjp(
-                *(self.light, self.seen, self.march, ray, samples, weights, of_color),
+                *(self.light, self.pipeline, ray, samples, weights, of_color),
                 *(self.tiling.chunk, sums),
             )
             total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
@@ -171,7 +171,7 @@ class Replay(SampleVisitor):
                 value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
             ]
         inside = vmap_cells(contained, of_cells=(False, True))
-        kept, slopes = _slopes(weights, worth, given.worth, kept)
+        kept, slopes = self._slopes(samples.opacity, weights, worth, given.worth, kept)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
         of_measured = []
@@ -186,30 +186,38 @@ class Replay(SampleVisitor):
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
         of_march, of_volume, of_rays, asked, of_voxels = self._placed(
-            ray, at, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
+            ray, at, samples.ahead, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
         voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return kept, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
-    def _placed(self, ray: Ray, at: Progress, cotangents: list[tuple[PyTree, Scalar, Any, Any]]) -> tuple:
+    def _placed(
+        self, ray: Ray, at: Progress, ahead: Ahead, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
+    ) -> tuple:
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
         its depth where the loss depends on that, and of its point where it is shaded; then the voxels that
         were fetched, and their cotangents. The number of samples counts as constant."""
         voxels = self.total.voxels is not None
-        march, march_rest = eqx.partition(self.march, eqx.is_inexact_array)
+        march, march_rest = eqx.partition(self.pipeline.march, eqx.is_inexact_array)
         volume, volume_rest = eqx.partition(without_voxels(self.volume), eqx.is_inexact_array)
         ray_floats, ray_rest = eqx.partition(ray, eqx.is_inexact_array)
 
         def one(
-            march: PyTree, volume: PyTree, ray: PyTree, taps: Any, ray_rest: PyTree, at: Progress, k: Array
+            march: PyTree,
+            volume: PyTree,
+            ray: PyTree,
+            taps: Any,
+            ray_rest: PyTree,
+            at: Progress,
+            ahead: Ahead,
         ):
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
             record = Recording(taps or [], [])
             here = with_fetch(placed, record) if voxels else with_words(placed, self.words)
             found = []
-            for piece in pieces(march, ray, here, front(march, at, k)):
+            for piece in pieces_ahead(self.pipeline._replace(march=march, volume=here), ray, at, ahead):
                 depth = march.sample(piece)
                 measured = self.transfer.measured(here, ray.path(depth))
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
@@ -217,8 +225,7 @@ class Replay(SampleVisitor):
                 found.append((floats(measured), piece.width, asked, point))
             return found, record.asked
 
-        ahead = jnp.arange(self.tiling.cells, dtype=at.index.dtype)
-        rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))
+        rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, ahead.axis_of_rays))
         cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
 
         def all_(march: PyTree, volume: PyTree, ray: PyTree, taps: list | None) -> PyTree:
@@ -239,15 +246,16 @@ class Replay(SampleVisitor):
         of_march, of_volume, of_ray, of_taps = pull(cotangents)
         return of_march, of_volume, of_ray, asked, of_taps
 
-
-def _slopes(
-    weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar
-) -> tuple[Scalar, list[Scalar]]:
-    """What all samples so far are worth, and the derivative of the loss by each one's optical depth."""
-    slopes: list[list[Scalar]] = [[] for _ in worth]
-    for k in range(worth[0].shape[0]):
-        for i, value in enumerate(worth):
-            front = front + weights.weight[i][k] * value[k]
-            slope = pull_over(value[k], weights.behind[i][k], whole - front)
-            slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
-    return front, [jnp.stack(each) for each in slopes]
+    def _slopes(
+        self, alphas: list[Scalar], weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar
+    ) -> tuple[Scalar, list[Scalar]]:
+        """What all samples so far are worth, and the derivative of the loss by each one's optical depth."""
+        slopes: list[list[Scalar]] = [[] for _ in worth]
+        for k in range(worth[0].shape[0]):
+            for i, value in enumerate(worth):
+                front = front + weights.weight[i][k] * value[k]
+                slope = self.pipeline.compositing.slope(
+                    alphas[i][k], weights.after[i][k], value[k], whole - front
+                )
+                slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
+        return front, [jnp.stack(each) for each in slopes]

@@ -7,6 +7,7 @@ opacities a third. (Measured on CPU.)
 """
 
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,21 +18,72 @@ from jaxtyping import Array, Bool, Int, PyTree
 from .._util.vec3 import Scalar
 from .._util.xla import in_memory
 from ..march import Cell, March
-from ..reference import Progress, blend, front, move, opacity, pieces
+from ..reference import Pipeline, Progress, blend, front, move, opacity, pieces
 from ..space import Ray
-from ..transfer import Classification, Measured
-from ..volume import Volume
+from ..transfer import Measured
 from .shading import shaded_colors
 from .tiling import Tiling
 
 
-class Samples(NamedTuple):
-    """The next cells of many rays, as lists with one entry for each piece of a cell; each entry is an array
-    (cells, rays). Cells that a ray does not take are placed beyond its exit."""
+class Ahead(NamedTuple):
+    """Where the next cells of rays begin, in steps from here, and how many steps long they are: arrays
+    (cells,), or (cells, rays) where strides differ. `stride` is None where each cell is one step long."""
 
+    begin: Int[Array, "cells *rays"]
+    stride: Int[Array, "cells *rays"] | None
+
+    @classmethod
+    def of(cls, march: March, cells: int, ray: Ray, at: Progress) -> "Ahead":
+        """The next cells of many rays. All strides are known before any sample is."""
+        if march.longest == 1:
+            return cls(jnp.arange(cells, dtype=at.index.dtype), None)
+        stride = jax.vmap(lambda ray, at, steps: march.stride(ray, front(march, at, steps), at.index + steps))
+        ends = [jnp.zeros_like(at.index)]
+        for _ in range(cells):
+            ends.append(ends[-1] + stride(ray, at, ends[-1]))
+        whole = jnp.stack(ends)
+        return cls(whole[:-1], whole[1:] - whole[:-1])
+
+    @property
+    def axis_of_rays(self) -> int | None:
+        """For `jax.vmap` over rays, once it is mapped over cells."""
+        return None if self.stride is None else 0
+
+    def ends(self, index: Int[Array, " rays"]) -> tuple[Int[Array, "cells rays"], Int[Array, "cells rays"]]:
+        """At which index of their ray the cells begin and end."""
+        if self.stride is None:
+            begin = index[None] + self.begin[:, None]
+            return begin, begin + 1
+        begin = index[None] + self.begin
+        return begin, begin + self.stride
+
+    def steps(self, cells: Int[Array, " rays"] | int) -> Int[Array, " rays"] | int:
+        """How many steps so many of the cells are long together."""
+        if self.stride is None:
+            return cells
+        dtype = self.stride.dtype
+        number = jnp.arange(self.stride.shape[0], dtype=dtype)[:, None]
+        return jnp.sum(jnp.where(number < cells, self.stride, 0), axis=0, dtype=dtype)
+
+    def before(self, steps: Int[Array, " rays"]) -> Int[Array, " rays"]:
+        """How many cells begin before so many steps. Where each is one step long, there may be fewer
+        cells."""
+        return steps if self.stride is None else jnp.sum(self.begin < steps, axis=0, dtype=steps.dtype)
+
+
+class Samples(NamedTuple):
+    """The next cells of many rays: `ahead`, where they begin, and as lists with one entry for each piece of a
+    cell, arrays (cells, rays). Cells that a ray does not take are placed beyond its exit."""
+
+    ahead: Ahead
     cells: list[Cell]
     measured: list[Measured]
     opacity: list[Scalar]
+
+    @property
+    def number(self) -> int:
+        """Number of cells of each ray."""
+        return self.opacity[0].shape[0]
 
 
 class SampleVisitor(ABC):
@@ -65,48 +117,36 @@ def regular_from_here(at: Progress) -> Bool[Array, "*rays"]:
 
 
 def march_segment(
-    march: March,
-    volume: Volume,
-    seen: Classification,
-    tiling: Tiling,
-    ray: Ray,
-    at: Progress,
-    *,
-    regular: bool,
+    pipeline: Pipeline, tiling: Tiling, ray: Ray, at: Progress, *, regular: bool
 ) -> tuple[Progress, Samples]:
     """Marches rays by a segment, or to where they are finished or shifted off the cells that were sampled.
     `regular`: no ray has a shift ahead of it, so that each takes all the cells."""
-    ahead = jnp.arange(tiling.cells, dtype=at.index.dtype)
-    samples = _sampled(march, volume, seen, ahead, ray, at)
-    taken = shifted = None
+    march, classification = pipeline.march, pipeline.classification
+    samples = _sampled(pipeline, Ahead.of(march, tiling.cells, ray, at), ray, at)
+    taken: Int[Array, " rays"] | int
+    taken, shifted = tiling.cells, None
     if not regular:
-        taken, shifted = _taken(march, at, ahead, samples.opacity)
-        samples = _without(samples, ahead[:, None] < taken[None], ray)
-    if seen.light is None:
-        colors = [vmap_cells(seen.classify)(read)[0] for read in samples.measured]
+        taken, shifted = _taken(march, at, samples)
+        samples = _without(samples, taken, ray)
+    if classification.light is None:
+        colors = [vmap_cells(classification.classify)(read)[0] for read in samples.measured]
     else:
-        colors = shaded_colors(seen, march, tiling.chunk, ray, at, *samples)
-    blended = jax.vmap(lambda ray, at, cell: blend(march, ray, at, cell))
+        colors = shaded_colors(pipeline, tiling.chunk, ray, at, *samples[1:])
+    blended = jax.vmap(lambda ray, at, cell: blend(pipeline, ray, at, cell))
     cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
     # unrolled, so that nothing between two cells is put in memory
     after, _ = jax.lax.scan(lambda at, cell: (blended(ray, at, cell), None), at, cells, unroll=tiling.cells)
-    if taken is None:
-        after = jax.vmap(lambda ray, at: move(march, ray, at, None, tiling.cells))(ray, after)
-    else:
-        after = jax.vmap(lambda ray, at, *how: move(march, ray, at, *how))(ray, after, shifted, taken)
-    return after, samples
+    steps = jnp.broadcast_to(jnp.asarray(samples.ahead.steps(taken), at.index.dtype), at.index.shape)
+    return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples
 
 
-def _sampled(
-    march: March, volume: Volume, seen: Classification, ahead: Int[Array, " cells"], ray: Ray, at: Progress
-) -> Samples:
+def _sampled(pipeline: Pipeline, ahead: Ahead, ray: Ray, at: Progress) -> Samples:
     """The samples of these cells ahead of each ray."""
+    march, classification = pipeline.march, pipeline.classification
 
     def pieces_of(at: Progress) -> tuple[Cell, ...]:
-        def one(ray: Ray, at: Progress, k: Int[Array, ""]) -> tuple[Cell, ...]:
-            return pieces(march, ray, volume, front(march, at, k))
-
-        return jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))(ray, at, ahead)
+        rays = jax.vmap(partial(pieces_ahead, pipeline), in_axes=(0, 0, ahead.axis_of_rays))
+        return jax.vmap(rays, in_axes=(None, None, 0))(ray, at, ahead)
 
     cut = pieces_of(at)
     divided = len(cut) > 1
@@ -118,44 +158,55 @@ def _sampled(
         return given if divided else pieces_of(at)
 
     def measured(at: Progress, given: Any) -> list[Measured]:
-        each = vmap_cells(lambda ray, piece: seen.measure(ray.path(march.sample(piece))), (False, True))
+        def one(ray: Ray, piece: Cell) -> Measured:
+            return classification.measure(ray.path(march.sample(piece)))
+
+        each = vmap_cells(one, (False, True))
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
-        each = vmap_cells(
-            lambda ray, piece, read: opacity(march, ray, seen, piece, read), (False, True, True)
-        )
+        each = vmap_cells(partial(opacity, pipeline), (False, True, True))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
     # Always true, but opaque to XLA, so that the branches survive. An index grows by at most one segment's
-    # cells a segment, finished or not, and there are no more segments in a pass than `march.most_samples`,
+    # steps a segment, finished or not, and there are no more segments in a pass than `march.most_samples`,
     # at most 2**24: it never overflows. Whether any ray is alive would take 1 % of a frame to find out.
     live = at.index[0] >= 0
     values = in_memory(live, measured, at, given)
-    if seen.search is not None:
-        found = in_memory(live, lambda values: [vmap_cells(seen.search)(v) for v in values], values)
+    if classification.search is not None:
+        search = vmap_cells(classification.search)
+        found = in_memory(live, lambda values: [search(each) for each in values], values)
         values = [(*read, *more) for read, more in zip(values, found, strict=True)]
     alphas = in_memory(live, opacities, at, given, values)
-    return Samples(list(cells(at, given)), values, alphas)
+    return Samples(ahead, list(cells(at, given)), values, alphas)
 
 
-def _taken(
-    march: March, at: Progress, ahead: Int[Array, " cells"], alphas: list[Scalar]
-) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
+def pieces_ahead(pipeline: Pipeline, ray: Ray, at: Progress, ahead: Ahead) -> tuple[Cell, ...]:
+    """The pieces of one of the next cells of a ray."""
+    depth = front(pipeline.march, at, ahead.begin)
+    return pieces(pipeline, ray, depth, 1 if ahead.stride is None else ahead.stride)
+
+
+def _taken(march: March, at: Progress, samples: Samples) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
     """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
     shift ahead goes no farther than its next transparent cell, behind which its samples lie elsewhere."""
-    left, cells = march.most_samples - at.index, ahead.size
-    transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
+    left = samples.ahead.before(march.most_samples - at.index)
+    number = jnp.arange(samples.number, dtype=at.index.dtype)
+    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=0)
+    cells = number.size
     # a minimum, since XLA computes argmax by comparing pairs
-    first = jnp.min(jnp.where(transparent, ahead[:, None] + 1, cells + 1), axis=0)
+    first = jnp.min(jnp.where(transparent, number[:, None] + 1, cells + 1), axis=0)
     shifted = ~regular_from_here(at) & (first <= jnp.minimum(left, cells))
     return jnp.minimum(jnp.where(shifted, first, cells), left), shifted
 
 
-def _without(samples: Samples, takes: Bool[Array, "cells rays"], ray: Ray) -> Samples:
+def _without(samples: Samples, taken: Int[Array, " rays"], ray: Ray) -> Samples:
     """The samples, with cells that are not taken made transparent and put beyond the exit."""
+    takes = jnp.arange(samples.number, dtype=taken.dtype)[:, None] < taken[None]
     cells = [
         eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
         for cell in samples.cells
     ]
-    return Samples(cells, samples.measured, [jnp.where(takes, alpha, 0) for alpha in samples.opacity])
+    return Samples(
+        samples.ahead, cells, samples.measured, [jnp.where(takes, alpha, 0) for alpha in samples.opacity]
+    )

@@ -13,32 +13,34 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.compaction import CHUNK, Chosen, in_front
 from .._util.vec3 import Scalar, Vec3, along
 from ..lighting.shading import Lighting, Sample
-from ..march import Cell, March
-from ..reference import Progress
+from ..march import Cell
+from ..reference import Pipeline, Progress
 from ..space import Line, Ray, Space
 from ..transfer import Classification, Measured
 
 
 class Weights(NamedTuple):
-    """Of samples, arrays (cells, rays), one for each piece of a cell: what each adds to its ray's opacity,
-    the transmittance in front of it and behind it, and whether the ray was finished before."""
+    """Of samples, arrays (cells, rays), one for each piece of a cell: the weight of each, the opacity
+    composited before it and with it, and whether the ray was finished before."""
 
     weight: list[Scalar]
-    front: list[Scalar]
-    behind: list[Scalar]
+    before: list[Scalar]
+    after: list[Scalar]
     finished: list[Bool[Array, "cells rays"]]
 
 
-def weights_of(march: March, at: Progress, alphas: list[Scalar]) -> Weights:
+def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weights:
     """The weights of consecutive cells, from the opacities of their pieces."""
-    seen, finished = at.seen, at.finished
+    compositing = pipeline.compositing
+    composite, finished = at.composite, at.finished
     found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
-            weight, before = jnp.where(finished, 0, seen.weight(alpha[k])), seen.transmittance
-            seen = seen.add(weight)
-            found[i].append((weight, before, seen.transmittance, finished))
-        finished |= jax.vmap(march.stop)(seen.transmittance)
+            before = composite.opacity
+            weight = jnp.where(finished, 0, compositing.weight(before, alpha[k]))
+            composite = composite.add(weight)
+            found[i].append((weight, before, composite.opacity, finished))
+        finished |= jax.vmap(pipeline.march.stop)(compositing.transmittance(composite.opacity))
     each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
     return Weights(*(list(parts) for parts in zip(*each, strict=True)))
 
@@ -51,8 +53,7 @@ def visible(weights: Weights, chunk: int) -> Chosen:
 def samples_of(
     chosen: Chosen,
     places: Int[Array, " chunk"],
-    seen: Classification,
-    march: March,
+    pipeline: Pipeline,
     ray: Ray,
     cells: list[Cell],
     measured: list[Measured],
@@ -62,15 +63,15 @@ def samples_of(
     entry, direction, pixel = jax.tree.map(
         lambda leaf: leaf.at[places % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
     )
-    depths = [march.sample(cell) for cell in cells]
-    depth, read, front = chosen.take(list(zip(depths, measured, weights.front, strict=True)), places)
-    color, extinction = jax.vmap(seen.classify)(read)
-    return Sample(along(entry, direction, depth), direction, read, color, extinction, front, pixel)
+    depths = [pipeline.march.sample(cell) for cell in cells]
+    depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), places)
+    color, extinction = jax.vmap(pipeline.classification.classify)(read)
+    transmittance = pipeline.compositing.transmittance(before)
+    return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
 
 
 def shaded_colors(
-    seen: Classification,
-    march: March,
+    pipeline: Pipeline,
     chunk: int,
     ray: Ray,
     at: Progress,
@@ -79,12 +80,12 @@ def shaded_colors(
     alphas: list[Scalar],
 ) -> list[Vec3]:
     """Shaded colours of a segment's samples; 0 for invisible ones."""
-    weights, light = weights_of(march, at, alphas), seen.light
+    weights, light = weights_of(pipeline, at, alphas), pipeline.classification.light
     chosen = visible(weights, chunk)
     assert light is not None
 
     def one(places: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        samples = samples_of(chosen, places, seen, march, ray, cells, measured, weights)
+        samples = samples_of(chosen, places, pipeline, ray, cells, measured, weights)
         return chosen.put(colors, places, jax.vmap(light)(samples))
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
@@ -93,7 +94,7 @@ def shaded_colors(
 
 def shade_pixels(
     lighting: Lighting,
-    seen: Classification,
+    classification: Classification,
     space: Space,
     line: Callable[[Int[Array, ""]], Line],
     rgba: Float[Array, "*rays 4"],
@@ -110,7 +111,7 @@ def shade_pixels(
     def shaded(places: Int[Array, " chunk"]) -> Float[Array, "chunk 4"]:
         # beyond the last visible one that one again, since nothing can be shaded at an infinite depth
         places = jnp.where(places < visible.size, places, place[last])
-        one = jax.vmap(lambda place, *ray: lighting.shade_pixel(seen, space, line(place), *ray))
+        one = jax.vmap(lambda place, *ray: lighting.shade_pixel(classification, space, line(place), *ray))
         return one(places, flat[places], depth[places])
 
     def chunk(number: Int[Array, ""]) -> Float[Array, "chunk 4"]:

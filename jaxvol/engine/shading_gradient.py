@@ -14,9 +14,8 @@ from .._util.fetching import scatter_add
 from .._util.trees import added, floats
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Shading, Surroundings, lit
-from ..march import March
+from ..reference import Pipeline
 from ..space import Ray
-from ..transfer import Classification
 from .segment import Samples
 from .shading import Weights, samples_of, visible
 
@@ -54,8 +53,7 @@ class ShadingVjp(NamedTuple):
 
 def shading_vjp(
     light: Lit,
-    seen: Classification,
-    march: March,
+    pipeline: Pipeline,
     ray: Ray,
     samples: Samples,
     weights: Weights,
@@ -73,7 +71,7 @@ def shading_vjp(
         places: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
     ) -> tuple[ShadingVjp, LightTotal]:
         found, total = carry
-        some = samples_of(chosen, places, seen, march, ray, samples.cells, samples.measured, weights)
+        some = samples_of(chosen, places, pipeline, ray, samples.cells, samples.measured, weights)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
         def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Vec3, Any]:

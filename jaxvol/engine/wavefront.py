@@ -21,12 +21,10 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.compaction import in_front
 from .._util.sharding import varying
-from ..march import EmptySpaceIndex, March
-from ..reference import Progress, begin, counts, front, measure, move, opacity, pieces
+from ..march import EmptySpaceIndex
+from ..reference import Pipeline, Progress, begin, counts, front, measure, move, opacity, pieces
 from ..rendering import Outputs
 from ..space import Ray
-from ..transfer import Classification
-from ..volume import Volume
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
 from .segment import SampleVisitor, regular_from_here
 from .tiles import vmap_rays
@@ -34,9 +32,7 @@ from .tiling import Tiling
 
 
 def march_rays(
-    march: March,
-    volume: Volume,
-    seen: Classification,
+    pipeline: Pipeline,
     index: EmptySpaceIndex | None,
     beams: Beams,
     tiling: Tiling,
@@ -45,17 +41,17 @@ def march_rays(
 ) -> State:
     """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
     outputs or nothing but opacity; and the visitor's `kept`, `sums` and `total`."""
-    rays, limited = beams.rays, march.max_samples is not None
+    march, rays = pipeline.march, beams.rays
     at = vmap_rays(lambda ray: begin(march, ray, outputs))(rays)
     finished, prepared = rays.length <= 0, None
     if index is not None:
         prepared = index.prepare(beams.box, tiling.cells * march.step)
         visible = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
         finished |= ~jnp.repeat(visible, beams.groups // beams.count)[:, None]
-    job = Job(march, volume, seen, beams, tiling, visitor, index, prepared, jnp.zeros((), bool))
+    job = Job(pipeline, beams, tiling, visitor, index, prepared, jnp.zeros((), bool))
     at = with_fields(at, finished=finished)
     if march.may_shift and index is None and visitor is None:
-        at = _past_first_cell(march, volume, seen, rays, at)
+        at = _past_first_cell(pipeline, rays, at)
         alive = job.alive(at)
         job = job._replace(any_order=_mostly(alive & ~regular_from_here(at), of=alive))
     if beams.range is not None:
@@ -64,6 +60,7 @@ def march_rays(
         at = over(rays, finished_after(beams.range, at), beams.range.first)
     visited = (None, None, None) if visitor is None else (visitor.kept, visitor.sums, visitor.total)
     state: State = varying((at, visited), rays)
+    limited = march.max_samples is not None
     if march.may_shift or limited:
         state = _pass(job, state, regular=False)
     if not limited:
@@ -98,15 +95,18 @@ def _mostly(some: Bool[Array, "groups rays"], of: Bool[Array, "groups rays"]) ->
     return 2 * jnp.sum(jnp.any(some, axis=-1)) > jnp.sum(jnp.any(of, axis=-1))
 
 
-def _past_first_cell(march: March, volume: Volume, seen: Classification, ray: Ray, at: Progress) -> Progress:
+def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     """Moves rays past their first cell where it is transparent. Most rays begin in empty space and would
     shift there, and so use one cell of their first segment only."""
 
+    march = pipeline.march
+
     def one(ray: Ray, at: Progress) -> Progress:
-        cut = pieces(march, ray, volume, front(march, at))
-        alphas = [opacity(march, ray, seen, piece, measure(march, ray, seen, piece)) for piece in cut]
+        stride = march.stride(ray, front(march, at), at.index)
+        cut = pieces(pipeline, ray, front(march, at), stride)
+        alphas = [opacity(pipeline, ray, piece, measure(pipeline, ray, piece)) for piece in cut]
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
-        moved = move(march, ray, at, jnp.ones((), bool))
+        moved = move(march, ray, at, jnp.ones((), bool), stride)
         if moved.met is not None:
             taken = jnp.sum(jnp.stack([counts(march, ray, piece) for piece in cut]))
             samples = moved.met.samples + taken.astype(moved.met.samples.dtype)

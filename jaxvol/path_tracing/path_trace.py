@@ -18,12 +18,12 @@ from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
 from .._util.xla import compiled
+from ..arguments import check_arguments
 from ..camera import Camera
 from ..engine.packing import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
 from ..occupancy import Blocks
-from ..scene import check_scene
 from ..space import Affine, enter
 from ..transfer import Transfer
 from ..volume import Volume, without_voxels
@@ -121,7 +121,7 @@ def path_trace(
     Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`.
     """
     order = "path_trace(volume, transfer, camera, lights)"
-    check_scene(order, volume=volume, transfer=transfer, camera=camera)
+    check_arguments(order, volume=volume, transfer=transfer, camera=camera)
     volume, transfer, camera, lights, materials, anisotropy = eqxi.nondifferentiable(
         (volume, transfer, camera, lights, materials, anisotropy), msg=NOT_DIFFERENTIABLE
     )

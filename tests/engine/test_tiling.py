@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.render import _render
 
@@ -35,7 +36,7 @@ def test_tiles_do_not_show(size):
     assert whole.rgba.shape == (size[1], size[0], 4)
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
     Other = counting()  # another type, hence another program
-    scene = volume, Other(*jax.tree.leaves(soft_transfer())), camera, MARCH, None
+    scene = Scene(volume, Other(*jax.tree.leaves(soft_transfer())), camera, MARCH)
     assert_same(whole, _render(scene, "all", "replay", Tiling(tile=4)))
     assert Other.traces == 1
 
@@ -184,7 +185,7 @@ def test_an_unknown_adjoint_is_named():
     # not through `render`, since the tests' type checker rejects its argument first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
         _render(
-            (anisotropic_noise(), soft_transfer(), around(anisotropic_noise()), MARCH, None), "all", "reverse"
+            Scene(anisotropic_noise(), soft_transfer(), around(anisotropic_noise()), MARCH), "all", "reverse"
         )
 
 

@@ -11,6 +11,7 @@ import jaxvol as jv
 from jaxvol._util.fetching import Packed
 from jaxvol._util.vec3 import apart
 from jaxvol.engine import packing
+from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.phantoms import toroidal_phantom
 from jaxvol.render import _render
@@ -199,7 +200,7 @@ def test_tilings_do_not_show(tiling):
     whole = jv.render(volume, table(1, 1.0), camera, march)
     assert float(whole.rgba[..., 3].max()) > 0.1
     before = Counting.traces
-    other = _render((volume, table(1, 1.0), camera, march, None), "all", "replay", tiling)
+    other = _render(Scene(volume, table(1, 1.0), camera, march), "all", "replay", tiling)
     assert Counting.traces > before
     assert_same(other, whole, fewer=False)
 
@@ -215,7 +216,7 @@ def test_tiling_does_not_show_under_jitter_and_termination(name, size, method):
     march = jv.March(0.013, leaping(MOVING, method))
     whole = jv.render(volume, table(1, 255), camera, march)
     tiling = Tiling()._replace(**{name: size})
-    other = _render((volume, table(1, 255), camera, march, None), "all", "replay", tiling)
+    other = _render(Scene(volume, table(1, 255), camera, march), "all", "replay", tiling)
     assert_same(other, whole, fewer=False)
 
 

@@ -37,7 +37,7 @@ EXPECTED: dict[str, tuple[tuple[type, ...], str, str]] = {
 """For each argument name: its allowed types, their description, and how to make one."""
 
 
-def check_scene(call: str, **arguments: Any) -> None:
+def check_arguments(call: str, **arguments: Any) -> None:
     """Check that arguments are of the types that their names say.
 
     **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`,
