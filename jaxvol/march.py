@@ -110,17 +110,17 @@ class Transform(eqx.Module):
         return None
 
     @property
-    def longest(self) -> int:
-        """The longest stride that `stride` may give, a static power of two."""
+    def longest_stride(self) -> int:
+        """The longest stride that `stride` may give: a static power of two."""
         return 1
 
     def stride(self, ray: Ray, depth: Scalar) -> Int[Array, ""]:
         """The binary logarithm of the number of steps that the cell at this depth may be long.
 
-        It depends on the ray and the scene alone. A march clips it, so that a cell is at most `longest` steps
-        long, and a cell of n steps begins a multiple of n steps behind the first one. Rays leap to multiples
-        of `longest`, so that leaps do not move cells. Of several transforms the shortest stride counts.
-        Gradients take strides as given."""
+        It depends on the ray and the scene alone. A march clips it, so that a cell is at most
+        `longest_stride` steps long, and a cell of n steps begins a multiple of n steps behind the first one. Rays leap to
+        multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the shortest
+        stride counts. Gradients take strides as given."""
         return jnp.zeros(jnp.shape(depth), jnp.int32)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -178,6 +178,10 @@ class March(eqx.Module):
                 raise ValueError(
                     f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
                 )
+            longest = transform.longest_stride
+            if longest < 1 or longest & (longest - 1):
+                name = type(transform).__name__
+                raise ValueError(f"transforms: {name}.longest_stride must be a power of two; got {longest}.")
         if quadrature not in ("left", "midpoint"):
             raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
         self.quadrature = quadrature
@@ -204,9 +208,9 @@ class March(eqx.Module):
         return any(type(transform).shift is not Transform.shift for transform in self.transforms)
 
     @property
-    def longest(self) -> int:
+    def longest_stride(self) -> int:
         """The longest stride of a cell, in steps."""
-        return min((transform.longest for transform in self._striding()), default=1)
+        return min((transform.longest_stride for transform in self._striding()), default=1)
 
     def _striding(self) -> list[Transform]:
         return [t for t in self.transforms if type(t).stride is not Transform.stride]
@@ -235,7 +239,7 @@ class March(eqx.Module):
 
     def stride(self, ray: Ray, depth: Scalar, index: Int[Array, ""]) -> Int[Array, ""] | int:
         """How many steps long the cell is that begins at this depth, `index` steps behind the first one."""
-        longest = self.longest
+        longest = self.longest_stride
         if longest == 1:
             return 1
         exponents = [jnp.asarray(transform.stride(ray, depth), index.dtype) for transform in self._striding()]

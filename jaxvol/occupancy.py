@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
-from ._util.memo import kept
+from ._util.memo import memoized
 from ._util.sharding import varying
 from ._util.vec3 import Vec3
 from ._util.xla import gather
@@ -43,8 +43,8 @@ class Blocks(eqx.Module):
     @classmethod
     def of(cls, volume: Volume) -> "Blocks":
         """The blocks of a volume, computed once for each array of voxels and of labels."""
-        labels = None if volume.labels is None else kept(volume.labels, _label_bits)
-        low, high = kept(volume.data, _ranges)
+        labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
+        low, high = memoized(volume.data, _ranges)
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         return cls(low, high, labels)

@@ -18,7 +18,7 @@ from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, along, apart
 from .arguments import check_arguments
 from .compositing import Composite, Compositing, Mode, compositing_of
-from .lighting.shading import Lighting, Sample, classification
+from .lighting.shading import Lighting, Sample, lit_classification
 from .march import Cell, March
 from .rendering import Details, Outputs, Rendering
 from .space import Line, Ray, enter, invalid
@@ -228,7 +228,7 @@ def render_ray_reference(
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
-    lit = classification(volume, transfer, space, lighting)
+    lit = lit_classification(volume, transfer, space, lighting)
     of_pixels = lighting is not None and lighting.shades_pixels
     pipeline = Pipeline(march, volume, lit._replace(light=None) if of_pixels else lit, mode)
 

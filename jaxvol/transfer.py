@@ -73,7 +73,7 @@ class Transfer(eqx.Module):
         classifier gets after it. By default there is none."""
         return None
 
-    def over(self, volume: Volume) -> Classification:
+    def classification(self, volume: Volume) -> Classification:
         """The two stages for this volume."""
         return Classification(
             lambda coordinate: self.measured(volume, coordinate), self.classifier(), self.search()

@@ -171,22 +171,22 @@ MUTATIONS = [
     Mutation(
         "leap: finished rays advance by an invalid index and overflow",
         "engine/batch.py",
-        "jnp.where((cells > 0) & ~at.finished, a, b), moved, at)",
-        "jnp.where(cells > 0, a, b), moved, at)",
+        "jnp.where((steps > 0) & ~at.finished, a, b), moved, at)",
+        "jnp.where(steps > 0, a, b), moved, at)",
         (LEAPING_GRADIENT,),
     ),
     Mutation(
         "leap: range of visible cells ends one cell too early",
         "engine/replay.py",
-        "until = jnp.max(jnp.where(seen, cells + 1, kept.until[None]), axis=0)",
-        "until = jnp.max(jnp.where(seen, cells, kept.until[None]), axis=0)",
+        "until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)",
+        "until = jnp.max(jnp.where(visible, begin, carry.until[None]), axis=0)",
         (LEAPING_GRADIENT,),
     ),
     Mutation(
         "leap: range of visible cells begins one cell too late",
         "engine/replay.py",
-        "return CellRange(jnp.minimum(kept.first, first), until), None, None",
-        "return CellRange(jnp.minimum(kept.first, first) + 1, until), None, None",
+        "return CellRange(jnp.minimum(carry.first, first), until), None, None",
+        "return CellRange(jnp.minimum(carry.first, first) + 1, until), None, None",
         (LEAPING_GRADIENT,),
     ),
     Mutation(
@@ -287,6 +287,34 @@ MUTATIONS = [
         "place = place.astype(jnp.int32)  # from 64 bits under x64",
         "pass",
         ("engine/test_tiling.py::test_rays_of_ones_own_draw_the_same_numbers_in_float64",),
+    ),
+    Mutation(
+        "stride: a long cell begins anywhere",
+        "march.py",
+        "return jnp.minimum(jnp.left_shift(1, exponent), aligned)",
+        "return jnp.left_shift(1, exponent)",
+        ("test_march.py::test_stride_lengthens_cells",),
+    ),
+    Mutation(
+        "stride: a leap ends where no cell begins",
+        "engine/batch.py",
+        "steps = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)",
+        "pass",
+        ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
+    ),
+    Mutation(
+        "stride: the second march takes cells of one step",
+        "engine/segment.py",
+        "return pieces(pipeline, ray, depth, 1 if ahead.stride is None else ahead.stride)",
+        "return pieces(pipeline, ray, depth, 1)",
+        ("engine/test_strides.py::test_leaps_and_adjoints_agree_under_strides",),
+    ),
+    Mutation(
+        "stride: visible cells are recorded as if one step long",
+        "engine/segment.py",
+        "return begin, begin + self.stride",
+        "return begin, begin + 1",
+        ("engine/test_strides.py::test_leaps_and_adjoints_agree_under_strides",),
     ),
     # fetching, transfer functions, lighting, path tracing
     Mutation(

@@ -58,9 +58,9 @@ def counting() -> type[jv.TransferFunction]:
     class Counting(jv.TransferFunction):
         traces: ClassVar[int] = 0
 
-        def over(self, volume):
+        def classification(self, volume):
             Counting.traces += 1
-            return super().over(volume)
+            return super().classification(volume)
 
     return Counting
 

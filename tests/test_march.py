@@ -1,5 +1,6 @@
 """The methods that a march calls on its transforms, and custom transforms."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +38,27 @@ class Halves(jv.Transform):
     def cut(self, cell, ray, volume):
         half = cell.width / 2
         return Cell(cell.front, half, cell.cut), Cell(cell.front + half, half, cell.cut)
+
+
+class Long(jv.Transform):
+    """Cells of 2**exponent steps behind the plane `value` = `beyond` of the volume."""
+
+    exponent: int = eqx.field(static=True)
+    beyond: float = eqx.field(static=True, default=0.0)
+
+    @property
+    def longest_stride(self):
+        return 4
+
+    def stride(self, ray, depth):
+        x, _, _ = ray.path(depth)
+        return jnp.where(x >= self.beyond, self.exponent, 0)
+
+
+class Three(jv.Transform):
+    @property
+    def longest_stride(self):
+        return 3
 
 
 class Moved(jv.Transform):
@@ -97,6 +119,31 @@ def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, 
     assert opacity((Late(by),))[1] == 7, "where nothing is transparent"
 
 
+@pytest.mark.parametrize(
+    ("transforms", "length", "samples"),
+    [
+        ((Long(0),), 2.1, 7),
+        ((Long(1),), 2.4, 4),  # at 0, 0.6, 1.2, 1.8
+        ((Long(2),), 2.4, 2),  # at 0, 1.2
+        ((Long(5),), 2.4, 2),  # no longer than the longest stride
+        ((Long(-1),), 2.1, 7),
+        # steps 0, 1, 2; 3 lies beyond the middle, but only a cell of one step may begin there; 4 is divisible
+        ((Long(2, 1.7),), 2.4, 5),
+        ((Shift(), Long(2)), 2.4, 2),  # at 0.15, 1.35
+        ((Halves(), Long(2)), 2.4, 4),  # half cells
+        ((jv.AlphaCorrection(), Long(2)), 2.0, 2),
+    ],
+)
+def test_stride_lengthens_cells(transforms, length, samples):
+    assert opacity(transforms)[:2] == (seen(length), samples)
+    march = jv.March(0.3, transforms)
+    reference = jv.render_ray_reference(
+        BOX, uniform_transfer(1.0), jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march
+    )
+    assert float(reference.rgba[3]) == seen(length)
+    assert int(reference.samples) == samples
+
+
 def test_locate_replaces_the_space():
     origins, directions = np.array(RAY)
     march = jv.March(0.3, (Moved(), jv.AlphaCorrection()))
@@ -152,6 +199,10 @@ BAD = {
         "transforms must each be given once; got AlphaCorrection 2 times",
     ),
     "a class": (lambda: jv.March(0.1, (jv.AlphaCorrection,)), "transforms must hold jaxvol transforms"),
+    "a stride of three": (
+        lambda: jv.March(0.1, (Three(),)),
+        "Three.longest_stride must be a power of two; got 3",
+    ),
     "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
     "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),
     **{

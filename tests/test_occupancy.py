@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.ndimage import distance_transform_cdt, map_coordinates
 
 import jaxvol as jv
-from jaxvol._util.memo import kept
+from jaxvol._util.memo import memoized
 from jaxvol._util.piecewise_linear import positive_between
 from jaxvol.occupancy import BLOCK, Blocks, Occupancy, Sums
 
@@ -243,9 +243,9 @@ def test_memoized_results_are_freed_with_their_array():
         return array * 2
 
     array = jnp.arange(5.0)
-    first = kept(array, double)
-    assert kept(array, double) is first
-    assert kept(jnp.arange(5.0), double) is not first
+    first = memoized(array, double)
+    assert memoized(array, double) is first
+    assert memoized(jnp.arange(5.0), double) is not first
     assert len(calls) == 2
     alive = weakref.ref(first)
     del first
@@ -267,6 +267,6 @@ def test_blocks_are_made_once_for_an_array_and_go_with_it():
 
 def test_nothing_is_memoized_for_mutable_numpy_arrays():
     array = np.zeros(3)
-    assert float(kept(array, lambda a: a.sum())) == 0
+    assert float(memoized(array, lambda a: a.sum())) == 0
     array[:] = 1
-    assert float(kept(array, lambda a: a.sum())) == 3
+    assert float(memoized(array, lambda a: a.sum())) == 3

@@ -35,7 +35,7 @@ class Chosen(NamedTuple):
         number = jnp.sum(whole, dtype=jnp.int32)
         return cls(in_front(whole.reshape(-1), chunk), number, whole.shape[1], chunk)
 
-    def over(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
+    def fold(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
         """Folds `one(places, carry)` over the chunks. The last one is padded with places past the end."""
 
         def body(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
@@ -57,7 +57,7 @@ class Chosen(NamedTuple):
         """Flat arrays with these entries at these places."""
         return jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), whole, part)
 
-    def apart(self, whole: PyTree, arrays: int) -> list[PyTree]:
+    def split(self, whole: PyTree, arrays: int) -> list[PyTree]:
         """Flat arrays, split into so many arrays (rows, columns) again."""
         leaves, tree = jax.tree.flatten(whole)
         each = (leaf.reshape(arrays, -1, self.columns) for leaf in leaves)

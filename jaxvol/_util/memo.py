@@ -19,7 +19,7 @@ from .checks import is_traced
 T = TypeVar("T")
 
 
-def kept(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
+def memoized(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
     """`compute(array)`, computed once in the lifetime of a concrete array; it carries no gradient. Under
     `jax.vmap`, it is computed once in the lifetime of the batch."""
     if not isinstance(array, jax.Array):  # NumPy arrays are mutable
@@ -41,7 +41,7 @@ def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     @one.def_vmap
     def _(size: int, batched: list[bool], arrays: Array) -> Any:
-        results = kept(arrays, several)
+        results = memoized(arrays, several)
         return results, jax.tree.map(lambda _: True, results)
 
     return one

@@ -49,7 +49,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         tiles, only = RayTiles.of(own, tiling._replace(tile=columns.size)), jnp.zeros((), jnp.int32)
         rays = tiles.rays(own, space, only)
         beams = Beams(rays, tiles.beams, tiles.box(own, rays, only))
-        pipeline = Pipeline(first, volume, transfer.over(volume), Over())
+        pipeline = Pipeline(first, volume, transfer.classification(volume), Over())
         at, _ = march_rays(pipeline, index, beams, tiling, "depth")
         seen = vmap_rays(end)(rays, at)
         return tiles.assemble(seen.depth[None]).reshape(columns.shape)

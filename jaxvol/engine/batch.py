@@ -21,7 +21,7 @@ from .tiling import Tiling
 
 
 State: TypeAlias = tuple[Progress, tuple[PyTree, PyTree, PyTree]]
-"""Where all rays are, and a visitor's `kept`, `sums` and `total`."""
+"""Where all rays are, and a visitor's `carry`, `sums` and `total`."""
 
 
 class CellRange(NamedTuple):
@@ -102,9 +102,9 @@ def march_batch(
     def scatter_add(leaf: Array, part: Array) -> Array:
         return leaf.at[rows].add(grouped(part), mode="drop")
 
-    at, (kept, sums, total) = state
+    at, (carry, sums, total) = state
     given = None if visitor is None else visitor.given
-    rays, here, range_, given, mine = jax.tree.map(take, (beams.rays, at, beams.range, given, kept))
+    rays, here, range_, given, mine = jax.tree.map(take, (beams.rays, at, beams.range, given, carry))
     here = with_fields(here, finished=here.finished | jnp.repeat(rows >= beams.groups, group))
     more = jax.tree.map(lambda leaf: jnp.zeros((size * group, *leaf.shape[2:]), leaf.dtype), sums)
     more = varying(more, rays)
@@ -126,7 +126,7 @@ def march_batch(
     here, (mine, more, total) = jax.lax.while_loop(
         lambda state: jnp.sum(going(state[0])) > keep, advance, (here, (mine, more, total))
     )
-    visited = jax.tree.map(scatter, kept, mine), jax.tree.map(scatter_add, sums, more), total
+    visited = jax.tree.map(scatter, carry, mine), jax.tree.map(scatter_add, sums, more), total
     return (jax.tree.map(scatter, at, here), visited), going(here)
 
 
@@ -158,7 +158,8 @@ def _leap(
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     # clipped before it becomes an integer, whose range it may exceed
     steps = jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype)
-    if march.longest > 1:  # to where a cell begins also without the leap
-        steps = jnp.maximum((at.index + steps) // march.longest * march.longest - at.index, 0)
+    longest = march.longest_stride
+    if longest > 1:  # to where a cell begins also without the leap
+        steps = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)
     steps = jnp.minimum(steps, march.most_samples - at.index)
     return jax.vmap(partial(over_transparent, march))(rays, at, steps)

@@ -73,7 +73,7 @@ def _pulled(
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
         index = index.within_ranges()
-    pipeline, fault = Pipeline(march, packed, transfer.over(packed), compositing), fault_of(scene)
+    pipeline, fault = Pipeline(march, packed, transfer.classification(packed), compositing), fault_of(scene)
     light, pull_light = None, None
     if lighting is not None:
         light, pull_light = _light(scene, packed, voxels=of_voxels)
@@ -116,7 +116,7 @@ def _pulled(
         Total.zeros(volume, transfer, march, light, voxels=of_voxels),
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
-    image = jax.tree.map(tiles.apart, (rendering, cotangent))
+    image = jax.tree.map(tiles.disassemble, (rendering, cotangent))
     (total, of_source), _ = jax.lax.scan(
         tile, varying(start, image), (jnp.arange(tiles.number), ranges, *image)
     )
@@ -156,7 +156,7 @@ def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable
         # the packed copy serves fetching only
         whole = moved if voxels else with_voxels(moved, volume.data)
         around = Surroundings(whole, transfer, march.locate(whole))
-        light = Lit(lighting.over(around), around)
+        light = Lit(lighting.shading(around), around)
         return floats(light.leaves), light
 
     _, pull, light = jax.vjp(made, moving, has_aux=True)

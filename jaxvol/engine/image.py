@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.sharding import varying
-from ..lighting.shading import classification
+from ..lighting.shading import lit_classification
 from ..reference import Pipeline, begin, end, has_fault, step
 from ..rendering import Outputs, Rendering
 from ..space import Ray, Space, invalid
@@ -72,7 +72,7 @@ def _pipeline(scene: Scene) -> tuple[Space, Pipeline]:
     """The space in which rays meet the volume, and what turns them into pixels."""
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
-    return space, Pipeline(march, volume, classification(volume, transfer, space, lighting), compositing)
+    return space, Pipeline(march, volume, lit_classification(volume, transfer, space, lighting), compositing)
 
 
 def _over_tiles(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Shaped, UInt32
 
 from .._util.checks import is_traced
 from .._util.fetching import Packed
-from .._util.memo import kept
+from .._util.memo import memoized
 from ..volume import Volume, with_fetch
 
 
@@ -33,7 +33,7 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
         or 4 * data.size > LIMIT
     ):
         return None
-    return kept(data, _packed)
+    return memoized(data, _packed)
 
 
 def with_words(volume: Volume, words: UInt32[Array, " voxels"] | None) -> Volume:

@@ -50,18 +50,18 @@ class VisibleRangeRecorder(SampleVisitor):
     given = sums = total = None
 
     def __init__(self, shape: tuple[int, ...]):
-        self.kept = CellRange(
+        self.carry = CellRange(
             jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32)
         )
 
     def visit(
-        self, ray: Ray, at: Progress, samples: Samples, given: None, kept: CellRange, total: None
+        self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
     ) -> tuple[CellRange, None, None]:
         begin, end = samples.ahead.ends(at.index)
         visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
-        first = jnp.min(jnp.where(visible, begin, kept.first[None]), axis=0)
-        until = jnp.max(jnp.where(visible, end, kept.until[None]), axis=0)
-        return CellRange(jnp.minimum(kept.first, first), until), None, None
+        first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
+        until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)
+        return CellRange(jnp.minimum(carry.first, first), until), None, None
 
 
 class Cotangents(NamedTuple):
@@ -142,11 +142,11 @@ class Replay(SampleVisitor):
         self.volume, self.words, self.transfer = scene
         self.pipeline, self.places, self.light = pipeline, places, light
         self.given, self.total, self.tiling = given, total, tiling
-        self.kept = jnp.zeros_like(given.worth)  # what the samples in front are worth
+        self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
         self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if places else None
 
     def visit(
-        self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, kept: Scalar, total: Total
+        self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, carry: Scalar, total: Total
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
         red, green, blue = each.color
@@ -171,7 +171,7 @@ class Replay(SampleVisitor):
                 value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
             ]
         inside = vmap_cells(contained, of_cells=(False, True))
-        kept, slopes = self._slopes(samples.opacity, weights, worth, given.worth, kept)
+        carry, slopes = self._slopes(samples.opacity, weights, worth, given.worth, carry)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
         of_measured = []
@@ -181,7 +181,7 @@ class Replay(SampleVisitor):
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
             of_measured.append(pulled if lit is None else added(pulled, lit[i].of_measured))
         if not self.places:
-            return kept, None, total
+            return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
@@ -190,7 +190,7 @@ class Replay(SampleVisitor):
         )
         voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
-        return kept, of_rays, Total(total.transfer, march, volume, voxels, total.light)
+        return carry, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
     def _placed(
         self, ray: Ray, at: Progress, ahead: Ahead, cotangents: list[tuple[PyTree, Scalar, Any, Any]]

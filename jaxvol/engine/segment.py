@@ -35,7 +35,7 @@ class Ahead(NamedTuple):
     @classmethod
     def of(cls, march: March, cells: int, ray: Ray, at: Progress) -> "Ahead":
         """The next cells of many rays. All strides are known before any sample is."""
-        if march.longest == 1:
+        if march.longest_stride == 1:
             return cls(jnp.arange(cells, dtype=at.index.dtype), None)
         stride = jax.vmap(lambda ray, at, steps: march.stride(ray, front(march, at, steps), at.index + steps))
         ends = [jnp.zeros_like(at.index)]
@@ -89,19 +89,19 @@ class Samples(NamedTuple):
 class SampleVisitor(ABC):
     """Looks at all samples of a march.
 
-    - `given`, `kept`, `sums`: for each ray, (groups, rays in a group): constants, state carried from segment
+    - `given`, `carry`, `sums`: for each ray, (groups, rays in a group): constants, state carried from segment
       to segment, and sums, which begin at 0.
     - `total`: sums over all rays.
     """
 
     given: PyTree
-    kept: PyTree
+    carry: PyTree
     sums: PyTree
     total: PyTree
 
     @abstractmethod
     def visit(
-        self, ray: Ray, at: Progress, samples: Samples, given: PyTree, kept: PyTree, total: PyTree
+        self, ray: Ray, at: Progress, samples: Samples, given: PyTree, carry: PyTree, total: PyTree
     ) -> tuple[PyTree, PyTree, PyTree]:
         """The state behind the samples of some rays, what these add to the rays' sums, and the new total."""
 

@@ -89,7 +89,7 @@ def shaded_colors(
         return chosen.put(colors, places, jax.vmap(light)(samples))
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
-    return chosen.apart(chosen.over(one, (none, none, none)), len(alphas))
+    return chosen.split(chosen.fold(one, (none, none, none)), len(alphas))
 
 
 def shade_pixels(

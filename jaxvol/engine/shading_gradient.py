@@ -97,5 +97,5 @@ def shading_vjp(
     measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))
     zeros = zero, zero, zero
     start = ShadingVjp(zeros, zeros, zero, measured, zeros)
-    found, total = chosen.over(one, (start, total))
-    return chosen.apart(found, len(weights.weight)), total
+    found, total = chosen.fold(one, (start, total))
+    return chosen.split(found, len(weights.weight)), total

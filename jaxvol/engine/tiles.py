@@ -85,7 +85,7 @@ class RayTiles(eqx.Module):
         """From (tiles, groups, rays in a group, *rest) to the image's shape."""
 
     @abstractmethod
-    def apart(self, leaf: Array) -> Array:
+    def disassemble(self, leaf: Array) -> Array:
         """The inverse of `assemble`; 0 for rays that only fill up groups."""
 
 
@@ -124,7 +124,7 @@ class _PixelTiles(RayTiles):
         image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
         return image.reshape(self.down * beam, self.across * beam, *rest)[:height, :width]
 
-    def apart(self, leaf: Array) -> Array:
+    def disassemble(self, leaf: Array) -> Array:
         rest, (width, height) = leaf.shape[2:], self.size
         side, beam = self.tiling.side, self.tiling.beam
         more = (self.down * beam - height, self.across * beam - width)
@@ -163,7 +163,7 @@ class _OwnRayTiles(RayTiles):
         rest = leaf.shape[3:]
         return leaf.reshape(-1, *rest)[: math.prod(self.shape)].reshape(*self.shape, *rest)
 
-    def apart(self, leaf: Array) -> Array:
+    def disassemble(self, leaf: Array) -> Array:
         rest, count = leaf.shape[len(self.shape) :], math.prod(self.shape)
         missing = self.number * self._rays_per_tile - count
         padded = jnp.pad(leaf.reshape(count, *rest), [(0, missing)] + [(0, 0)] * len(rest))

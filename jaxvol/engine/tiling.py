@@ -15,7 +15,8 @@ class Tiling(NamedTuple):
     - `cells`: cells of a segment, whose samples are all fetched before any is composited.
     - `group`: rays compacted as one unit, a square number.
     - `batch`: groups marched at a time, as many as fit into the cache.
-    - `kept`: share of a batch's groups that must be alive for it to go on; below it, batches are refilled.
+    - `min_alive`: share of a batch's groups that must be alive for it to go on; below it, batches are
+      refilled.
     - `tile`: beams that are marched to their ends before the next ones are made: 262 144 rays.
     - `direct_tile`: the same where JAX differentiates the march itself, and so keeps all its states.
     - `chunk`: samples shaded at a time, a multiple of 128.
@@ -25,7 +26,7 @@ class Tiling(NamedTuple):
     group: int = 16
     # Not 512: rows of 8192 floats would lie 32 KiB apart, so that all of them map to the same cache lines.
     batch: int = 520
-    kept: float = 0.75
+    min_alive: float = 0.75
     tile: int = 4096
     direct_tile: int = 64
     chunk: int = CHUNK

@@ -1,8 +1,8 @@
 """In which order are rays marched? In batches of groups, refilled as rays finish.
 
 - Rays are compacted in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is
-  marched segment by segment until too few of its groups are left (`Tiling.kept`); then batches are made up
-  anew from the groups that are left. Idle lanes cost as much as working ones.
+  marched segment by segment until too few of its groups are left (`Tiling.min_alive`); then batches are made
+  up anew from the groups that are left. Idle lanes cost as much as working ones.
 - A ray that may still shift (`Transform.shift`) must stop at its next transparent cell. Groups with such rays
   are marched first; the second pass can then take whole segments without that test. If more than half of the
   groups have such rays, and rays do not leap, the first pass takes all groups, so that neighbours stay
@@ -40,7 +40,7 @@ def march_rays(
     visitor: SampleVisitor | None = None,
 ) -> State:
     """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
-    outputs or nothing but opacity; and the visitor's `kept`, `sums` and `total`."""
+    outputs or nothing but opacity; and the visitor's `carry`, `sums` and `total`."""
     march, rays = pipeline.march, beams.rays
     at = vmap_rays(lambda ray: begin(march, ray, outputs))(rays)
     finished, prepared = rays.length <= 0, None
@@ -58,7 +58,7 @@ def march_rays(
         over = vmap_rays(partial(over_transparent, march))
         # Rays that see nothing are finished first, and so stay where they are: their `first` is no index.
         at = over(rays, finished_after(beams.range, at), beams.range.first)
-    visited = (None, None, None) if visitor is None else (visitor.kept, visitor.sums, visitor.total)
+    visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
     state: State = varying((at, visited), rays)
     limited = march.max_samples is not None
     if march.may_shift or limited:
@@ -71,13 +71,13 @@ def march_rays(
 def _pass(job: Job, state: State, *, regular: bool) -> State:
     """Marches groups for as long as any of their rays is wanted, in rounds of batches."""
     size = min(job.tiling.batch, job.beams.groups)
-    kept = int(job.tiling.kept * size)
+    enough = int(job.tiling.min_alive * size)
 
     def round_(state: tuple[State, Bool[Array, " groups"]]) -> tuple[State, Bool[Array, " groups"]]:
         rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
         # only full batches, as long as there are any: what remains joins those of the next round
         batches = jnp.maximum(count // size, 1)
-        keep = jnp.where(count > size, kept, 0)
+        keep = jnp.where(count > size, enough, 0)
 
         def one(i: Int[Array, ""], state: tuple[State, Array]) -> tuple[State, Array]:
             some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)

@@ -55,7 +55,7 @@ class BakedLighting(Lighting):
         steps = (self.words[:, None] >> shifts[None]) & jnp.uint32(LEVELS)
         return (steps.astype(self.highest.dtype) * (self.highest / LEVELS)[None]).reshape(*self.shape, 3)
 
-    def over(self, around: Surroundings) -> "BakedShading":
+    def shading(self, around: Surroundings) -> "BakedShading":
         return BakedShading(jax.lax.stop_gradient(self))
 
 
@@ -109,7 +109,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     """Compute the light on a grid of nodes. NaN in any of its inputs makes all of it NaN."""
     shading, around = jax.lax.stop_gradient((shading, around))
     nx, ny, nz = nodes
-    classification = around.transfer.over(around.volume)
+    classification = around.transfer.classification(around.volume)
 
     def node(number: Int[Array, ""]) -> Sample:
         places = jnp.unravel_index(number, (nx, ny, nz))
@@ -140,7 +140,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     def chunk(places: Int[Array, " chunk"], channels: Vec3) -> Vec3:
         return chosen.put(channels, places, jax.vmap(ratio)(jnp.minimum(places, count - 1)))
 
-    ratios = jnp.stack(chosen.over(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
+    ratios = jnp.stack(chosen.fold(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
     ratios = _dilate(ratios, visible.reshape(nx, ny, nz))
     highest = jnp.maximum(ratios.max((0, 1, 2)), 1e-6)
     steps = jnp.round(ratios.reshape(-1, 3) / highest[None] * LEVELS).astype(jnp.uint32)

@@ -48,22 +48,28 @@ class Deferred(Lighting):
             raise ValueError(f"lighting must be a Lighting, such as ScattererTemplates; got {lighting!r}.")
         self.lighting = lighting
 
-    def over(self, around: Surroundings) -> Shading:
-        return self.lighting.over(around)
+    def shading(self, around: Surroundings) -> Shading:
+        return self.lighting.shading(around)
 
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
         return Deferred(self.lighting.prepared(volume, transfer, march))
 
     def shade_pixel(
-        self, seen: Classification, space: Space, line: Line, rgba: Float[Array, "4"], depth: Scalar
+        self,
+        classification: Classification,
+        space: Space,
+        line: Line,
+        rgba: Float[Array, "4"],
+        depth: Scalar,
     ) -> Float[Array, "4"]:
-        assert seen.light is not None
+        light = classification.light
+        assert light is not None
         opacity = rgba[3]
         visible = opacity != 0  # NaN stays NaN
         red, green, blue = (rgba[i] / jnp.where(visible, opacity, 1) for i in range(3))
         point = along(line.origin, line.direction, jnp.where(visible, depth, 0))
-        measured = seen.searched(seen.measure(space.coordinate(point)))
-        _, extinction = seen.classify(measured)
+        measured = classification.searched(classification.measure(space.coordinate(point)))
+        _, extinction = classification.classify(measured)
         one = jnp.ones_like(opacity)
         sample = Sample(point, line.direction, measured, (red, green, blue), extinction, one, line.pixel)
-        return jnp.stack([*(jnp.where(visible, opacity * part, 0) for part in seen.light(sample)), opacity])
+        return jnp.stack([*(jnp.where(visible, opacity * part, 0) for part in light(sample)), opacity])

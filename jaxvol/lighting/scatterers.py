@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._util.checks import integer, is_traced, number
-from .._util.memo import kept
+from .._util.memo import memoized
 from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along
 from ..march import March, Transform
@@ -246,7 +246,7 @@ class ScattererTemplates(Lighting):
         leaves, tree = jax.tree.flatten((self, without_voxels(volume), transfer, spaces))
         if is_traced(leaves, volume.data):
             return self
-        cache = kept(volume.data, _bake_cache)
+        cache = memoized(volume.data, _bake_cache)
         entry = cache.get(tree)
         if entry is None or not all(_same(a, b) for a, b in zip(entry[0], leaves, strict=True)):
             cache.clear()
@@ -255,9 +255,9 @@ class ScattererTemplates(Lighting):
                 cache[tree] = entry = leaves, _baked(self, around)
         return entry[1]
 
-    def over(self, around: Surroundings) -> Shading:
+    def shading(self, around: Surroundings) -> Shading:
         if self.baked:
-            return _baked(self, around).over(around)
+            return _baked(self, around).shading(around)
         return TemplateShading(self, self.grown(blend=self.blend), self._optics, self.cutoff)
 
     @property

@@ -69,7 +69,7 @@ class Surroundings(eqx.Module):
         inside, coordinate, measured = self._measured(point)
 
         def found(measured: Measured) -> tuple[Vec3, Scalar]:
-            return self.transfer.over(self.volume).classify(measured)
+            return self.transfer.classification(self.volume).classify(measured)
 
         color, extinction = self._in_memory(found, measured)
         return Place(inside, coordinate, measured[0], color, inside * extinction)
@@ -77,17 +77,18 @@ class Surroundings(eqx.Module):
     def extinction(self, point: Vec3) -> Scalar:
         """The extinction at a world point."""
         inside, _, measured = self._measured(point)
-        return inside * self.transfer.over(self.volume).classify(measured)[1]
+        return inside * self.transfer.classification(self.volume).classify(measured)[1]
 
     def _measured(self, point: Vec3) -> tuple[Scalar, Vec3, Measured]:
-        coordinate, seen = self.space.coordinate(point), self.transfer.over(self.volume)
+        coordinate = self.space.coordinate(point)
+        classification = self.transfer.classification(self.volume)
         x, y, z = (
             jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
 
         def measured(coordinate: Vec3) -> Measured:
-            return seen.searched(seen.measure(coordinate))
+            return classification.searched(classification.measure(coordinate))
 
         return x * y * z, coordinate, self._in_memory(measured, coordinate)
 
@@ -129,7 +130,7 @@ class Lighting(eqx.Module):
         return type(self).shade_pixel is not Lighting.shade_pixel
 
     @abstractmethod
-    def over(self, around: Surroundings) -> Shading:
+    def shading(self, around: Surroundings) -> Shading:
         """The shading of one image. What does not depend on the sample is computed here, once."""
 
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> "Lighting":
@@ -137,23 +138,28 @@ class Lighting(eqx.Module):
         return self
 
     def shade_pixel(
-        self, seen: Classification, space: Space, line: Line, rgba: Float[Array, "4"], depth: Scalar
+        self,
+        classification: Classification,
+        space: Space,
+        line: Line,
+        rgba: Float[Array, "4"],
+        depth: Scalar,
     ) -> Float[Array, "4"]:
         """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
-        depth. `seen.light` shades samples. Not called unless overridden."""
+        depth. `classification.light` shades samples. Not called unless overridden."""
         return rgba
 
 
-def classification(
+def lit_classification(
     volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None
 ) -> Classification:
-    """Measuring, classifying and shading the places of a volume."""
-    seen = transfer.over(volume)
+    """Measuring, classifying and, where there is a lighting, shading the places of a volume."""
+    classification = transfer.classification(volume)
     if lighting is None:
-        return seen
+        return classification
     around = Surroundings(volume, transfer, space)
-    shading = lighting.over(around)
-    return seen._replace(light=lambda sample: lit(shading, around, sample)[0])
+    shading = lighting.shading(around)
+    return classification._replace(light=lambda sample: lit(shading, around, sample)[0])
 
 
 def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None) -> tuple[Vec3, Any]:

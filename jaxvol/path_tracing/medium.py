@@ -28,7 +28,7 @@ class Medium(NamedTuple):
         Where the transfer function shows a material, the extinction is 1/λ instead, and the albedo is
         colour · (1 - opacity). Where materials overlap, the first counts.
         """
-        classification = transfer.over(volume)
+        classification = transfer.classification(volume)
 
         def measure(coordinate: Vec3) -> Measured:
             measured = classification.measure(coordinate)

@@ -30,7 +30,7 @@ def test_each_chosen_one_is_taken_once_and_put_where_it_was():
         found = chosen.take(values, places)
         return chosen.put(whole, places, 2 * found), visits.at[places].add(1, mode="drop")
 
-    whole, visits = chosen.over(one, (jnp.zeros(7200), jnp.zeros(7200)))
-    for value, part, count in zip(values, chosen.apart(whole, 2), chosen.apart(visits, 2), strict=True):
+    whole, visits = chosen.fold(one, (jnp.zeros(7200), jnp.zeros(7200)))
+    for value, part, count in zip(values, chosen.split(whole, 2), chosen.split(visits, 2), strict=True):
         np.testing.assert_array_equal(part, np.where(value > 0.5, 2 * value, 0))
         np.testing.assert_array_equal(count, value > 0.5)

@@ -43,9 +43,9 @@ def look_around(volume, transfer):
 
 def sample_at(around, point, pixel, transmittance):
     """The sample of a ray at a world point."""
-    seen, point = around.transfer.over(around.volume), apart(point)
-    measured = seen.measure(around.space.coordinate(point))
-    color, extinction = seen.classify(measured)
+    classification, point = around.transfer.classification(around.volume), apart(point)
+    measured = classification.measure(around.space.coordinate(point))
+    color, extinction = classification.classify(measured)
     none, one = jnp.zeros_like(extinction), jnp.ones_like(extinction)
     return Sample(
         point, (none, none, one), measured, color, extinction, one * transmittance, (pixel[0], pixel[1])
@@ -55,7 +55,7 @@ def sample_at(around, point, pixel, transmittance):
 @eqx.filter_jit
 def lit_points(lighting, volume, transfer, points, pixels, transmittance):
     around = look_around(volume, transfer)
-    shading = lighting.over(around)
+    shading = lighting.shading(around)
 
     def one(point, pixel):
         return jnp.stack(lit(shading, around, sample_at(around, point, pixel, transmittance))[0])
@@ -693,7 +693,7 @@ def test_nan_in_what_is_baked_reaches_all_of_it():
 def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
     volume, space = nodes({}), Affine(nodes({}))
     lighting = ScattererTemplates(MATERIALS, lights(sky=True), given=given(PAIR, PAIR), reach=(2.0,))
-    seen = lighting_shading.classification(volume, TRANSFER, space, lighting)
+    seen = lighting_shading.lit_classification(volume, TRANSFER, space, lighting)
     zero = jnp.zeros((), jnp.int32)
     line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
     rgba = jnp.asarray([[jnp.nan] * 4, [0.5] * 4, [0.0] * 4])
@@ -919,7 +919,7 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
     @jax.jit
     def expected(points, colors, pixels):
         around = look_around(volume, transfer)
-        shading = lighting.over(around)
+        shading = lighting.shading(around)
 
         def one(point, color, pixel):
             sample = sample_at(around, point, pixel, 1.0)._replace(color=apart(color))
@@ -947,7 +947,7 @@ class Dimmed(Lighting):
         def color(self, sample, notes, sums):
             return tuple(part / 2 for part in sample.color)
 
-    def over(self, around):
+    def shading(self, around):
         return Dimmed.Half()
 
 
@@ -1230,7 +1230,7 @@ def test_rays_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
 
     def loss(direction, rgba, depth):
         turned = eqx.tree_at(lambda how: how.lights[0].direction, lighting, direction)
-        seen = lighting_shading.classification(volume, TRANSFER, space, turned)
+        seen = lighting_shading.lit_classification(volume, TRANSFER, space, turned)
         line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
         return jnp.sum(shade_pixels(Deferred(turned), seen, space, lambda _: line, rgba, depth) ** 2)
 

@@ -191,7 +191,7 @@ def test_the_jitter_happens_at_the_same_sample_where_air_lies_beyond_the_last_po
     "tiling",
     [
         Tiling(cells=4, batch=4, tile=2),
-        pytest.param(Tiling(cells=16, group=4, batch=64, tile=4, kept=0.5), marks=pytest.mark.slow),
+        pytest.param(Tiling(cells=16, group=4, batch=64, tile=4, min_alive=0.5), marks=pytest.mark.slow),
     ],
 )
 def test_tilings_do_not_show(tiling):
