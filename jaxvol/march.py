@@ -118,9 +118,9 @@ class Transform(eqx.Module):
         """The binary logarithm of the number of steps that the cell at this depth may be long.
 
         It depends on the ray and the scene alone. A march clips it, so that a cell is at most
-        `longest_stride` steps long, and a cell of n steps begins a multiple of n steps behind the first one. Rays leap to
-        multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the shortest
-        stride counts. Gradients take strides as given."""
+        `longest_stride` steps long, and a cell of n steps begins a multiple of n steps behind the first one.
+        Rays leap to multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the
+        shortest stride counts. Gradients take strides as given."""
         return jnp.zeros(jnp.shape(depth), jnp.int32)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
