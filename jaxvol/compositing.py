@@ -5,7 +5,7 @@ and of the weights themselves, which is its opacity.
 """
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 import equinox as eqx
 import jax
@@ -58,32 +58,33 @@ class Composite(eqx.Module):
 
 
 class Compositing(eqx.Module):
-    """A compositing mode. All methods see one ray; engines batch them.
+    """A compositing mode: a rule for weights, which depend on the cells' opacities alone, are at least 0, and
+    sum to at most 1.
 
-    The weights depend on the cells' opacities alone. A cell of opacity 0 must change nothing, since engines
-    leave such cells out. Parameters are static fields: they have no gradient.
+    All methods work elementwise, on the numbers of one ray or of many. Parameters are static fields: they
+    have no gradient. A cell here is a piece of one where transforms divide cells.
     """
 
     @abstractmethod
-    def weight(self, opacity: Scalar, alpha: Scalar) -> Scalar:
-        """Weight of the next cell, of opacity `alpha`, behind cells that are composited to `opacity`. 0 where
-        `alpha` is 0."""
+    def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
+        """Weight of the next cell, of opacity `alpha`, where the weights of the cells in front sum to
+        `before`. It is 0 where `alpha` is, since engines leave such cells out."""
 
     @abstractmethod
-    def slope(self, alpha: Scalar, opacity: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
+    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
         """Derivative of a loss by the optical depth τ of a cell, for the second march.
 
         **Arguments:**
 
         - `alpha`: opacity of the cell, 1 - exp(-τ), so that its own derivative is 1 - `alpha`.
-        - `opacity`: composited from all cells up to and including this one.
+        - `after`: sum of the weights up to and including this cell's.
         - `worth`: derivative of the loss by the cell's weight.
         - `behind`: sum over all cells behind this one of weight × worth.
         """
 
     def transmittance(self, opacity: Scalar) -> Scalar:
-        """Of all cells so far: `Transform.stop` decides by it, and it is what shading is told. By default 1:
-        what is in front hides nothing."""
+        """Of all cells so far, whose weights sum to `opacity`. `Transform.stop` decides by it, and shading is
+        told it. By default 1: what is in front hides nothing."""
         return jnp.ones_like(opacity)
 
 
@@ -101,12 +102,12 @@ class Over(Compositing):
     Source: Porter and Duff 1984; Max 1995.
     """
 
-    def weight(self, opacity: Scalar, alpha: Scalar) -> Scalar:
-        return (1 - opacity) * alpha
+    def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
+        return (1 - before) * alpha
 
-    def slope(self, alpha: Scalar, opacity: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
+    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
         """More of the cell, and less of all that lies behind it."""
-        transmittance = self.transmittance(opacity)
+        transmittance = self.transmittance(after)
         # Below this transmittance `behind` is nothing but the sums' rounding, which the extinction of an
         # opaque sample would amplify.
         nothing = 2 * float(jnp.finfo(behind.dtype).eps)
@@ -116,10 +117,10 @@ class Over(Compositing):
         return 1 - opacity
 
 
-MODES: dict[str, type[Compositing]] = {"over": Over}
-"""Modes without parameters, by name."""
+Mode: TypeAlias = Literal["over"]
+"""Names of modes."""
 
-Mode = Literal["over"]
+MODES: dict[Mode, type[Compositing]] = {"over": Over}
 
 
 def compositing_of(given: Mode | Any) -> Compositing:
@@ -134,7 +135,7 @@ def compositing_of(given: Mode | Any) -> Compositing:
                 f"{described(given)} has others."
             )
         return given
-    if isinstance(given, str) and given in MODES:
-        return MODES[given]()
+    if isinstance(given, str) and given in get_args(Mode):
+        return MODES[cast(Mode, given)]()
     names = " or ".join(f'"{name}"' for name in MODES)
     raise ValueError(f"compositing must be {names}, or a jaxvol Compositing; got {described(given)}.")

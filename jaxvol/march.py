@@ -2,8 +2,8 @@
 
 A march is a step length and a tuple of transforms. Without any it is Levoy's ray casting: samples at depths
 0, d, 2d, … past the entry, each of which stands for a cell of width d behind it, up to the exit. A transform
-is one idea of one paper. It overrides one of these methods, the seams, and leaves the others alone. Each seam
-passes through all transforms in turn, so that they compose.
+is one idea of one paper. It overrides one of these methods, the seams, or two, and leaves the others alone.
+At each seam the answers of all transforms are combined, so that they compose.
 
 | seam | question | default answer |
 |---|---|---|
@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -50,7 +51,7 @@ class View(NamedTuple):
     - `size`: (width, height).
     - `corner`: pixel (column, row) that keys the random numbers of the ray through column 0 and row 0.
     - `first_hit`: distances along the rays of columns and rows to their first visible sample, infinite where
-      there is none. They are marched with the index that it is given.
+      there is none. It marches these rays, which leap by the index that it is given.
     """
 
     ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
@@ -64,8 +65,8 @@ class EmptySpaceIndex(eqx.Module):
 
     @abstractmethod
     def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
-        """What is worth finding out once about these beams, from the boxes around them. `stretch`: the length
-        of a segment; leaps shorter than that are of no use."""
+        """What `any_visible` and `skip_to` need to know about these beams, from the boxes around them;
+        computed once. `stretch`: the length of a segment; leaps shorter than that are of no use."""
 
     @abstractmethod
     def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
@@ -111,17 +112,17 @@ class Transform(eqx.Module):
 
     @property
     def longest_stride(self) -> int:
-        """The longest stride that `stride` may give: a static power of two."""
+        """The longest stride that `stride` may give: a static power of two, at most 64."""
         return 1
 
     def stride(self, ray: Ray, depth: Scalar) -> Int[Array, ""]:
-        """The binary logarithm of the number of steps that the cell at this depth may be long.
+        """How many steps long the cell at this depth may be.
 
-        It depends on the ray and the scene alone. A march clips it, so that a cell is at most
-        `longest_stride` steps long, and a cell of n steps begins a multiple of n steps behind the first one.
+        It depends on the ray and the depth alone. A march rounds it down to a power of two of at most
+        `longest_stride`, and so far that a cell of n steps begins a multiple of n steps behind the first one.
         Rays leap to multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the
-        shortest stride counts. Gradients take strides as given."""
-        return jnp.zeros(jnp.shape(depth), jnp.int32)
+        shortest stride counts. Gradients take strides as given; the image jumps where one changes."""
+        return jnp.ones(jnp.shape(depth), jnp.int32)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
@@ -142,9 +143,9 @@ class March(eqx.Module):
     - `transforms`: applied in this order at every seam; none may be given twice.
     - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
       error falls with d. `"midpoint"`: in the middle; the error falls with d².
-    - `max_samples`: the most steps that a ray may take, an integer from 1 to 2²⁴, up to which float32 counts
-      exactly. Rays that need more are marked in `Rendering.exhausted`. By default 131 072, so that every
-      march ends.
+    - `max_samples`: a ray's cells begin less than so many steps behind its first one; an integer from 1 to
+      2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
+      default 131 072, so that every march ends.
 
     **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
     transform, for a transform given twice, and for a `max_samples` that is no such integer.
@@ -178,10 +179,7 @@ class March(eqx.Module):
                 raise ValueError(
                     f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
                 )
-            longest = transform.longest_stride
-            if longest < 1 or longest & (longest - 1):
-                name = type(transform).__name__
-                raise ValueError(f"transforms: {name}.longest_stride must be a power of two; got {longest}.")
+            _check_stride(transform)
         if quadrature not in ("left", "midpoint"):
             raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
         self.quadrature = quadrature
@@ -197,23 +195,23 @@ class March(eqx.Module):
         indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
         return next((index for index in indices if index is not None), None)
 
+    def _overriding(self, seam: str) -> list[Transform]:
+        return [transform for transform in self.transforms if _overrides(transform, seam)]
+
     @property
     def leaps(self) -> bool:
         """Whether any transform overrides `empty_space`."""
-        return any(type(transform).empty_space is not Transform.empty_space for transform in self.transforms)
+        return bool(self._overriding("empty_space"))
 
     @property
     def may_shift(self) -> bool:
         """Whether any transform overrides `shift`."""
-        return any(type(transform).shift is not Transform.shift for transform in self.transforms)
+        return bool(self._overriding("shift"))
 
     @property
     def longest_stride(self) -> int:
         """The longest stride of a cell, in steps."""
-        return min((transform.longest_stride for transform in self._striding()), default=1)
-
-    def _striding(self) -> list[Transform]:
-        return [t for t in self.transforms if type(t).stride is not Transform.stride]
+        return min((transform.longest_stride for transform in self._overriding("stride")), default=1)
 
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""
@@ -242,11 +240,18 @@ class March(eqx.Module):
         longest = self.longest_stride
         if longest == 1:
             return 1
-        exponents = [jnp.asarray(transform.stride(ray, depth), index.dtype) for transform in self._striding()]
-        exponent = jnp.clip(jnp.min(jnp.stack(exponents), axis=0), 0, longest.bit_length() - 1)
+        ray, depth = jax.lax.stop_gradient((ray, depth))
+        power = jnp.full_like(index, longest)
+        for transform in self._overriding("stride"):
+            stride = jnp.asarray(transform.stride(ray, depth))
+            if not jnp.issubdtype(stride.dtype, jnp.integer):
+                name = type(transform).__name__
+                raise ValueError(f"{name}.stride must return integers; got {stride.dtype}.")
+            for shorter in (2**k for k in reversed(range(longest.bit_length() - 1))):
+                power = jnp.where(stride < 2 * shorter, jnp.minimum(power, shorter), power)
         # the largest power of two that divides the index
         aligned = jnp.where(index == 0, longest, index & -index)
-        return jnp.minimum(jnp.left_shift(1, exponent), aligned)
+        return jnp.minimum(power, aligned)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""
@@ -265,3 +270,16 @@ class March(eqx.Module):
     def sample(self, cell: Cell) -> Scalar:
         """Depth at which a cell is sampled."""
         return cell.front if self.quadrature == "left" else cell.front + cell.width / 2
+
+
+def _overrides(transform: Transform, seam: str) -> bool:
+    return getattr(type(transform), seam) is not getattr(Transform, seam)
+
+
+def _check_stride(transform: Transform) -> None:
+    name, longest = type(transform).__name__, transform.longest_stride
+    if _overrides(transform, "stride") != _overrides(transform, "longest_stride"):
+        raise ValueError(f"transforms: {name} must override both stride and longest_stride, or neither.")
+    longest = integer(f"{name}.longest_stride", longest, 1, 64)
+    if longest & (longest - 1):
+        raise ValueError(f"transforms: {name}.longest_stride must be a power of two; got {longest}.")

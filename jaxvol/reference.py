@@ -134,7 +134,7 @@ def blend(
     march, _, _, compositing = pipeline
     composite, met = at.composite, at.met
     for piece, own, alpha in cell:
-        weight = jnp.where(at.finished, 0, compositing.weight(composite.opacity, alpha))
+        weight = jnp.where(at.finished, 0, compositing.weight(alpha, composite.opacity))
         composite = composite.add(weight, own, march.sample(piece))
         if met is not None:
             taken = ~at.finished & counts(march, ray, piece)
@@ -162,7 +162,7 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
 
 
 def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
-    """Samples one cell, composites it, and moves on. Changes nothing once the ray is finished."""
+    """Samples one cell, composites it, and moves on. A ray that is finished sees no more."""
     march, _, _, compositing = pipeline
     stride = march.stride(ray, front(march, at), at.index)
     cut = pieces(pipeline, ray, front(march, at), stride)
@@ -173,9 +173,12 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     for piece, read, alpha in zip(cut, measured, alphas, strict=True):
         transmittance = compositing.transmittance(before.opacity)
         colors.append(color(pipeline, ray, piece, read, transmittance))
-        before = before.add(compositing.weight(before.opacity, alpha))
+        before = before.add(compositing.weight(alpha, before.opacity))
     after = blend(pipeline, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
-    return move(march, ray, after, transparent, stride)
+    after = move(march, ray, after, transparent, stride)
+    if march.longest_stride == 1:  # a scan has as many steps as a ray may take
+        return after
+    return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
 
 
 def end(ray: Ray, at: Progress) -> Rendering:
@@ -227,7 +230,7 @@ def render_ray_reference(
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
-    ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
+    ray = invalid(enter(space, *line), has_fault(volume, march, transfer, lighting))
     lit = lit_classification(volume, transfer, space, lighting)
     of_pixels = lighting is not None and lighting.shades_pixels
     pipeline = Pipeline(march, volume, lit._replace(light=None) if of_pixels else lit, mode)

@@ -277,7 +277,7 @@ MUTATIONS = [
     Mutation(
         "compositing: samples not attenuated by those in front",
         "compositing.py",
-        "return (1 - opacity) * alpha",
+        "return (1 - before) * alpha",
         "return alpha",
         (f"{RENDERED}[plain-left]",),
     ),
@@ -291,15 +291,15 @@ MUTATIONS = [
     Mutation(
         "stride: a long cell begins anywhere",
         "march.py",
-        "return jnp.minimum(jnp.left_shift(1, exponent), aligned)",
-        "return jnp.left_shift(1, exponent)",
+        "return jnp.minimum(power, aligned)",
+        "return power",
         ("test_march.py::test_stride_lengthens_cells",),
     ),
     Mutation(
         "stride: a leap ends where no cell begins",
         "engine/batch.py",
-        "steps = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)",
-        "pass",
+        "rounded = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)",
+        "rounded = steps",
         ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
     ),
     Mutation(

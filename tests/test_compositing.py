@@ -14,19 +14,21 @@ from .scenes import in_float64, uniform_transfer
 
 
 class Additive(jv.Compositing):
-    """Opacities are summed; nothing hides what lies behind it."""
+    """A part of all opacities is summed; nothing hides what lies behind it."""
 
-    def weight(self, opacity, alpha):
-        return alpha
+    part: float = eqx.field(static=True, default=0.01)
 
-    def slope(self, alpha, opacity, worth, behind):
-        return (1 - alpha) * worth
+    def weight(self, alpha, before):
+        return self.part * alpha
+
+    def slope(self, alpha, after, worth, behind):
+        return self.part * (1 - alpha) * worth
 
 
 class Scaled(Additive):
     """With a parameter that is not static."""
 
-    by: jax.Array
+    by: float = 1.0
 
 
 BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
@@ -37,7 +39,7 @@ def composited(mode, alphas, colors):
     """Opacity, colour and mean depth of cells at depths 0, 1, 2, …"""
     composite = Composite.begin(jnp.zeros(()), color=True, moment=True)
     for depth, (alpha, color) in enumerate(zip(alphas, colors, strict=True)):
-        weight = mode.weight(composite.opacity, jnp.asarray(alpha))
+        weight = mode.weight(jnp.asarray(alpha), composite.opacity)
         composite = composite.add(weight, tuple(map(jnp.asarray, color)), jnp.asarray(float(depth)))
     return np.asarray(composite.rgba()), float(composite.mean_depth())
 
@@ -72,14 +74,14 @@ def test_slopes_are_those_of_jax(mode):
         def total(depths):
             opacity, total = jnp.zeros(()), 0.0
             for alpha, worth in zip(1 - jnp.exp(-depths), worths, strict=True):
-                weight = mode.weight(opacity, alpha)
+                weight = mode.weight(alpha, opacity)
                 opacity, total = opacity + weight, total + weight * worth
             return total
 
         expected, whole = jax.grad(total)(depths), total(depths)
         opacity, front = jnp.zeros(()), 0.0
         for k, alpha in enumerate(1 - jnp.exp(-depths)):
-            weight = mode.weight(opacity, alpha)
+            weight = mode.weight(alpha, opacity)
             opacity, front = opacity + weight, front + weight * worths[k]
             slope = mode.slope(alpha, opacity, worths[k], whole - front)
             np.testing.assert_allclose(slope, expected[k], rtol=1e-12)
@@ -88,7 +90,7 @@ def test_slopes_are_those_of_jax(mode):
 def test_a_mode_of_ones_own_composites():
     """Seven equal cells, in the fast engine and the reference; early termination never ends the ray."""
     march = jv.March(0.3, (jv.EarlyTermination(0.5),))
-    transfer, expected = uniform_transfer(1.0), 7 * (1 - np.exp(-0.3))
+    transfer, expected = uniform_transfer(1.0), 0.07 * (1 - np.exp(-0.3))
     rendering = jv.render_rays(BOX, transfer, *RAY, march, compositing=Additive())
     reference = jv.render_ray_reference(
         BOX, transfer, jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march, compositing=Additive()
@@ -154,5 +156,5 @@ def test_bad_modes_are_named():
     with pytest.raises(ValueError, match="got the class Over"):
         compositing_of(jv.Over)
     with pytest.raises(ValueError, match=r"compositing must have static fields only.*a Scaled has others"):
-        compositing_of(Scaled(jnp.ones(())))
+        compositing_of(Scaled(0.1, 2.0))
     assert isinstance(compositing_of("over"), jv.Over)

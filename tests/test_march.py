@@ -41,9 +41,9 @@ class Halves(jv.Transform):
 
 
 class Long(jv.Transform):
-    """Cells of 2**exponent steps behind the plane `value` = `beyond` of the volume."""
+    """Cells of so many steps from the grid coordinate x = `beyond` on."""
 
-    exponent: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
     beyond: float = eqx.field(static=True, default=0.0)
 
     @property
@@ -52,10 +52,15 @@ class Long(jv.Transform):
 
     def stride(self, ray, depth):
         x, _, _ = ray.path(depth)
-        return jnp.where(x >= self.beyond, self.exponent, 0)
+        return jnp.where(x >= self.beyond, self.steps, 1)
 
 
-class Three(jv.Transform):
+class Unlimited(jv.Transform):
+    def stride(self, ray, depth):
+        return jnp.full(depth.shape, 2)
+
+
+class Three(Long):
     @property
     def longest_stride(self):
         return 3
@@ -122,16 +127,17 @@ def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, 
 @pytest.mark.parametrize(
     ("transforms", "length", "samples"),
     [
-        ((Long(0),), 2.1, 7),
-        ((Long(1),), 2.4, 4),  # at 0, 0.6, 1.2, 1.8
-        ((Long(2),), 2.4, 2),  # at 0, 1.2
-        ((Long(5),), 2.4, 2),  # no longer than the longest stride
+        ((Long(1),), 2.1, 7),
+        ((Long(2),), 2.4, 4),  # at 0, 0.6, 1.2, 1.8
+        ((Long(3),), 2.4, 4),  # rounded down
+        ((Long(4),), 2.4, 2),  # at 0, 1.2
+        ((Long(50),), 2.4, 2),  # no longer than the longest stride
         ((Long(-1),), 2.1, 7),
-        # steps 0, 1, 2; 3 lies beyond the middle, but only a cell of one step may begin there; 4 is divisible
-        ((Long(2, 1.7),), 2.4, 5),
-        ((Shift(), Long(2)), 2.4, 2),  # at 0.15, 1.35
-        ((Halves(), Long(2)), 2.4, 4),  # half cells
-        ((jv.AlphaCorrection(), Long(2)), 2.0, 2),
+        # steps 0, 1, 2; 3 lies beyond x = 1.7, but only a cell of one step may begin there; 4 is divisible
+        ((Long(4, 1.7),), 2.4, 5),
+        ((Shift(), Long(4)), 2.4, 2),  # at 0.15, 1.35
+        ((Halves(), Long(4)), 2.4, 4),  # half cells
+        ((jv.AlphaCorrection(), Long(4)), 2.0, 2),
     ],
 )
 def test_stride_lengthens_cells(transforms, length, samples):
@@ -142,6 +148,21 @@ def test_stride_lengthens_cells(transforms, length, samples):
     )
     assert float(reference.rgba[3]) == seen(length)
     assert int(reference.samples) == samples
+
+
+@pytest.mark.parametrize(("limit", "cells"), [(1, 1), (4, 1), (5, 2), (8, 2)])
+def test_cells_of_several_steps_begin_within_the_limit(limit, cells):
+    """On a ray of seven steps, in all engines."""
+    march, box = jv.March(0.3, (Long(4),), max_samples=limit), (BOX, uniform_transfer(1.0))
+    found = [jv.render_rays(*box, *RAY, march, adjoint=adjoint) for adjoint in ("replay", "direct")]
+    found.append(
+        jv.render_rays(*box, *RAY, jv.March(0.3, (*march.transforms, jv.SpaceLeaping()), max_samples=limit))
+    )
+    alone = jv.render_ray_reference(*box, jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march)
+    for rendering in (*(jax.tree.map(lambda leaf: leaf[0], each) for each in found), alone):
+        assert float(rendering.rgba[3]) == seen(cells * 1.2)
+        assert int(rendering.samples) == cells
+        assert bool(rendering.exhausted) == (cells == 1)
 
 
 def test_locate_replaces_the_space():
@@ -200,7 +221,7 @@ BAD = {
     ),
     "a class": (lambda: jv.March(0.1, (jv.AlphaCorrection,)), "transforms must hold jaxvol transforms"),
     "a stride of three": (
-        lambda: jv.March(0.1, (Three(),)),
+        lambda: jv.March(0.1, (Three(1),)),
         "Three.longest_stride must be a power of two; got 3",
     ),
     "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),

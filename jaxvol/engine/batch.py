@@ -25,7 +25,8 @@ State: TypeAlias = tuple[Progress, tuple[PyTree, PyTree, PyTree]]
 
 
 class CellRange(NamedTuple):
-    """The visible cells of a ray lie from `first` on, and before `until`."""
+    """Indices of steps: all visible cells of a ray begin at `first` or later, and end at `until` or
+    earlier."""
 
     first: Int[Array, "*rays"]
     until: Int[Array, "*rays"]
@@ -160,6 +161,7 @@ def _leap(
     steps = jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype)
     longest = march.longest_stride
     if longest > 1:  # to where a cell begins also without the leap
-        steps = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)
+        rounded = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)
+        steps = jnp.where(there < rays.length, rounded, steps)
     steps = jnp.minimum(steps, march.most_samples - at.index)
     return jax.vmap(partial(over_transparent, march))(rays, at, steps)

@@ -106,4 +106,4 @@ def shade_image(
 
 def fault_of(scene: Scene) -> Bool[Array, ""]:
     """Whether a number on which all pixels depend makes them NaN."""
-    return has_fault(scene.volume, scene.march, scene.transfer, scene.compositing, scene.lighting)
+    return has_fault(scene.volume, scene.march, scene.transfer, scene.lighting)

@@ -58,21 +58,24 @@ class Ahead(NamedTuple):
         return begin, begin + self.stride
 
     def steps(self, cells: Int[Array, " rays"] | int) -> Int[Array, " rays"] | int:
-        """How many steps so many of the cells are long together."""
+        """Total length, in steps, of each ray's first `cells` cells."""
         if self.stride is None:
             return cells
         dtype = self.stride.dtype
-        number = jnp.arange(self.stride.shape[0], dtype=dtype)[:, None]
+        number, cells = jnp.arange(self.stride.shape[0], dtype=dtype)[:, None], jnp.asarray(cells, dtype)
+        cells = jnp.broadcast_to(cells, self.stride.shape[1:])[None]
         return jnp.sum(jnp.where(number < cells, self.stride, 0), axis=0, dtype=dtype)
 
     def before(self, steps: Int[Array, " rays"]) -> Int[Array, " rays"]:
-        """How many cells begin before so many steps. Where each is one step long, there may be fewer
-        cells."""
-        return steps if self.stride is None else jnp.sum(self.begin < steps, axis=0, dtype=steps.dtype)
+        """How many of the cells begin before so many steps; where each is one step long, this may exceed
+        their number."""
+        if self.stride is None:
+            return steps
+        return jnp.sum(self.begin < steps[None], axis=0, dtype=steps.dtype)
 
 
 class Samples(NamedTuple):
-    """The next cells of many rays: `ahead`, where they begin, and as lists with one entry for each piece of a
+    """The next cells of many rays, `ahead`. The other fields are lists with one entry for each piece of a
     cell, arrays (cells, rays). Cells that a ray does not take are placed beyond its exit."""
 
     ahead: Ahead
@@ -168,9 +171,10 @@ def _sampled(pipeline: Pipeline, ahead: Ahead, ray: Ray, at: Progress) -> Sample
         each = vmap_cells(partial(opacity, pipeline), (False, True, True))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
-    # Always true, but opaque to XLA, so that the branches survive. An index grows by at most one segment's
-    # steps a segment, finished or not, and there are no more segments in a pass than `march.most_samples`,
-    # at most 2**24: it never overflows. Whether any ray is alive would take 1 % of a frame to find out.
+    # Always true, but opaque to XLA, so that the branches survive. In a pass there are at most some
+    # `march.most_samples` / cells segments, in each of which an index grows by at most cells *
+    # `longest_stride`, finished or not: with 2**24 samples and strides of 64 it stays below 2**31. Whether
+    # any ray is alive would take 1 % of a frame to find out.
     live = at.index[0] >= 0
     values = in_memory(live, measured, at, given)
     if classification.search is not None:

@@ -37,7 +37,7 @@ def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weight
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
             before = composite.opacity
-            weight = jnp.where(finished, 0, compositing.weight(before, alpha[k]))
+            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
             composite = composite.add(weight)
             found[i].append((weight, before, composite.opacity, finished))
         finished |= jax.vmap(pipeline.march.stop)(compositing.transmittance(composite.opacity))

@@ -23,7 +23,7 @@ class Patchy(jv.Transform):
 
     def stride(self, ray, depth):
         x, y, z = ray.path(depth)
-        return jnp.floor(x / 3 + y / 2 + z / 5).astype(jnp.int32) % 5
+        return 2 ** (jnp.floor(x / 3 + y / 2 + z / 5).astype(jnp.int32) % 5)
 
 
 def with_strides(scene):
