@@ -177,14 +177,14 @@ MUTATIONS = [
     ),
     Mutation(
         "leap: range of visible cells ends one cell too early",
-        "engine/replay.py",
+        "engine/batch.py",
         "until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)",
         "until = jnp.max(jnp.where(visible, begin, carry.until[None]), axis=0)",
         (LEAPING_GRADIENT,),
     ),
     Mutation(
         "leap: range of visible cells begins one cell too late",
-        "engine/replay.py",
+        "engine/batch.py",
         "return CellRange(jnp.minimum(carry.first, first), until), None, None",
         "return CellRange(jnp.minimum(carry.first, first) + 1, until), None, None",
         (LEAPING_GRADIENT,),

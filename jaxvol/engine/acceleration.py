@@ -12,7 +12,7 @@ from ..reference import Pipeline, end
 from ..transforms.space_leaping import FirstHit
 from ..volume import Volume
 from .batch import Beams
-from .packing import words_of
+from .packing import with_words, words_of
 from .scene import Scene
 from .tiles import OwnRays, RayTiles, lines, vmap_rays
 from .tiling import Tiling
@@ -29,6 +29,10 @@ class VolumeAcceleration(eqx.Module):
     @classmethod
     def of(cls, volume: Volume, march: March) -> "VolumeAcceleration":
         return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
+
+    def packed(self, scene: Scene) -> Scene:
+        """The scene, with voxels fetched from their packed copy."""
+        return scene._replace(volume=with_words(scene.volume, self.words))
 
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:

@@ -16,7 +16,7 @@ from ..march import EmptySpaceIndex, March
 from ..occupancy import Occupancy
 from ..reference import Pipeline, Progress, front, move
 from ..space import Ray
-from .segment import SampleVisitor, march_segment, regular_from_here
+from .segment import Samples, SampleVisitor, march_segment, regular_from_here
 from .tiling import Tiling
 
 
@@ -30,6 +30,27 @@ class CellRange(NamedTuple):
 
     first: Int[Array, "*rays"]
     until: Int[Array, "*rays"]
+
+
+class VisibleRangeRecorder(SampleVisitor):
+    """Records each ray's first and last visible cell, over rays of this shape. A ray without any has
+    `until` = 0, and a `first` that is not one of its cells."""
+
+    given = sums = total = None
+
+    def __init__(self, shape: tuple[int, ...]):
+        self.carry = CellRange(
+            jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32)
+        )
+
+    def visit(
+        self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
+    ) -> tuple[CellRange, None, None]:
+        begin, end = samples.ahead.ends(at.index)
+        visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
+        first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
+        until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)
+        return CellRange(jnp.minimum(carry.first, first), until), None, None
 
 
 class Beams(eqx.Module):

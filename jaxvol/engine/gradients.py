@@ -15,14 +15,12 @@ from jaxtyping import Array, PyTree
 from .._util.sharding import varying
 from .._util.trees import added, floats
 from ..lighting.shading import Surroundings
-from ..reference import Pipeline
 from ..rendering import Rendering
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
-from .image import RenderOptions, fault_of
-from .packing import with_words
+from .image import RenderOptions, fault_of, pipeline_of
 from .replay import Cotangents, Replay, Total
 from .scene import Scene
 from .shading_gradient import Lit
@@ -66,17 +64,18 @@ def _pulled(
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
-    volume, transfer, source, march, compositing, lighting = scene
+    volume, transfer, source, march, _, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed.volume.data
     places = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
-    packed, tiling = with_words(volume, acceleration.words), options.tiling
+    packed, tiling = acceleration.packed(scene), options.tiling
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
         index = index.within_ranges()
-    pipeline, fault = Pipeline(march, packed, transfer.classification(packed), compositing), fault_of(scene)
+    fault = fault_of(scene)
+    _, pipeline = pipeline_of(packed._replace(lighting=None))  # samples are shaded by `light`
     light, pull_light = None, None
     if lighting is not None:
-        light, pull_light = _light(scene, packed, voxels=of_voxels)
+        light, pull_light = _light(scene, packed.volume, voxels=of_voxels)
 
     def tile(
         sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, Rendering, Rendering]
@@ -92,8 +91,8 @@ def _pulled(
         rays, pull = eqx.filter_vjp(made, moving)
         replay = Replay(
             pipeline,
-            (volume, acceleration.words, transfer),
-            *(rays, Cotangents.of(rays, rendering, cotangent), total, light, tiling),
+            scene,
+            *(acceleration.words, rays, Cotangents.of(rays, rendering, cotangent), total, light, tiling),
             places=places,
         )
         beams = Beams(rays, tiles.beams, tiles.box(source, rays, number), range_)

@@ -15,9 +15,7 @@ from ..reference import Pipeline, begin, end, has_fault, step
 from ..rendering import Outputs, Rendering
 from ..space import Ray, Space, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
-from .batch import Beams, CellRange
-from .packing import with_words
-from .replay import VisibleRangeRecorder
+from .batch import Beams, CellRange, VisibleRangeRecorder
 from .scene import Scene
 from .shading import shade_pixels
 from .tiles import RayTiles, line, vmap_rays
@@ -38,9 +36,9 @@ def march_image(
     """The image, by the fast engine; and, to `record`, each ray's visible cells, where rays leap."""
     tiling = options.tiling
     tiles = RayTiles.of(scene.source, tiling)
-    scene = scene._replace(volume=with_words(scene.volume, acceleration.words))
+    scene = acceleration.packed(scene)
     index = empty_space_of(scene, acceleration, tiling)
-    space, pipeline = _pipeline(scene)
+    space, pipeline = pipeline_of(scene)
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
         beams = Beams(rays, tiles.beams, tiles.box(scene.source, rays, tile))
@@ -56,8 +54,8 @@ def scan_image(
 ) -> Rendering:
     """The image, by `length` steps of the reference engine along each ray, which JAX can differentiate."""
     tiles = RayTiles.of(scene.source, options.tiling, direct=True)
-    scene = scene._replace(volume=with_words(scene.volume, acceleration.words))
-    space, pipeline = _pipeline(scene)
+    scene = acceleration.packed(scene)
+    space, pipeline = pipeline_of(scene)
 
     def scanned(_: Int[Array, ""], rays: Ray) -> Rendering:
         one = vmap_rays(partial(step, pipeline))
@@ -68,7 +66,7 @@ def scan_image(
     return _over_tiles(scene, space, tiles, lambda tile, rays: (scanned(tile, rays), None))[0]
 
 
-def _pipeline(scene: Scene) -> tuple[Space, Pipeline]:
+def pipeline_of(scene: Scene) -> tuple[Space, Pipeline]:
     """The space in which rays meet the volume, and what turns them into pixels."""
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
@@ -97,8 +95,8 @@ def shade_image(
     """The image as shaded by a lighting for which `shades_pixels` holds."""
     lighting = scene.lighting
     assert lighting is not None
-    scene = scene._replace(volume=with_words(scene.volume, acceleration.words))
-    space, pipeline = _pipeline(scene)
+    scene = acceleration.packed(scene)
+    space, pipeline = pipeline_of(scene)
     through = partial(line, scene.source)
     shaded = shade_pixels(lighting, pipeline.classification, space, through, rgba, depth)
     return shaded * jnp.where(fault_of(scene), jnp.nan, 1).astype(shaded.dtype)

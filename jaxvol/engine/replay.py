@@ -35,33 +35,12 @@ from ..rendering import Rendering
 from ..space import Ray
 from ..transfer import Transfer
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
-from .batch import CellRange
 from .packing import with_words
+from .scene import Scene
 from .segment import Ahead, Samples, SampleVisitor, pieces_ahead, vmap_cells
 from .shading import Weights, weights_of
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
 from .tiling import Tiling
-
-
-class VisibleRangeRecorder(SampleVisitor):
-    """Records each ray's first and last visible cell, over rays of this shape. A ray without any has
-    `until` = 0, and a `first` that is not one of its cells."""
-
-    given = sums = total = None
-
-    def __init__(self, shape: tuple[int, ...]):
-        self.carry = CellRange(
-            jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32)
-        )
-
-    def visit(
-        self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
-    ) -> tuple[CellRange, None, None]:
-        begin, end = samples.ahead.ends(at.index)
-        visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
-        first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
-        until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)
-        return CellRange(jnp.minimum(carry.first, first), until), None, None
 
 
 class Cotangents(NamedTuple):
@@ -119,8 +98,9 @@ class Replay(SampleVisitor):
 
     **Arguments:**
 
-    - `pipeline`: of the rays. `volume`, `transfer`: where the gradient is taken, `words`: the packed copy of
-      the volume's voxels.
+    - `pipeline`: of the rays; without lighting. `scene`: what the gradient is taken by.
+    - `words`: the packed copy of the scene's voxels.
+    - `rays`: that are marched.
     - `given`: cotangents of the rays.
     - `total`: to be added to.
     - `light`: what shades the samples.
@@ -130,7 +110,8 @@ class Replay(SampleVisitor):
     def __init__(
         self,
         pipeline: Pipeline,
-        scene: tuple[Volume, UInt32[Array, " voxels"] | None, Transfer],
+        scene: Scene,
+        words: UInt32[Array, " voxels"] | None,
         rays: Ray,
         given: Cotangents,
         total: Total,
@@ -139,7 +120,7 @@ class Replay(SampleVisitor):
         *,
         places: bool,
     ):
-        self.volume, self.words, self.transfer = scene
+        self.volume, self.words, self.transfer = scene.volume, words, scene.transfer
         self.pipeline, self.places, self.light = pipeline, places, light
         self.given, self.total, self.tiling = given, total, tiling
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth

@@ -134,7 +134,9 @@ def march_segment(
     if classification.light is None:
         colors = [vmap_cells(classification.classify)(read)[0] for read in samples.measured]
     else:
-        colors = shaded_colors(pipeline, tiling.chunk, ray, at, *samples[1:])
+        colors = shaded_colors(
+            pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
+        )
     blended = jax.vmap(lambda ray, at, cell: blend(pipeline, ray, at, cell))
     cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
     # unrolled, so that nothing between two cells is put in memory
