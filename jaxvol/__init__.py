@@ -7,7 +7,13 @@ composited front to back into a `Rendering`.
 
 from . import lighting as lighting, metrics as metrics
 from .camera import Camera as Camera
-from .compositing import Compositing as Compositing, Over as Over
+from .compositing import (
+    Compositing as Compositing,
+    FirstVisible as FirstVisible,
+    Over as Over,
+    Selection as Selection,
+    Weighting as Weighting,
+)
 from .display import (
     from_srgb as from_srgb,
     save_image as save_image,

@@ -1,19 +1,79 @@
-"""How do the cells of a ray become a pixel? One after the other, front to back.
+"""How do the cells of a ray become a pixel?
 
-A compositing mode gives each cell a weight; the pixel is the sum of the cells' colours times their weights,
-and of the weights themselves, which is its opacity.
+There are two kinds of compositing modes. A `Weighting` gives each cell a weight; the pixel is the sum of the
+cells' colours times their weights, and of the weights themselves, which is its opacity. A `Selection`
+compares the samples of a ray and chooses one depth, at which the pixel is then computed.
 """
 
 from abc import abstractmethod
-from typing import Any, Literal, TypeAlias, cast, get_args
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._util.checks import described
-from ._util.vec3 import Scalar, Vec3
+from ._util.vec3 import Scalar, Vec3, along
+from .lighting.shading import Sample
+from .occupancy import Blocks
+from .space import Ray
+from .transfer import Classification, Measured, Transfer
+
+
+State = TypeVar("State")
+
+Outputs: TypeAlias = Literal["all", "depth", "rgba"]
+"""What is computed beside the image and `Rendering.exhausted`: everything, the depth, or nothing."""
+
+
+class Fragment(NamedTuple):
+    """A sample, as compositing sees it.
+
+    - `alpha`: opacity of its cell; 0 behind the ray's end.
+    - `depth`: past the ray's entry. `value`: of the volume.
+    - `color`: as shaded; None for a selection, or where nobody asks for it.
+    - `valid`: False for what is no sample: behind the ray's end, in a gap of the volume, or of width 0.
+    """
+
+    alpha: Scalar
+    depth: Scalar
+    value: Scalar
+    color: Vec3 | None
+    valid: Bool[Array, ""]
+
+
+class Compositing(eqx.Module, Generic[State]):
+    """A compositing mode: a `Weighting` or a `Selection`. All methods see one ray; engines batch them.
+
+    `State`: a tree of arrays, what a mode knows of the fragments so far.
+    """
+
+    @abstractmethod
+    def begin(self, zero: Scalar, asked: Outputs | None) -> State:
+        """The state before the first fragment. `zero`: of the shape and type of a ray's numbers. `asked`: the
+        outputs that are computed; None for the opacity alone."""
+
+    @abstractmethod
+    def add(self, state: State, fragment: Fragment) -> State:
+        """The state with one more fragment, the next one from the front."""
+
+    @abstractmethod
+    def end(self, state: State) -> tuple[Float[Array, "4"], Scalar | None]:
+        """Premultiplied colour and opacity; and the depth past the entry, if it was asked for: infinite where
+        nothing is visible."""
+
+    @abstractmethod
+    def transmittance(self, state: State) -> Scalar:
+        """Of all cells so far: `Transform.stop` decides by it, and it is what shading is told."""
+
+    def settled(self, state: State) -> Bool[Array, ""]:
+        """Whether what follows cannot change the pixel, so that the ray is finished."""
+        return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
+
+    def visible(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """Which blocks of a volume may change a pixel. Rays leap over the others."""
+        return transfer.visible(blocks)
 
 
 class Composite(eqx.Module):
@@ -21,13 +81,8 @@ class Composite(eqx.Module):
     weights. What is not asked for is None."""
 
     opacity: Scalar
-    color: Vec3 | None
-    moment: Scalar | None
-
-    @classmethod
-    def begin(cls, zero: Scalar, *, color: bool, moment: bool) -> "Composite":
-        """Before the first cell; `zero`: of the shape and type of a ray's numbers."""
-        return cls(zero, (zero, zero, zero) if color else None, zero if moment else None)
+    color: Vec3 | None = None
+    moment: Scalar | None = None
 
     def add(self, weight: Scalar, color: Vec3 | None = None, depth: Scalar | None = None) -> "Composite":
         """With one more cell; its colour and depth are left out where they are not given."""
@@ -57,12 +112,12 @@ class Composite(eqx.Module):
         return jnp.where(visible, mean, jnp.inf)
 
 
-class Compositing(eqx.Module):
-    """A compositing mode: a rule for weights, which depend on the cells' opacities alone, are at least 0, and
-    sum to at most 1.
+class Weighting(Compositing[Composite]):
+    """A mode that gives each cell a weight. The pixel is Σ w c, its opacity Σ w.
 
-    All methods work elementwise, on the numbers of one ray or of many. Parameters are static fields: they
-    have no gradient. A cell here is a piece of one where transforms divide cells.
+    Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. A cell here is a piece
+    of one where transforms divide cells. `weight`, `slope` and `transmittance` work elementwise, on the
+    numbers of one ray or of many. Parameters are static fields: they have no gradient.
     """
 
     @abstractmethod
@@ -82,13 +137,22 @@ class Compositing(eqx.Module):
         - `behind`: sum over all cells behind this one of weight × worth.
         """
 
-    def transmittance(self, opacity: Scalar) -> Scalar:
-        """Of all cells so far, whose weights sum to `opacity`. `Transform.stop` decides by it, and shading is
-        told it. By default 1: what is in front hides nothing."""
-        return jnp.ones_like(opacity)
+    def transmittance(self, state: Composite) -> Scalar:
+        """By default 1: what is in front hides nothing."""
+        return jnp.ones_like(state.opacity)
+
+    def begin(self, zero: Scalar, asked: Outputs | None) -> Composite:
+        moment = zero if asked in ("all", "depth") else None
+        return Composite(zero, None if asked is None else (zero, zero, zero), moment)
+
+    def add(self, state: Composite, fragment: Fragment) -> Composite:
+        return state.add(self.weight(fragment.alpha, state.opacity), fragment.color, fragment.depth)
+
+    def end(self, state: Composite) -> tuple[Float[Array, "4"], Scalar | None]:
+        return state.rgba(), None if state.moment is None else state.mean_depth()
 
 
-class Over(Compositing):
+class Over(Weighting):
     """The operator "over": emission and absorption, front to back.
 
     A cell of opacity α and colour c, behind opacity A, has the weight w:
@@ -107,14 +171,103 @@ class Over(Compositing):
 
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
         """More of the cell, and less of all that lies behind it."""
-        transmittance = self.transmittance(after)
+        transmittance = 1 - after
         # Below this transmittance `behind` is nothing but the sums' rounding, which the extinction of an
         # opaque sample would amplify.
         nothing = 2 * float(jnp.finfo(behind.dtype).eps)
         return jnp.where(transmittance <= nothing, 0, transmittance * worth - behind)
 
-    def transmittance(self, opacity: Scalar) -> Scalar:
-        return 1 - opacity
+    def transmittance(self, state: Composite) -> Scalar:
+        return 1 - state.opacity
+
+
+class Sight(NamedTuple):
+    """A ray, and how places along it are measured, classified and shaded. Depths are past the entry.
+
+    `rate`: by which depths are multiplied. It is 1, and has a gradient where depths count steps of a march.
+    """
+
+    ray: Ray
+    classification: Classification
+    rate: Scalar | int = 1
+
+    def measured(self, depth: Scalar) -> Measured:
+        """The measured values at this depth, the volume's value first."""
+        coordinate = self.ray.path(depth * self.rate)
+        return self.classification.searched(self.classification.measure(coordinate))
+
+    def color(self, depth: Scalar, measured: Measured, transmittance: Scalar) -> Vec3:
+        """The colour of these measured values, shaded where there is a lighting. `transmittance`: between
+        the place and the camera."""
+        color, extinction = self.classification.classify(measured)
+        if self.classification.light is None:
+            return color
+        ray = self.ray
+        point = along(ray.entry, ray.direction, depth * self.rate)
+        return self.classification.light(
+            Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
+        )
+
+    def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
+        """Colour, shaded where there is a lighting, and extinction at this depth, which nothing hides."""
+        measured = self.measured(depth)
+        _, extinction = self.classification.classify(measured)
+        return self.color(depth, measured, jnp.ones_like(depth)), extinction
+
+
+class Selection(Compositing[State]):
+    """A mode that compares the samples of a ray and chooses a depth. The pixel is computed from what is
+    there, once for each ray, after the march.
+
+    Gradients are those of `pixel`. What the march found is constant to them: the depths in its state stay the
+    same number of steps behind the entry, while the ray, the step and what the ray meets change. A pixel
+    jumps where the choice does. Parameters may have gradients, through `pixel`.
+    """
+
+    @abstractmethod
+    def depth(self, state: State) -> Scalar:
+        """The depth that is chosen, past the entry; infinite as long as there is none."""
+
+    @abstractmethod
+    def pixel(self, sight: Sight, state: State) -> tuple[Float[Array, "4"], Scalar]:
+        """Premultiplied colour and opacity, and the depth past the entry that is reported, of a ray for which
+        a depth was chosen. It is differentiated by JAX."""
+
+    def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
+        depth = self.depth(state)
+        none, chosen = jnp.zeros_like(depth), (~jnp.isinf(depth)).astype(depth.dtype)
+        return jnp.stack([none, none, none, chosen]), depth
+
+    def transmittance(self, state: State) -> Scalar:
+        """1: what is in front hides nothing."""
+        return jnp.ones_like(self.depth(state))
+
+    def visible(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """By default all blocks: what is transparent may still be chosen."""
+        return jnp.ones(blocks.low.shape, bool)
+
+
+class FirstVisible(Selection[Scalar]):
+    """The first sample of positive opacity, shown opaque."""
+
+    def begin(self, zero: Scalar, asked: Outputs | None) -> Scalar:
+        return jnp.full_like(zero, jnp.inf)
+
+    def add(self, state: Scalar, fragment: Fragment) -> Scalar:
+        return jnp.where((state == jnp.inf) & (fragment.alpha > 0), fragment.depth, state)
+
+    def depth(self, state: Scalar) -> Scalar:
+        return state
+
+    def settled(self, state: Scalar) -> Bool[Array, ""]:
+        return state < jnp.inf
+
+    def visible(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        return transfer.visible(blocks)
+
+    def pixel(self, sight: Sight, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
+        color, _ = sight.shaded(state)
+        return jnp.stack([*color, jnp.ones_like(state)]), state
 
 
 Mode: TypeAlias = Literal["over"]
@@ -126,16 +279,18 @@ MODES: dict[Mode, type[Compositing]] = {"over": Over}
 def compositing_of(given: Mode | Any) -> Compositing:
     """The mode of this name, or the mode itself.
 
-    **Raises:** `ValueError`, naming the argument, for anything else, and for a mode whose fields are not all
-    static."""
-    if isinstance(given, Compositing):
-        if jax.tree.leaves(given):
+    **Raises:** `ValueError`, naming the argument, for anything else, and for a `Weighting` whose fields are
+    not all static."""
+    if isinstance(given, Weighting | Selection):
+        if isinstance(given, Weighting) and jax.tree.leaves(given):
             raise ValueError(
-                "compositing must have static fields only, eqx.field(static=True); "
+                "compositing must be a Weighting with static fields only, eqx.field(static=True); "
                 f"{described(given)} has others."
             )
         return given
     if isinstance(given, str) and given in get_args(Mode):
         return MODES[cast(Mode, given)]()
     names = " or ".join(f'"{name}"' for name in MODES)
-    raise ValueError(f"compositing must be {names}, or a jaxvol Compositing; got {described(given)}.")
+    raise ValueError(
+        f"compositing must be {names}, or a jaxvol Weighting or Selection; got {described(given)}."
+    )

@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
-from ._util.vec3 import Scalar, Vec3, along, apart
+from ._util.vec3 import Scalar, Vec3, apart
 from .arguments import check_arguments
-from .compositing import Composite, Compositing, Mode, compositing_of
-from .lighting.shading import Lighting, Sample, lit_classification
+from .compositing import Compositing, Fragment, Mode, Outputs, Selection, Sight, compositing_of
+from .lighting.shading import Lighting, lit_classification
 from .march import Cell, March
-from .rendering import Details, Outputs, Rendering
-from .space import Line, Ray, enter, invalid
+from .rendering import Details, Rendering
+from .space import Line, Ray, Space, enter, invalid
 from .transfer import Classification, Measured, Transfer
 from .volume import Volume, without_voxels
 
@@ -41,13 +41,13 @@ class Progress(eqx.Module):
 
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
-    that of all cells so far. `shift`, in steps, is added to `offset` behind the first transparent cell, and
-    is 0 from then on. What is not asked for is None.
+    the compositing mode's state behind all cells so far. `shift`, in steps, is added to `offset` behind the
+    first transparent cell, and is 0 from then on. What is not asked for is None.
     """
 
     index: Int[Array, ""]
     offset: Scalar
-    composite: Composite
+    composite: PyTree
     met: "Met | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
@@ -67,14 +67,15 @@ def has_fault(volume: Volume, march: March, *others: Any) -> Bool[Array, ""]:
     return ~(all_finite((without_voxels(volume), march, others)) & (march.step > 0))
 
 
-def begin(march: March, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Progress:
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
+    march, _, _, compositing = pipeline
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
         index=count,
         offset=march.start(ray),
-        composite=Composite.begin(zero, color=outputs is not None, moment=outputs in ("all", "depth")),
+        composite=compositing.begin(zero, outputs),
         met=Met(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
@@ -90,8 +91,7 @@ def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] |
 
 def measure(pipeline: Pipeline, ray: Ray, piece: Cell) -> Measured:
     """The measured values at a piece's sample, and what the transfer function's search finds for them."""
-    classification = pipeline.classification
-    return classification.searched(classification.measure(ray.path(pipeline.march.sample(piece))))
+    return Sight(ray, pipeline.classification).measured(pipeline.march.sample(piece))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
@@ -110,40 +110,35 @@ def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Sc
     return 2 * t / (1 + t)
 
 
-def color(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured, transmittance: Scalar) -> Vec3:
-    """Colour of a piece behind this transmittance, shaded where there is a lighting."""
-    classification = pipeline.classification
-    color, extinction = classification.classify(measured)
-    if classification.light is None:
-        return color
-    point = along(ray.entry, ray.direction, pipeline.march.sample(piece))
-    return classification.light(
-        Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
-    )
-
-
 def counts(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
     """Whether a piece counts as a sample. Where a cell is not divided, some of its pieces have width 0."""
     return (march.sample(piece) < ray.length) & (piece.width > 0)
 
 
-def blend(
-    pipeline: Pipeline, ray: Ray, at: Progress, cell: tuple[tuple[Cell, Vec3, Scalar], ...]
+def add(
+    pipeline: Pipeline, ray: Ray, at: Progress, piece: Cell, value: Scalar, color: Vec3 | None, alpha: Scalar
 ) -> Progress:
-    """Composites a cell, given its pieces with their colours and opacities."""
+    """Composites a piece of the next cell. A ray that is finished sees no more."""
     march, _, _, compositing = pipeline
-    composite, met = at.composite, at.met
-    for piece, own, alpha in cell:
-        weight = jnp.where(at.finished, 0, compositing.weight(alpha, composite.opacity))
-        composite = composite.add(weight, own, march.sample(piece))
-        if met is not None:
-            taken = ~at.finished & counts(march, ray, piece)
-            met = Met(
-                met.samples + taken.astype(met.samples.dtype),
-                met.aligned | (piece.cut & (weight > 0)),
-            )
-    stopped = march.stop(compositing.transmittance(composite.opacity))
-    return replace(at, composite=composite, met=met, finished=at.finished | stopped)
+    depth, taken = march.sample(piece), ~at.finished & counts(march, ray, piece)
+    alpha = jnp.where(at.finished, 0, alpha)
+    fragment = Fragment(alpha, depth, value, color, taken & contained(ray, depth))
+    met = at.met
+    if met is not None:
+        shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
+        met = Met(met.samples + taken.astype(met.samples.dtype), met.aligned | (piece.cut & shows))
+    return replace(at, composite=compositing.add(at.composite, fragment), met=met)
+
+
+def stop(pipeline: Pipeline, at: Progress) -> Progress:
+    """Finishes a ray, behind a cell, if it needs no other."""
+    return replace(at, finished=at.finished | stopped(pipeline, at.composite))
+
+
+def stopped(pipeline: Pipeline, composite: Any) -> Bool[Array, ""]:
+    """Whether a ray in this state of compositing needs no other cell."""
+    march, _, _, compositing = pipeline
+    return march.stop(compositing.transmittance(composite)) | compositing.settled(composite)
 
 
 def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
@@ -162,36 +157,65 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
 
 
 def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
-    """Samples one cell, composites it, and moves on. A ray that is finished sees no more."""
-    march, _, _, compositing = pipeline
-    stride = march.stride(ray, front(march, at), at.index)
-    cut = pieces(pipeline, ray, front(march, at), stride)
-    measured = [measure(pipeline, ray, piece) for piece in cut]
-    alphas = [opacity(pipeline, ray, piece, read) for piece, read in zip(cut, measured, strict=True)]
+    """Samples one cell, composites it, and moves on."""
+    march, _, classification, compositing = pipeline
+    stride, sight = march.stride(ray, front(march, at), at.index), Sight(ray, classification)
+    after, alphas, color = at, [], None
+    for piece in pieces(pipeline, ray, front(march, at), stride):
+        measured = measure(pipeline, ray, piece)
+        alphas.append(opacity(pipeline, ray, piece, measured))
+        if not isinstance(compositing, Selection):
+            transmittance = compositing.transmittance(after.composite)
+            color = sight.color(march.sample(piece), measured, transmittance)
+        after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1])
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    before, colors = at.composite, []
-    for piece, read, alpha in zip(cut, measured, alphas, strict=True):
-        transmittance = compositing.transmittance(before.opacity)
-        colors.append(color(pipeline, ray, piece, read, transmittance))
-        before = before.add(compositing.weight(alpha, before.opacity))
-    after = blend(pipeline, ray, at, tuple(zip(cut, colors, alphas, strict=True)))
-    after = move(march, ray, after, transparent, stride)
+    after = move(march, ray, stop(pipeline, after), transparent, stride)
     if march.longest_stride == 1:  # a scan has as many steps as a ray may take
         return after
     return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
 
 
-def end(ray: Ray, at: Progress) -> Rendering:
-    """The rendering of a ray, with the outputs that it was begun with."""
+def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
+    """The rendering of a ray, with the outputs that it was begun with. A `Selection` leaves the pixel to
+    `finish`."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
+    rgba, depth = pipeline.compositing.end(at.composite)
     # a product, since the derivative of a `where` would be 0
-    rgba = at.composite.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
-    if at.composite.moment is not None:
-        mean = at.composite.mean_depth()
-        details = Details(jnp.where(valid & jnp.isinf(mean), jnp.inf, ray.t_in + mean))
+    rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
+    if depth is not None:
+        details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
     if at.met is not None:
         details = details._replace(samples=at.met.samples, aligned=at.met.aligned)
+    if isinstance(pipeline.compositing, Selection):
+        details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)
+
+
+def finishes(compositing: Compositing, lighting: Lighting | None) -> bool:
+    """Whether pixels are computed after the march, by `finish`. Rays are then marched without light."""
+    return isinstance(compositing, Selection) or (lighting is not None and lighting.shades_pixels)
+
+
+def finish(
+    pipeline: Pipeline,
+    lighting: Lighting | None,
+    space: Space,
+    line: Line,
+    rgba: Float[Array, "4"],
+    depth: Scalar,
+    selected: PyTree,
+) -> tuple[Float[Array, "4"], Scalar]:
+    """Pixel and depth of a ray that is not transparent, from what its march found: by the mode that selected
+    it, or else by the lighting."""
+    march, _, classification, compositing = pipeline
+    if not isinstance(compositing, Selection):
+        assert lighting is not None
+        return lighting.shade_pixel(classification, space, line, rgba, depth), depth
+    ray = enter(space, *line)
+    rate = march.step / jax.lax.stop_gradient(march.step)
+    pixel, depth = compositing.pixel(Sight(ray, classification, rate), jax.lax.stop_gradient(selected))
+    valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
+    return pixel * valid, ray.t_in + depth * rate
 
 
 def render_ray_reference(
@@ -230,20 +254,27 @@ def render_ray_reference(
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
-    ray = invalid(enter(space, *line), has_fault(volume, march, transfer, lighting))
+    ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
     lit = lit_classification(volume, transfer, space, lighting)
-    of_pixels = lighting is not None and lighting.shades_pixels
-    pipeline = Pipeline(march, volume, lit._replace(light=None) if of_pixels else lit, mode)
+    later = finishes(mode, lighting)
+    pipeline = Pipeline(march, volume, lit._replace(light=None) if later else lit, mode)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(pipeline, ray, at), None
 
-    at, _ = jax.lax.scan(one, varying(begin(march, ray), ray), None, length=steps_across(volume, march))
-    rendering = end(ray, at)
-    if lighting is None or not of_pixels:
+    start = varying(begin(pipeline, ray), ray)
+    at, _ = jax.lax.scan(one, start, None, length=steps_across(volume, march))
+    rendering = end(pipeline, ray, at)
+    if not later:
         return rendering
-    rgba = lighting.shade_pixel(lit, space, line, rendering.rgba, rendering.depth)
-    return replace(rendering, rgba=rgba)
+    visible, details = rendering.rgba[3] != 0, rendering.details
+    # a transparent ray has no depth at which anything could be computed
+    given = jax.tree.map(
+        lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), (rendering.depth, details.selected)
+    )
+    rgba, depth = finish(pipeline._replace(classification=lit), lighting, space, line, rendering.rgba, *given)
+    rgba, depth = jnp.where(visible, rgba, 0), jnp.where(visible, depth, jnp.inf)
+    return replace(rendering, rgba=rgba, details=details._replace(depth=depth, selected=None))
 
 
 def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:

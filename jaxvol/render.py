@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -12,7 +13,7 @@ from ._util.checks import Arrayable, finite_array, require
 from ._util.sharding import shard_number, varying
 from .arguments import check_arguments
 from .camera import Camera
-from .compositing import Compositing, Mode, compositing_of
+from .compositing import Compositing, Mode, Selection, compositing_of
 from .engine.acceleration import VolumeAcceleration
 from .engine.adjoints import AbstractAdjoint, Adjoint, adjoint_of
 from .engine.image import RenderOptions
@@ -21,7 +22,8 @@ from .engine.tiles import OwnRays
 from .engine.tiling import Tiling
 from .lighting.shading import Lighting
 from .march import March
-from .rendering import Rendering
+from .reference import finishes
+from .rendering import Details, Rendering
 from .transfer import Transfer
 from .volume import Volume
 
@@ -141,20 +143,24 @@ def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = No
     options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
     acceleration = VolumeAcceleration.of(volume, march)
     scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
-    if lighting is not None and lighting.shades_pixels:
-        return _shaded_afterwards(scene, options, how, acceleration)
+    if finishes(scene.compositing, lighting):
+        return _finished(scene, options, how, acceleration)
     return how.render(scene, options, acceleration)
 
 
-def _shaded_afterwards(
+def _finished(
     scene: Scene, options: RenderOptions, how: AbstractAdjoint, acceleration: VolumeAcceleration
 ) -> Rendering:
-    """The image is rendered without light, and shaded as a whole."""
+    """The rays are marched without light, and pixels computed from what that found."""
     all_ = options.outputs == "all"
-    unlit = replace(options, outputs="all" if all_ else "depth")
-    rendering = how.render(scene._replace(lighting=None), unlit, acceleration)
-    rgba = how.shade(scene, acceleration, rendering.rgba, rendering.depth)
-    return replace(rendering, rgba=rgba) if all_ else Rendering(rgba, rendering.exhausted)
+    unlit, options = scene._replace(lighting=None), replace(options, outputs="all" if all_ else "depth")
+    if isinstance(scene.compositing, Selection):  # the choice is a constant
+        unlit = jax.lax.stop_gradient(unlit)
+    rendering = how.render(unlit, options, acceleration)
+    details = rendering.details
+    pixels = how.finish(scene, acceleration, (rendering.rgba, rendering.depth, details.selected))
+    details = details._replace(depth=pixels[..., 4], selected=None) if all_ else Details()
+    return Rendering(pixels[..., :4], rendering.exhausted, details)
 
 
 def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:

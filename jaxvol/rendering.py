@@ -1,25 +1,26 @@
 """What does a render return?"""
 
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._util.checks import finite, is_traced
 
 
-Outputs: TypeAlias = Literal["all", "depth", "rgba"]
-"""What is computed beside the image and `exhausted`: everything, the depth, or nothing."""
-
-
 class Details(NamedTuple):
-    """Outputs that cost time, each None where it was not asked for. See `Rendering`."""
+    """Outputs that cost time, each None where it was not asked for. See `Rendering`.
+
+    `selected`: the state of a `Selection` behind the march, which `reference.finish` makes pixels from; not
+    part of a finished image.
+    """
 
     depth: Float[Array, "*rays"] | None = None
     samples: Int[Array, "*rays"] | None = None
     aligned: Bool[Array, "*rays"] | None = None
+    selected: PyTree = None
 
 
 class Rendering(eqx.Module):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing import Composite, compositing_of
+from jaxvol.compositing import compositing_of
 
 from .engine.test_gradient_matrix import scene_of
 from .scenes import in_float64, uniform_transfer
 
 
-class Additive(jv.Compositing):
+class Additive(jv.Weighting):
     """A part of all opacities is summed; nothing hides what lies behind it."""
 
     part: float = eqx.field(static=True, default=0.01)
@@ -37,7 +37,7 @@ RAY = ([[-1.0, 1.0, 1.0]], [[1.0, 0.0, 0.0]])
 
 def composited(mode, alphas, colors):
     """Opacity, colour and mean depth of cells at depths 0, 1, 2, …"""
-    composite = Composite.begin(jnp.zeros(()), color=True, moment=True)
+    composite = mode.begin(jnp.zeros(()), "all")
     for depth, (alpha, color) in enumerate(zip(alphas, colors, strict=True)):
         weight = mode.weight(jnp.asarray(alpha), composite.opacity)
         composite = composite.add(weight, tuple(map(jnp.asarray, color)), jnp.asarray(float(depth)))
@@ -150,11 +150,11 @@ def test_adjoints_of_a_mode_of_ones_own_agree(method):
 
 def test_bad_modes_are_named():
     with pytest.raises(
-        ValueError, match="compositing must be \"over\", or a jaxvol Compositing; got 'under'"
+        ValueError, match="compositing must be \"over\", or a jaxvol Weighting or Selection; got 'under'"
     ):
         compositing_of("under")
     with pytest.raises(ValueError, match="got the class Over"):
         compositing_of(jv.Over)
-    with pytest.raises(ValueError, match=r"compositing must have static fields only.*a Scaled has others"):
+    with pytest.raises(ValueError, match=r"must be a Weighting with static fields only.*a Scaled has"):
         compositing_of(Scaled(0.1, 2.0))
     assert isinstance(compositing_of("over"), jv.Over)

@@ -1,15 +1,16 @@
 """What is found out about a scene before any ray is marched?"""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from ..compositing import Over
+from ..compositing import FirstVisible
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
-from ..transforms.space_leaping import FirstHit
 from ..volume import Volume
 from .batch import Beams
 from .packing import with_words, words_of
@@ -37,25 +38,28 @@ class VolumeAcceleration(eqx.Module):
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
     """Where the scene is empty; None where the march does not leap. It carries no gradient."""
-    volume, transfer, source, march, *_ = jax.lax.stop_gradient(scene)
+    volume, transfer, source, march, compositing, _ = jax.lax.stop_gradient(scene)
     blocks = acceleration.blocks
     if blocks is None:
         return None
     space = march.locate(volume)
-    occupancy = space.occupancy(transfer.visible(blocks) | blocks.unordered)
+    visible = compositing.visible(transfer, blocks) | blocks.unordered
+    if march.may_shift:  # what is leapt over is taken as transparent
+        visible |= transfer.visible(blocks)
+    occupancy = space.occupancy(visible)
     if isinstance(source, OwnRays):
         return march.empty_space(occupancy, None)
 
     def first_hit(index: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
-        first = March(march.step, (FirstHit(),), march.quadrature, max_samples=march.max_samples)
+        plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
         through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
         own = OwnRays(*(jnp.stack(part, axis=-1) for part in (through.origin, through.direction)))
         tiles, only = RayTiles.of(own, tiling._replace(tile=columns.size)), jnp.zeros((), jnp.int32)
         rays = tiles.rays(own, space, only)
         beams = Beams(rays, tiles.beams, tiles.box(own, rays, only))
-        pipeline = Pipeline(first, volume, transfer.classification(volume), Over())
+        pipeline = Pipeline(plain, volume, transfer.classification(volume), FirstVisible())
         at, _ = march_rays(pipeline, index, beams, tiling, "depth")
-        seen = vmap_rays(end)(rays, at)
+        seen = vmap_rays(partial(end, pipeline))(rays, at)
         return tiles.assemble(seen.depth[None]).reshape(columns.shape)
 
     return march.empty_space(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))

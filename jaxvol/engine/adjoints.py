@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._util.checks import is_traced
 from .._util.xla import compiled, forward_only, recomputed, transformations
@@ -19,7 +19,8 @@ from ..rendering import Rendering
 from ..volume import Volume
 from .acceleration import VolumeAcceleration
 from .gradients import render_vjp
-from .image import RenderOptions, march_image, scan_image, shade_image
+from .image import RenderOptions, march_image, scan_image
+from .pixels import Found, finish_image
 from .scene import Scene
 
 
@@ -40,15 +41,9 @@ class AbstractAdjoint(eqx.Module):
     def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
         """The image."""
 
-    def shade(
-        self,
-        scene: Scene,
-        acceleration: VolumeAcceleration,
-        rgba: Float[Array, "*rays 4"],
-        depth: Float[Array, "*rays"],
-    ) -> Float[Array, "*rays 4"]:
-        """The image, as shaded by a lighting for which `shades_pixels` holds."""
-        return _shade(scene, acceleration, rgba, depth)
+    def finish(self, scene: Scene, acceleration: VolumeAcceleration, found: Found) -> Array:
+        """Pixels and their depths (*rays, 5), where they are computed after the march."""
+        return _finish(scene, acceleration, found)
 
 
 class ReplayAdjoint(AbstractAdjoint):
@@ -65,14 +60,8 @@ class ReplayAdjoint(AbstractAdjoint):
         image = _replayed_in_shard if sharded else _replayed
         return image(scene, options, jax.lax.stop_gradient(acceleration))
 
-    def shade(
-        self,
-        scene: Scene,
-        acceleration: VolumeAcceleration,
-        rgba: Float[Array, "*rays 4"],
-        depth: Float[Array, "*rays"],
-    ) -> Float[Array, "*rays 4"]:
-        return _shade_again(scene, acceleration, rgba, depth)
+    def finish(self, scene: Scene, acceleration: VolumeAcceleration, found: Found) -> Array:
+        return _finish_again(scene, acceleration, found)
 
 
 class ForwardAdjoint(AbstractAdjoint):
@@ -114,8 +103,8 @@ _march_in_turn = compiled(_image)
 _march_recorded = compiled(partial(march_image, record=True))
 _render_vjp = compiled(render_vjp)
 _scan = compiled(scan_image, has_jvp=True)
-_shade = compiled(shade_image, has_jvp=True)
-_shade_again = recomputed(shade_image)
+_finish = compiled(finish_image, has_jvp=True)
+_finish_again = recomputed(finish_image)
 
 
 @eqx.filter_custom_vjp

@@ -7,18 +7,18 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.sharding import varying
+from ..compositing import Outputs
 from ..lighting.shading import lit_classification
 from ..reference import Pipeline, begin, end, has_fault, step
-from ..rendering import Outputs, Rendering
+from ..rendering import Rendering
 from ..space import Ray, Space, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, VisibleRangeRecorder
 from .scene import Scene
-from .shading import shade_pixels
-from .tiles import RayTiles, line, vmap_rays
+from .tiles import RayTiles, vmap_rays
 from .tiling import Tiling
 from .wavefront import march_rays
 
@@ -44,7 +44,7 @@ def march_image(
         beams = Beams(rays, tiles.beams, tiles.box(scene.source, rays, tile))
         recorder = VisibleRangeRecorder(rays.length.shape) if record and index is not None else None
         at, (ranges, *_) = march_rays(pipeline, index, beams, tiling, options.outputs, recorder)
-        return vmap_rays(end)(rays, at), ranges
+        return vmap_rays(partial(end, pipeline))(rays, at), ranges
 
     return _over_tiles(scene, space, tiles, marched)
 
@@ -59,9 +59,9 @@ def scan_image(
 
     def scanned(_: Int[Array, ""], rays: Ray) -> Rendering:
         one = vmap_rays(partial(step, pipeline))
-        start = varying(vmap_rays(lambda ray: begin(scene.march, ray, options.outputs))(rays), rays)
+        start = varying(vmap_rays(lambda ray: begin(pipeline, ray, options.outputs))(rays), rays)
         at, _ = jax.lax.scan(lambda at, none: (one(rays, at), none), start, None, length=length)
-        return vmap_rays(end)(rays, at)
+        return vmap_rays(partial(end, pipeline))(rays, at)
 
     return _over_tiles(scene, space, tiles, lambda tile, rays: (scanned(tile, rays), None))[0]
 
@@ -86,22 +86,6 @@ def _over_tiles(
     return jax.tree.map(tiles.assemble, renderings), more
 
 
-def shade_image(
-    scene: Scene,
-    acceleration: VolumeAcceleration,
-    rgba: Float[Array, "*rays 4"],
-    depth: Float[Array, "*rays"],
-) -> Float[Array, "*rays 4"]:
-    """The image as shaded by a lighting for which `shades_pixels` holds."""
-    lighting = scene.lighting
-    assert lighting is not None
-    scene = acceleration.packed(scene)
-    space, pipeline = pipeline_of(scene)
-    through = partial(line, scene.source)
-    shaded = shade_pixels(lighting, pipeline.classification, space, through, rgba, depth)
-    return shaded * jnp.where(fault_of(scene), jnp.nan, 1).astype(shaded.dtype)
-
-
 def fault_of(scene: Scene) -> Bool[Array, ""]:
     """Whether a number on which all pixels depend makes them NaN."""
-    return has_fault(scene.volume, scene.march, scene.transfer, scene.lighting)
+    return has_fault(scene.volume, scene.march, scene.transfer, scene.compositing, scene.lighting)

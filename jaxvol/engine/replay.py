@@ -10,7 +10,7 @@ to the loss, and
     ∂L/∂c_k = w_k c̄        ∂L/∂s_k = w_k d̄ / A        ∂L/∂τ_k = Σ_j q_j ∂w_j/∂τ_k
 
 with the optical depth τ_k (extinction × width). The last is the compositing mode's to say
-(`Compositing.slope`) from q_k and Σ_{j>k} w_j q_j, which is Σ w_j q_j = c̄ · C + ā A, known from the image,
+(`Weighting.slope`) from q_k and Σ_{j>k} w_j q_j, which is Σ w_j q_j = c̄ · C + ā A, known from the image,
 minus the sum over j ≤ k. So nothing is kept from the first march, and nothing is divided by a transmittance,
 which may be 0. JAX pulls optical depths, colours and depths back to the transfer function, the voxels, the
 ray and the step, one segment at a time.
@@ -29,6 +29,7 @@ from jaxtyping import Array, Float, PyTree, UInt32
 from .._util.fetching import Recording, scatter_add
 from .._util.trees import added, floats
 from .._util.vec3 import Scalar, Vec3, along
+from ..compositing import Weighting
 from ..march import March
 from ..reference import Pipeline, Progress, contained
 from ..rendering import Rendering
@@ -232,11 +233,11 @@ class Replay(SampleVisitor):
     ) -> tuple[Scalar, list[Scalar]]:
         """What all samples so far are worth, and the derivative of the loss by each one's optical depth."""
         slopes: list[list[Scalar]] = [[] for _ in worth]
+        compositing = self.pipeline.compositing
+        assert isinstance(compositing, Weighting)
         for k in range(worth[0].shape[0]):
             for i, value in enumerate(worth):
                 front = front + weights.weight[i][k] * value[k]
-                slope = self.pipeline.compositing.slope(
-                    alphas[i][k], weights.after[i][k], value[k], whole - front
-                )
+                slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], whole - front)
                 slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
         return front, [jnp.stack(each) for each in slopes]

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .._util.vec3 import Scalar
+from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
+from ..compositing import Selection
 from ..march import Cell, March
-from ..reference import Pipeline, Progress, blend, front, move, opacity, pieces
+from ..reference import Pipeline, Progress, add, front, move, opacity, pieces, stop
 from ..space import Ray
 from ..transfer import Measured
 from .shading import shaded_colors
@@ -131,16 +132,26 @@ def march_segment(
     if not regular:
         taken, shifted = _taken(march, at, samples)
         samples = _without(samples, taken, ray)
-    if classification.light is None:
+    colors: list[Vec3] | list[None]
+    if isinstance(pipeline.compositing, Selection):
+        colors = [None] * len(samples.cells)
+    elif classification.light is None:
         colors = [vmap_cells(classification.classify)(read)[0] for read in samples.measured]
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
         )
-    blended = jax.vmap(lambda ray, at, cell: blend(pipeline, ray, at, cell))
-    cells = tuple(zip(samples.cells, colors, samples.opacity, strict=True))
+    values = [read[0] for read in samples.measured]
+    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
+
+    def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
+        for piece in cell:
+            at = add(pipeline, ray, at, *piece)
+        return stop(pipeline, at)
+
+    each = jax.vmap(composited)
     # unrolled, so that nothing between two cells is put in memory
-    after, _ = jax.lax.scan(lambda at, cell: (blended(ray, at, cell), None), at, cells, unroll=tiling.cells)
+    after, _ = jax.lax.scan(lambda at, cell: (each(ray, at, cell), None), at, cells, unroll=tiling.cells)
     steps = jnp.broadcast_to(jnp.asarray(samples.ahead.steps(taken), at.index.dtype), at.index.shape)
     return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples
 

@@ -1,22 +1,23 @@
-"""Gathers the samples of positive weight, or the visible pixels, and shades them in chunks.
+"""Gathers the samples of positive weight, and shades them in chunks.
 
 Shading a sample costs many times as much as fetching it, and few samples are visible.
 """
 
-from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from .._util.compaction import CHUNK, Chosen, in_front
+from .._util.compaction import Chosen
 from .._util.vec3 import Scalar, Vec3, along
-from ..lighting.shading import Lighting, Sample
+from ..compositing import Composite, Weighting
+from ..lighting.shading import Sample
 from ..march import Cell
-from ..reference import Pipeline, Progress
-from ..space import Line, Ray, Space
-from ..transfer import Classification, Measured
+from ..reference import Pipeline, Progress, stopped
+from ..space import Ray
+from ..transfer import Measured
 
 
 class Weights(NamedTuple):
@@ -32,7 +33,8 @@ class Weights(NamedTuple):
 def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weights:
     """The weights of consecutive cells, from the opacities of their pieces."""
     compositing = pipeline.compositing
-    composite, finished = at.composite, at.finished
+    assert isinstance(compositing, Weighting)
+    composite, finished = Composite(at.composite.opacity), at.finished
     found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
@@ -40,7 +42,7 @@ def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weight
             weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
             composite = composite.add(weight)
             found[i].append((weight, before, composite.opacity, finished))
-        finished |= jax.vmap(pipeline.march.stop)(compositing.transmittance(composite.opacity))
+        finished |= jax.vmap(partial(stopped, pipeline))(composite)
     each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
     return Weights(*(list(parts) for parts in zip(*each, strict=True)))
 
@@ -66,7 +68,7 @@ def samples_of(
     depths = [pipeline.march.sample(cell) for cell in cells]
     depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), places)
     color, extinction = jax.vmap(pipeline.classification.classify)(read)
-    transmittance = pipeline.compositing.transmittance(before)
+    transmittance = pipeline.compositing.transmittance(Composite(before))
     return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
 
 
@@ -90,35 +92,3 @@ def shaded_colors(
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
     return chosen.split(chosen.fold(one, (none, none, none)), len(alphas))
-
-
-def shade_pixels(
-    lighting: Lighting,
-    classification: Classification,
-    space: Space,
-    line: Callable[[Int[Array, ""]], Line],
-    rgba: Float[Array, "*rays 4"],
-    depth: Float[Array, "*rays"],
-) -> Float[Array, "*rays 4"]:
-    """`Lighting.shade_pixel` for many rays, by chunks of those that are not transparent. `line`: the ray of
-    an index into the flattened image."""
-    flat, depth = rgba.reshape(-1, 4), depth.reshape(-1)
-    visible = flat[:, 3] != 0
-    place, last = in_front(visible), jnp.maximum(jnp.sum(visible, dtype=jnp.int32) - 1, 0)
-
-    # recomputed in the backward pass, where its states would take memory for all rays
-    @jax.checkpoint
-    def shaded(places: Int[Array, " chunk"]) -> Float[Array, "chunk 4"]:
-        # beyond the last visible one that one again, since nothing can be shaded at an infinite depth
-        places = jnp.where(places < visible.size, places, place[last])
-        one = jax.vmap(lambda place, *ray: lighting.shade_pixel(classification, space, line(place), *ray))
-        return one(places, flat[places], depth[places])
-
-    def chunk(number: Int[Array, ""]) -> Float[Array, "chunk 4"]:
-        places = jax.lax.dynamic_slice_in_dim(place, number * CHUNK, CHUNK)
-        return jax.lax.cond(
-            number * CHUNK <= last, shaded, lambda _: jnp.zeros((CHUNK, 4), flat.dtype), places
-        )
-
-    found = jax.lax.map(chunk, jnp.arange(place.size // CHUNK, dtype=jnp.int32)).reshape(-1, 4)
-    return jnp.zeros_like(flat).at[place].set(found, mode="drop").reshape(rgba.shape)

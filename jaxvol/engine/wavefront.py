@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.compaction import in_front
 from .._util.sharding import varying
+from ..compositing import Outputs, Weighting
 from ..march import EmptySpaceIndex
 from ..reference import Pipeline, Progress, begin, counts, front, measure, move, opacity, pieces
-from ..rendering import Outputs
 from ..space import Ray
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
 from .segment import SampleVisitor, regular_from_here
@@ -42,7 +42,7 @@ def march_rays(
     """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
     outputs or nothing but opacity; and the visitor's `carry`, `sums` and `total`."""
     march, rays = pipeline.march, beams.rays
-    at = vmap_rays(lambda ray: begin(march, ray, outputs))(rays)
+    at = vmap_rays(lambda ray: begin(pipeline, ray, outputs))(rays)
     finished, prepared = rays.length <= 0, None
     if index is not None:
         prepared = index.prepare(beams.box, tiling.cells * march.step)
@@ -50,7 +50,8 @@ def march_rays(
         finished |= ~jnp.repeat(visible, beams.groups // beams.count)[:, None]
     job = Job(pipeline, beams, tiling, visitor, index, prepared, jnp.zeros((), bool))
     at = with_fields(at, finished=finished)
-    if march.may_shift and index is None and visitor is None:
+    weighs = isinstance(pipeline.compositing, Weighting)  # to others, transparent cells may matter
+    if march.may_shift and weighs and index is None and visitor is None:
         at = _past_first_cell(pipeline, rays, at)
         alive = job.alive(at)
         job = job._replace(any_order=_mostly(alive & ~regular_from_here(at), of=alive))

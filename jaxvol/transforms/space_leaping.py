@@ -126,13 +126,6 @@ class SpaceLeaping(Transform):
         return start.reshape(column.shape[:-1])
 
 
-class FirstHit(Transform):
-    """End a ray at its first visible sample."""
-
-    def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
-        return stopped | (transmittance < 1)
-
-
 class _Beams(EmptySpaceIndex):
     """Skips the stretches of a beam whose bounding boxes are empty."""
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol import reference
+from jaxvol import compositing
 from jaxvol._util.vec3 import apart
 from jaxvol.engine import shading as engine_shading
-from jaxvol.engine.shading import shade_pixels
+from jaxvol.engine.pixels import of_visible
 from jaxvol.lighting import (
     ConstantLight,
     Deferred,
@@ -50,6 +50,15 @@ def sample_at(around, point, pixel, transmittance):
     return Sample(
         point, (none, none, one), measured, color, extinction, one * transmittance, (pixel[0], pixel[1])
     )
+
+
+def shaded_pixels(lighting, classification, space, line, rgba, depth):
+    """Pixels as shaded by a lighting that shades pixels."""
+
+    def one(place, rgba, depth, selected):
+        return jnp.append(lighting.shade_pixel(classification, space, line, rgba, depth), depth)
+
+    return of_visible(one, (rgba, depth, None))[:, :4]
 
 
 @eqx.filter_jit
@@ -697,9 +706,8 @@ def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
     zero = jnp.zeros((), jnp.int32)
     line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
     rgba = jnp.asarray([[jnp.nan] * 4, [0.5] * 4, [0.0] * 4])
-    found = jax.jit(
-        lambda rgba, depth: shade_pixels(Deferred(lighting), seen, space, lambda _: line, rgba, depth)
-    )(rgba, jnp.asarray([jnp.nan, 0.0, jnp.inf]))
+    depth = jnp.asarray([jnp.nan, 0.0, jnp.inf])
+    found = jax.jit(partial(shaded_pixels, Deferred(lighting), seen, space, line))(rgba, depth)
     np.testing.assert_array_equal(np.isnan(found), [[True] * 4, [False] * 4, [False] * 4])
 
 
@@ -1094,7 +1102,7 @@ def test_one_opaque_surface_is_lit_as_its_samples_are():
 def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     """All lighting goes through these names, which the programs of lit images call."""
     called = []
-    for module in (lighting_shading, reference, engine_shading):
+    for module in (lighting_shading, compositing, engine_shading):
         for name in ("lit", "shaded_colors", "Chosen", "Sample"):
             if hasattr(module, name):
                 original = getattr(module, name)
@@ -1232,7 +1240,7 @@ def test_rays_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
         turned = eqx.tree_at(lambda how: how.lights[0].direction, lighting, direction)
         seen = lighting_shading.lit_classification(volume, TRANSFER, space, turned)
         line = Line(apart(jnp.zeros(3)), apart(jnp.asarray([0.0, 0.0, 1.0])), (zero, zero))
-        return jnp.sum(shade_pixels(Deferred(turned), seen, space, lambda _: line, rgba, depth) ** 2)
+        return jnp.sum(shaded_pixels(Deferred(turned), seen, space, line, rgba, depth) ** 2)
 
     # one ray ends at the skin's soft edge, lit by a sun from the side; the other sees nothing
     rgba, depth = jnp.asarray([[0.3, 0.2, 0.1, 0.5], [0.0] * 4]), jnp.asarray([0.11, jnp.inf])

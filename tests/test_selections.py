@@ -1,0 +1,283 @@
+"""Modes that select a depth, in both engines and all adjoints: a maximum and an isosurface of one's own."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.engine.scene import Scene
+from jaxvol.engine.tiling import Tiling
+from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
+from jaxvol.render import _render
+
+from .scenes import CAMERAS, anisotropic_noise, around, in_float64, soft_transfer, uniform_transfer
+
+
+class Maximum(jv.Selection):
+    """The sample of the greatest value, as opaque as a layer of this thickness."""
+
+    thickness: float = eqx.field(static=True, default=0.5)
+
+    def begin(self, zero, asked):
+        return zero - jnp.inf, zero + jnp.inf
+
+    def add(self, state, fragment):
+        value, depth = state
+        greater = fragment.valid & ~(fragment.value <= value) & ~jnp.isnan(value)
+        return jnp.where(greater, fragment.value, value), jnp.where(greater, fragment.depth, depth)
+
+    def depth(self, state):
+        return state[1]
+
+    def pixel(self, sight, state):
+        (r, g, b), extinction = sight.shaded(state[1])
+        opacity = 1 - jnp.exp(-extinction * self.thickness)
+        return opacity * jnp.stack([r, g, b, jnp.ones_like(r)]), state[1]
+
+
+class Isosurface(jv.Selection):
+    """Where a ray first crosses a value; the root of the interpolated value, by bisection."""
+
+    value: jax.Array
+
+    def begin(self, zero, asked):
+        # the last depth and whether it lies above the value; and the ends of the first crossing
+        return zero - jnp.inf, zero < 0, zero + jnp.inf, zero + jnp.inf
+
+    def add(self, state, fragment):
+        last, above, near, far = state
+        now = fragment.value >= self.value
+        crosses = fragment.valid & (last >= 0) & (now != above) & (far == jnp.inf)
+        last = jnp.where(fragment.valid, fragment.depth, last)
+        above = jnp.where(fragment.valid, now, above)
+        return last, above, jnp.where(crosses, state[0], near), jnp.where(crosses, fragment.depth, far)
+
+    def settled(self, state):
+        return state[3] < jnp.inf
+
+    def depth(self, state):
+        return state[3]
+
+    def visible(self, transfer, blocks):
+        value = self.value.astype(blocks.low.dtype)
+        return (blocks.low <= value) & (blocks.high >= value)
+
+    def pixel(self, sight, state):
+        _, above, near, far = state  # `above`: behind the crossing
+
+        def halved(_, ends):
+            near, far = ends
+            middle = (near + far) / 2
+            behind = (sight.measured(middle)[0] >= self.value) == above
+            return jnp.where(behind, near, middle), jnp.where(behind, middle, far)
+
+        root = jax.lax.stop_gradient(jax.lax.fori_loop(0, 40, halved, (near, far))[1])
+        # the implicit function theorem: v(s) = value, so that ds = (dvalue - dv) / v'
+        value, slope = jax.jvp(lambda s: sight.measured(s)[0], (root,), (jnp.ones_like(root),))
+        root = root + (self.value - value) / jax.lax.stop_gradient(slope)
+        color, _ = sight.shaded(root)
+        return jnp.stack([*color, jnp.ones_like(root)]), root
+
+
+NOISE = anisotropic_noise()
+TRANSFORMS = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05)
+MODES = {
+    "first visible": jv.FirstVisible(),
+    "maximum": Maximum(),
+    "isosurface": Isosurface(jnp.asarray(0.45)),
+}
+
+
+def reference_image(volume, transfer, camera, march, mode, lighting=None):
+    """rgba and depth of every pixel, ray by ray."""
+    column, row = jnp.meshgrid(*(jnp.arange(n) for n in camera.size))
+    rays = jnp.vectorize(lambda x, y: tuple(part for end in camera.ray(x, y) for part in end))
+    x, y, z, *direction = rays(column, row)
+
+    @jax.jit
+    @jax.vmap
+    @jax.vmap
+    def one(origin, direction, column, row):
+        rendering = jv.render_ray_reference(
+            *(volume, transfer, origin, direction, march),
+            pixel=(column, row),
+            compositing=mode,
+            lighting=lighting,
+        )
+        return rendering.rgba, rendering.depth
+
+    return one(jnp.stack([x, y, z], -1), jnp.stack(direction, -1), column, row)
+
+
+def test_a_maximum_is_that_of_the_samples():
+    """Along rays through the middles of voxels, the samples are the voxels."""
+    data = np.random.default_rng(0).random((9, 6, 7), np.float32)
+    volume, transfer = jv.Volume(data), jv.colormap("gray", (0.0, 1.0), unit_distance=0.5)
+    y, z = np.meshgrid(np.arange(6.0), np.arange(7.0), indexing="ij")
+    origins = np.stack([np.full_like(y, -3.0), y, z], -1)
+    origins[..., 1:] = np.clip(origins[..., 1:], 1e-3, [4.999, 5.999])  # a ray along a face misses it
+    directions = np.broadcast_to([1.0, 0.0, 0.0], origins.shape)
+    rendering = jv.render_rays(volume, transfer, origins, directions, jv.March(1.0), compositing=Maximum())
+    samples = data[:8]  # the exit is no sample
+    _, extinction = jax.vmap(jax.vmap(transfer))(jnp.asarray(samples.max(axis=0)))
+    np.testing.assert_allclose(rendering.rgba[..., 3], 1 - np.exp(-0.5 * extinction), atol=5e-3)
+    np.testing.assert_allclose(rendering.depth, 3 + samples.argmax(axis=0), atol=1e-5)
+    np.testing.assert_array_equal(rendering.samples, 8)
+
+
+def test_an_isosurface_is_where_the_value_is_reached():
+    """A value that falls linearly with the distance from a plane."""
+    x = np.linspace(0.0, 1.0, 11, dtype=np.float32)
+    volume = jv.Volume(np.broadcast_to(x[:, None, None], (11, 5, 5)).copy(), spacing=[0.1] * 3)
+    transfer = jv.colormap("gray", (0.0, 1.0))
+    straight, steep = [1.0, 0.0, 0.0], [0.8, 0.0, 0.6]
+    origins, directions = [[-1.0, 0.2, 0.21]] * 2, [straight, steep]  # the second one misses
+    for value in (0.33, 0.777):
+        found = jv.render_rays(
+            volume, transfer, origins, directions, jv.March(0.07), compositing=Isosurface(jnp.asarray(value))
+        )
+        np.testing.assert_allclose(found.depth, [1 + value, np.inf], rtol=1e-6)
+        color, _ = transfer(jnp.asarray(value))
+        np.testing.assert_allclose(found.rgba, [[*color, 1.0], [0.0] * 4], atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("camera", ["around", pytest.param("inside", marks=pytest.mark.slow)])
+def test_selections_are_those_of_the_reference(mode, camera):
+    """With leaps and without, where samples shift."""
+    camera = CAMERAS[camera](NOISE)
+    plain, leaping = (jv.March(0.11, (*TRANSFORMS, *more)) for more in ((), (jv.SpaceLeaping(),)))
+    rgba, depth = reference_image(NOISE, soft_transfer(), camera, plain, MODES[mode])
+    finite = np.isfinite(depth)
+    assert finite.mean() > 0.1
+    for march in (plain, leaping):
+        found = jv.render(NOISE, soft_transfer(), camera, march, compositing=MODES[mode])
+        np.testing.assert_allclose(found.rgba, rgba, atol=2e-4)
+        np.testing.assert_array_equal(np.isfinite(found.depth), finite)
+        np.testing.assert_allclose(found.depth[finite], depth[finite], rtol=1e-4)
+
+
+def test_rays_shift_where_they_are_transparent_alone():
+    """Here nowhere, although blocks in which the isosurface cannot lie are leapt over."""
+
+    class FirstAbove(Isosurface):
+        """At the sample behind the crossing."""
+
+        def pixel(self, sight, state):
+            return jnp.ones(4), state[3]
+
+    x = np.append(np.zeros(20), np.linspace(0.0, 1.0, 21)).astype(np.float32)
+    volume = jv.Volume(np.broadcast_to(x[:, None, None], (41, 9, 9)).copy(), spacing=[0.1] * 3)
+    y, z = np.meshgrid(np.linspace(0.1, 0.7, 8), np.linspace(0.1, 0.7, 8))
+    origins = np.stack([np.full_like(y, -1.0), y, z], -1)
+    found = jv.render_rays(
+        *(volume, uniform_transfer(1.0), origins, np.broadcast_to([1.0, 0.0, 0.0], origins.shape)),
+        jv.March(0.11, (jv.EmptySpaceJitter(4), jv.SpaceLeaping())),
+        compositing=FirstAbove(jnp.asarray(0.93)),
+    )
+    # the value is reached at x = 3.86, and 36 steps are 3.96
+    np.testing.assert_allclose(found.depth, 1 + 36 * 0.11, rtol=1e-6)
+
+
+def test_a_settled_ray_takes_no_more_samples():
+    """The value 0.33 lies between the fifth sample and the sixth."""
+    x = np.linspace(0.0, 1.0, 11, dtype=np.float32)
+    volume = jv.Volume(np.broadcast_to(x[:, None, None], (11, 5, 5)).copy(), spacing=[0.1] * 3)
+    found = jv.render_rays(
+        *(volume, jv.colormap("gray", (0.0, 1.0)), [[-1.0, 0.2, 0.2]], [[1.0, 0.0, 0.0]], jv.March(0.07)),
+        compositing=Isosurface(jnp.asarray(0.33)),
+    )
+    np.testing.assert_array_equal(found.samples, 6)
+
+
+def test_more_tiles_than_one_show_nothing():
+    camera = around(NOISE, (37, 50))
+    scene = NOISE, soft_transfer(), camera, jv.March(0.11, (jv.SpaceLeaping(),))
+    whole = jv.render(*scene, compositing=Maximum())
+    small = _render(Scene(*scene, Maximum()), "all", "replay", Tiling(tile=6, batch=5))
+    np.testing.assert_array_equal(whole.rgba, small.rgba)
+    np.testing.assert_array_equal(whole.depth, small.depth)
+
+
+def test_a_selected_sample_is_lit():
+    """By the same light in both engines."""
+    lighting = ScattererTemplates(
+        Material(0.8, 0.1, 1.4), DirectionalLight((0.3, -1.0, 0.2)), templates=1, photons=2
+    )
+    camera, march = around(NOISE, (12, 10)), jv.March(0.11)
+    found = jv.render(NOISE, soft_transfer(), camera, march, compositing=jv.FirstVisible(), lighting=lighting)
+    rgba, _ = reference_image(NOISE, soft_transfer(), camera, march, jv.FirstVisible(), lighting)
+    unlit = jv.render(NOISE, soft_transfer(), camera, march, compositing=jv.FirstVisible())
+    assert np.abs(found.rgba - unlit.rgba).max() > 0.1
+    np.testing.assert_allclose(found.rgba, rgba, atol=2e-4)
+
+
+def test_nan_is_passed_on():
+    """From a voxel into the pixels whose rays meet it, and from the transfer function into all."""
+    volume = eqx.tree_at(lambda v: v.data, NOISE, NOISE.data.at[10:14, 10:14, 10:14].set(jnp.nan))
+    camera, march = around(NOISE), jv.March(0.11, (jv.SpaceLeaping(),))
+    hurt = jv.render(volume, soft_transfer(), camera, march, compositing=Maximum())
+    assert 0 < np.isnan(hurt.rgba).any(axis=-1).mean() < 0.3
+    broken = eqx.tree_at(lambda t: t.extinction, soft_transfer(), jnp.full(8, jnp.nan))
+    image = jv.render(NOISE, broken, camera, march, compositing=Maximum())
+    assert np.isnan(image.rgba).all()
+
+
+def leaves(scene):
+    """Voxels, spacing, colours, extinction, camera position, step, and the value of an isosurface."""
+    volume, transfer, camera, march, mode = scene
+    found = volume.data, volume.spacing, transfer.colors, transfer.extinction, camera.position, march.step
+    return (*found, mode.value) if isinstance(mode, Isosurface) else found
+
+
+@pytest.mark.parametrize("mode", ["maximum", "isosurface"])
+@pytest.mark.parametrize(
+    "adjoint", ["replay", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "direct"))]
+)
+def test_gradients_are_central_differences(mode, adjoint):
+    """Of colours and depths, by each leaf alone under replay, and by all of them together."""
+    with in_float64():
+        volume = jv.Volume(np.asarray(NOISE.data, np.float64), NOISE.spacing)
+        march = jv.March(0.11, (jv.AlphaCorrection(), jv.SpaceLeaping()), max_samples=64)
+        shown = Maximum() if mode == "maximum" else Isosurface(jnp.asarray(0.45, jnp.float64))
+        scene = volume, soft_transfer(), around(volume, (9, 8)), march, shown
+        hit = np.isfinite(jv.render(*scene[:4], compositing=shown).depth)
+        assert hit.mean() > 0.2
+        random = np.random.default_rng(3)
+        weights = random.normal(size=(8, 9, 5))
+        ways = tuple(jnp.asarray(random.choice([-1.0, 1.0], leaf.shape)) for leaf in leaves(scene))
+
+        def loss(given, adjoint="replay"):
+            moved = eqx.tree_at(leaves, scene, given)
+            image = jv.render(*moved[:4], compositing=moved[4], adjoint=adjoint)
+            depth = jnp.where(hit, image.depth, 0)
+            return jnp.sum(image.rgba * weights[..., :4]) + jnp.sum(depth * weights[..., 4])
+
+        def difference(part, h=1e-7):
+            ends = [
+                loss(
+                    tuple(
+                        leaf + sign * h * way if k in part else leaf
+                        for k, (leaf, way) in enumerate(zip(leaves(scene), ways, strict=True))
+                    )
+                )
+                for sign in (1, -1)
+            ]
+            return float(ends[0] - ends[1]) / (2 * h)
+
+        everything = range(len(ways))
+        if adjoint == "forward":
+            slope = jax.jvp(lambda given: loss(given, "forward"), (leaves(scene),), (ways,))[1]
+        else:
+            gradient = jax.grad(lambda given: loss(given, adjoint))(leaves(scene))
+            slopes = [float(jnp.vdot(part, way)) for part, way in zip(gradient, ways, strict=True)]
+            slope = sum(slopes)
+            if adjoint == "replay":
+                found = [difference({k}) for k in everything]
+                np.testing.assert_allclose(slopes, found, rtol=1e-5, atol=1e-5)
+                # an isosurface is opaque, and its root is that of any step
+                constant = [k for k in everything if abs(slopes[k]) < 1e-9]
+                assert constant == ([3, 5] if mode == "isosurface" else [])
+        np.testing.assert_allclose(slope, difference(set(everything)), rtol=1e-5)
