@@ -25,8 +25,7 @@ State: TypeAlias = tuple[Progress, tuple[PyTree, PyTree, PyTree]]
 
 
 class CellRange(NamedTuple):
-    """Indices of steps: all visible cells of a ray begin at `first` or later, and end at `until` or
-    earlier."""
+    """Indices of steps: all visible cells of a ray begin at `first` or later, and before `until`."""
 
     first: Int[Array, "*rays"]
     until: Int[Array, "*rays"]
@@ -46,10 +45,10 @@ class VisibleRangeRecorder(SampleVisitor):
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
     ) -> tuple[CellRange, None, None]:
-        begin, end = samples.ahead.ends(at.index)
+        begin = samples.ahead.indices(at.index)
         visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
         first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
-        until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)
+        until = jnp.max(jnp.where(visible, begin + 1, carry.until[None]), axis=0)
         return CellRange(jnp.minimum(carry.first, first), until), None, None
 
 

@@ -50,13 +50,9 @@ class Ahead(NamedTuple):
         """For `jax.vmap` over rays, once it is mapped over cells."""
         return None if self.stride is None else 0
 
-    def ends(self, index: Int[Array, " rays"]) -> tuple[Int[Array, "cells rays"], Int[Array, "cells rays"]]:
-        """At which index of their ray the cells begin and end."""
-        if self.stride is None:
-            begin = index[None] + self.begin[:, None]
-            return begin, begin + 1
-        begin = index[None] + self.begin
-        return begin, begin + self.stride
+    def indices(self, index: Int[Array, " rays"]) -> Int[Array, "cells rays"]:
+        """At which index of their ray the cells begin, for rays at these indices."""
+        return index[None] + (self.begin[:, None] if self.stride is None else self.begin)
 
     def steps(self, cells: Int[Array, " rays"] | int) -> Int[Array, " rays"] | int:
         """Total length, in steps, of each ray's first `cells` cells."""
