@@ -5,16 +5,18 @@ rays.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, Int, PyTree, UInt32
 
 from .._util.sharding import varying
 from .._util.trees import added, floats
 from ..lighting.shading import Surroundings
+from ..march import EmptySpaceIndex
+from ..reference import Pipeline
 from ..rendering import Rendering
 from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
@@ -25,6 +27,7 @@ from .replay import Cotangents, Replay, Total
 from .scene import Scene
 from .shading_gradient import Lit
 from .tiles import RayTiles
+from .tiling import Tiling
 from .wavefront import march_rays
 
 
@@ -54,6 +57,66 @@ def render_vjp(
     return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
 
 
+class _Sums(NamedTuple):
+    """Gradients summed over the tiles so far: of the scene's parts, and of where its rays come from."""
+
+    total: Total
+    source: PyTree
+
+
+class _Image(NamedTuple):
+    """What the tiles of an image share.
+
+    - `pipeline`: without lighting, since samples are shaded by `light`.
+    - `places`: whether volume, camera, rays or march have a gradient.
+    """
+
+    scene: Scene
+    pipeline: Pipeline
+    words: UInt32[Array, " voxels"] | None
+    empty_space: EmptySpaceIndex | None
+    light: Lit | None
+    fault: Bool[Array, ""]
+    tiles: RayTiles
+    tiling: Tiling
+    places: bool
+
+    def pull_tile(
+        self,
+        sums: _Sums,
+        number: Int[Array, ""],
+        range_: CellRange | None,
+        rendering: Rendering,
+        cotangent: Rendering,
+    ) -> _Sums:
+        """The sums with the gradients of one more tile, from its part of the image and of its cotangent."""
+        volume, source, march = self.scene.volume, self.scene.source, self.scene.march
+
+        def made(moving: PyTree) -> Ray:
+            volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
+            space = march_.locate(with_voxels(volume_, volume.data))
+            return invalid(self.tiles.rays(source_, space, number), self.fault)
+
+        rays, pull = eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
+        replay = Replay(
+            *(self.pipeline, self.scene, self.words, rays, Cotangents.of(rays, rendering, cotangent)),
+            *(sums.total, self.light, self.tiling),
+            places=self.places,
+        )
+        beams = Beams(rays, self.tiles.beams, self.tiles.box(source, rays, number), range_)
+        _, (_, of_rays, total) = march_rays(self.pipeline, self.empty_space, beams, self.tiling, None, replay)
+        if not self.places:
+            return _Sums(total, sums.source)
+        if cotangent.details.depth is not None:
+            # depth is measured from the ray's origin, and a sample's from the entry
+            toward = jnp.where(rendering.rgba[..., 3] > 0, cotangent.depth, 0)
+            of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
+        of_volume, of_source, of_march = pull(of_rays)[0]
+        of_parts = added(total.volume, of_volume), added(total.march, of_march)
+        total = eqx.tree_at(lambda t: (t.volume, t.march), total, of_parts)
+        return _Sums(total, added(sums.source, of_source))
+
+
 def _pulled(
     scene: Scene,
     perturbed: Any,
@@ -71,55 +134,24 @@ def _pulled(
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
         index = index.within_ranges()
-    fault = fault_of(scene)
-    _, pipeline = pipeline_of(packed._replace(lighting=None))  # samples are shaded by `light`
+    _, pipeline = pipeline_of(packed._replace(lighting=None))
     light, pull_light = None, None
     if lighting is not None:
         light, pull_light = _light(scene, packed.volume, voxels=of_voxels)
-
-    def tile(
-        sums: tuple[Total, PyTree], given: tuple[Array, CellRange | None, Rendering, Rendering]
-    ) -> tuple[tuple[Total, PyTree], None]:
-        (total, of_source), (number, range_, rendering, cotangent) = sums, given
-
-        def made(moving: PyTree) -> Ray:
-            volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
-            space = march_.locate(with_voxels(volume_, volume.data))
-            return invalid(tiles.rays(source_, space, number), fault)
-
-        moving = floats((without_voxels(volume), source, march))
-        rays, pull = eqx.filter_vjp(made, moving)
-        replay = Replay(
-            pipeline,
-            scene,
-            *(acceleration.words, rays, Cotangents.of(rays, rendering, cotangent), total, light, tiling),
-            places=places,
-        )
-        beams = Beams(rays, tiles.beams, tiles.box(source, rays, number), range_)
-        _, (_, of_rays, total) = march_rays(pipeline, index, beams, tiling, None, replay)
-        if not places:
-            return (total, of_source), None
-        if cotangent.details.depth is not None:
-            # depth is measured from the ray's origin, and a sample's from the entry
-            toward = jnp.where(rendering.rgba[..., 3] > 0, cotangent.depth, 0)
-            of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
-        of_volume, of_rays_source, of_march = pull(of_rays)[0]
-        total = eqx.tree_at(
-            lambda t: (t.volume, t.march),
-            total,
-            (added(total.volume, of_volume), added(total.march, of_march)),
-        )
-        return (total, added(of_source, of_rays_source)), None
-
-    start = (
+    image = _Image(
+        *(scene, pipeline, acceleration.words, index, light, fault_of(scene), tiles, tiling, places)
+    )
+    sums = _Sums(
         Total.zeros(volume, transfer, march, light, voxels=of_voxels),
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
-    image = jax.tree.map(tiles.disassemble, (rendering, cotangent))
-    (total, of_source), _ = jax.lax.scan(
-        tile, varying(start, image), (jnp.arange(tiles.number), ranges, *image)
+    parts = jax.tree.map(tiles.disassemble, (rendering, cotangent))
+    sums, _ = jax.lax.scan(
+        lambda sums, each: (image.pull_tile(sums, *each), None),
+        varying(sums, parts),
+        (jnp.arange(tiles.number), ranges, *parts),
     )
-    return _cotangents(scene, total, of_source, pull_light)
+    return _cotangents(scene, *sums, pull_light)
 
 
 def _cotangents(

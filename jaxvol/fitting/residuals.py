@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .._util.checks import Arrayable, described, finite, finite_array
 from ..camera import Camera
+from ..compositing import Compositing, Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march import March
 from ..render import Adjoint, render
@@ -121,6 +122,7 @@ class ImageResidual(Residual):
     - `views`: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
       `background`, or (height, width, 4), as `Rendering.rgba`.
     - `background`: linear RGB behind the volume, for three-channel images.
+    - `compositing`: as in `render`.
 
     The residual is divided by the square root of the number of its entries, so that the loss, half the
     sum of squares, is half the mean squared error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
@@ -134,17 +136,21 @@ class ImageResidual(Residual):
     scene: Scene
     groups: list[_Group]
     background: Float[Array, "3"]
+    compositing: Compositing
 
     def __init__(
         self,
         scene: Scene | Any,
         views: Sequence[tuple[Camera, Arrayable]] | Any,
         background: Arrayable = (1.0, 1.0, 1.0),
+        *,
+        compositing: Mode | Compositing | Any = "over",
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
         self.scene = cast(Scene, scene)
         self.background = finite_array("background", background, (3,))
+        self.compositing = compositing_of(compositing)
         by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
         for number, view in enumerate(_pairs(views)):
             camera, image = _view(number, *view)
@@ -183,7 +189,11 @@ class ImageResidual(Residual):
             if pieces > 1:
                 camera = _rows_of(camera, first, rows)
             rendering = render(
-                volume, transfer, camera, march, lighting=lighting, outputs="rgba", adjoint=adjoint
+                *(volume, transfer, camera, march),
+                compositing=self.compositing,
+                lighting=lighting,
+                outputs="rgba",
+                adjoint=adjoint,
             )
             rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)

@@ -105,6 +105,31 @@ def test_a_transfer_function_is_recovered_from_grey_and_held_out_views_agree(fou
     assert found.loss < 1e-8 < 1e-3 < found.losses[0]
 
 
+@pytest.mark.slow
+def test_colours_are_recovered_from_the_first_visible_samples():
+    """Extinctions, which do not show, are fixed."""
+
+    def shown(transfer, view):
+        return jv.render(*seen(transfer, view), compositing=jv.FirstVisible()).image()
+
+    views = [(view, shown(TRUTH, view)) for view, _ in VIEWS]
+    residual = jv.ImageResidual(seen, views, compositing=jv.FirstVisible())
+    start = eqx.tree_at(lambda t: t.colors, TRUTH, jnp.full_like(TRUTH.colors, 0.5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # colours of invisible points do not show either
+        found = jv.fit(residual, start, where=lambda t: t.colors, max_steps=20)
+    assert found.loss < 1e-6 * found.losses[0]
+
+
+def test_a_residual_is_composited_as_it_was_told():
+    (view, _), how = VIEWS[0], jv.FirstVisible()
+    target = jv.render(*seen(TRUTH, view), compositing=how).image()
+    (tiles,) = jv.ImageResidual(seen, [(view, target)], compositing=how).tiles(10**6)
+    residual = tiles.of(TRUTH, jax.tree.map(lambda leaf: leaf[0], tiles.items), "forward")
+    np.testing.assert_allclose(residual, 0, atol=1e-7)
+    assert float(jnp.abs(target - image(TRUTH, view)).max()) > 0.1
+
+
 def test_the_loss_is_half_the_mean_square_error(found):
     errors = [image(GREY, view) - target for view, target in VIEWS]
     assert found.losses[0] == pytest.approx(float(np.mean(np.square(errors))) / 2, rel=1e-4)
