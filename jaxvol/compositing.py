@@ -6,7 +6,7 @@ compares the samples of a ray and chooses one depth, at which the pixel is then 
 """
 
 from abc import abstractmethod
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
 
 import equinox as eqx
 import jax
@@ -50,9 +50,9 @@ class Compositing(eqx.Module, Generic[State]):
     """
 
     @abstractmethod
-    def begin(self, zero: Scalar, asked: Outputs | None) -> State:
-        """The state before the first fragment. `zero`: of the shape and type of a ray's numbers. `asked`: the
-        outputs that are computed; None for the opacity alone."""
+    def begin(self, zero: Scalar, outputs: Outputs | None) -> State:
+        """The state before the first fragment. `zero`: of the shape and type of a ray's numbers. `outputs`:
+        what is computed; None for the opacity alone."""
 
     @abstractmethod
     def add(self, state: State, fragment: Fragment) -> State:
@@ -60,7 +60,7 @@ class Compositing(eqx.Module, Generic[State]):
 
     @abstractmethod
     def end(self, state: State) -> tuple[Float[Array, "4"], Scalar | None]:
-        """Premultiplied colour and opacity; and the depth past the entry, if it was asked for: infinite where
+        """Premultiplied colour and opacity; and the depth past the entry, if it is computed: infinite where
         nothing is visible."""
 
     @abstractmethod
@@ -71,7 +71,7 @@ class Compositing(eqx.Module, Generic[State]):
         """Whether what follows cannot change the pixel, so that the ray is finished."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
-    def visible(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """Which blocks of a volume may change a pixel. Rays leap over the others."""
         return transfer.visible(blocks)
 
@@ -113,7 +113,8 @@ class Composite(eqx.Module):
 
 
 class Weighting(Compositing[Composite]):
-    """A mode that gives each cell a weight. The pixel is Σ w c, its opacity Σ w.
+    """A mode that gives each cell a weight. The pixel is Σ w c, its opacity Σ w. Subclasses override
+    `weight`, `slope` and `transmittance` alone.
 
     Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. A cell here is a piece
     of one where transforms divide cells. `weight`, `slope` and `transmittance` work elementwise, on the
@@ -141,13 +142,16 @@ class Weighting(Compositing[Composite]):
         """By default 1: what is in front hides nothing."""
         return jnp.ones_like(state.opacity)
 
-    def begin(self, zero: Scalar, asked: Outputs | None) -> Composite:
-        moment = zero if asked in ("all", "depth") else None
-        return Composite(zero, None if asked is None else (zero, zero, zero), moment)
+    @final
+    def begin(self, zero: Scalar, outputs: Outputs | None) -> Composite:
+        moment = zero if outputs in ("all", "depth") else None
+        return Composite(zero, None if outputs is None else (zero, zero, zero), moment)
 
+    @final
     def add(self, state: Composite, fragment: Fragment) -> Composite:
         return state.add(self.weight(fragment.alpha, state.opacity), fragment.color, fragment.depth)
 
+    @final
     def end(self, state: Composite) -> tuple[Float[Array, "4"], Scalar | None]:
         return state.rgba(), None if state.moment is None else state.mean_depth()
 
@@ -181,20 +185,20 @@ class Over(Weighting):
         return 1 - state.opacity
 
 
-class Sight(NamedTuple):
-    """A ray, and how places along it are measured, classified and shaded. Depths are past the entry.
+class RaySampler(NamedTuple):
+    """Measures, classifies and shades what is on a ray. Depths are past the entry.
 
-    `rate`: by which depths are multiplied. It is 1, and has a gradient where depths count steps of a march.
+    `depth_scale`: a factor for depths. It is 1; where depths are numbers of steps, its derivative is that of
+    the step.
     """
 
     ray: Ray
     classification: Classification
-    rate: Scalar | int = 1
+    depth_scale: Scalar | int = 1
 
     def measured(self, depth: Scalar) -> Measured:
         """The measured values at this depth, the volume's value first."""
-        coordinate = self.ray.path(depth * self.rate)
-        return self.classification.searched(self.classification.measure(coordinate))
+        return self.classification.at(self.ray.path(depth * self.depth_scale))
 
     def color(self, depth: Scalar, measured: Measured, transmittance: Scalar) -> Vec3:
         """The colour of these measured values, shaded where there is a lighting. `transmittance`: between
@@ -203,7 +207,7 @@ class Sight(NamedTuple):
         if self.classification.light is None:
             return color
         ray = self.ray
-        point = along(ray.entry, ray.direction, depth * self.rate)
+        point = along(ray.entry, ray.direction, depth * self.depth_scale)
         return self.classification.light(
             Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
         )
@@ -220,8 +224,10 @@ class Selection(Compositing[State]):
     there, once for each ray, after the march.
 
     Gradients are those of `pixel`. What the march found is constant to them: the depths in its state stay the
-    same number of steps behind the entry, while the ray, the step and what the ray meets change. A pixel
-    jumps where the choice does. Parameters may have gradients, through `pixel`.
+    same number of steps past the entry, while the ray, the step and what the ray meets change. They miss that
+    a pixel jumps where the choice does, and how the sample of a cell that is cut at a face moves with that
+    face. Parameters may have gradients, through `pixel`. The gradient of voxels takes an array of their size
+    for each fetch of `pixel`, for each chunk of 2048 pixels: slow for large volumes.
     """
 
     @abstractmethod
@@ -229,7 +235,7 @@ class Selection(Compositing[State]):
         """The depth that is chosen, past the entry; infinite as long as there is none."""
 
     @abstractmethod
-    def pixel(self, sight: Sight, state: State) -> tuple[Float[Array, "4"], Scalar]:
+    def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
         """Premultiplied colour and opacity, and the depth past the entry that is reported, of a ray for which
         a depth was chosen. It is differentiated by JAX."""
 
@@ -242,7 +248,7 @@ class Selection(Compositing[State]):
         """1: what is in front hides nothing."""
         return jnp.ones_like(self.depth(state))
 
-    def visible(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """By default all blocks: what is transparent may still be chosen."""
         return jnp.ones(blocks.low.shape, bool)
 
@@ -250,11 +256,11 @@ class Selection(Compositing[State]):
 class FirstVisible(Selection[Scalar]):
     """The first sample of positive opacity, shown opaque."""
 
-    def begin(self, zero: Scalar, asked: Outputs | None) -> Scalar:
+    def begin(self, zero: Scalar, outputs: Outputs | None) -> Scalar:
         return jnp.full_like(zero, jnp.inf)
 
     def add(self, state: Scalar, fragment: Fragment) -> Scalar:
-        return jnp.where((state == jnp.inf) & (fragment.alpha > 0), fragment.depth, state)
+        return jnp.where((state == jnp.inf) & ~(fragment.alpha <= 0), fragment.depth, state)
 
     def depth(self, state: Scalar) -> Scalar:
         return state
@@ -262,18 +268,18 @@ class FirstVisible(Selection[Scalar]):
     def settled(self, state: Scalar) -> Bool[Array, ""]:
         return state < jnp.inf
 
-    def visible(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         return transfer.visible(blocks)
 
-    def pixel(self, sight: Sight, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
-        color, _ = sight.shaded(state)
+    def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
+        color, _ = sampler.shaded(state)
         return jnp.stack([*color, jnp.ones_like(state)]), state
 
 
 Mode: TypeAlias = Literal["over"]
-"""Names of modes."""
+"""The keys of `MODES`."""
 
-MODES: dict[Mode, type[Compositing]] = {"over": Over}
+MODES: dict[str, type[Compositing[Any]]] = {"over": Over}
 
 
 def compositing_of(given: Mode | Any) -> Compositing:
@@ -288,8 +294,8 @@ def compositing_of(given: Mode | Any) -> Compositing:
                 f"{described(given)} has others."
             )
         return given
-    if isinstance(given, str) and given in get_args(Mode):
-        return MODES[cast(Mode, given)]()
+    if isinstance(given, str) and given in MODES:
+        return MODES[given]()
     names = " or ".join(f'"{name}"' for name in MODES)
     raise ValueError(
         f"compositing must be {names}, or a jaxvol Weighting or Selection; got {described(given)}."

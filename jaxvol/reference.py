@@ -17,7 +17,7 @@ from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, apart
 from .arguments import check_arguments
-from .compositing import Compositing, Fragment, Mode, Outputs, Selection, Sight, compositing_of
+from .compositing import Compositing, Fragment, Mode, Outputs, RaySampler, Selection, compositing_of
 from .lighting.shading import Lighting, lit_classification
 from .march import Cell, March
 from .rendering import Details, Rendering
@@ -91,7 +91,7 @@ def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] |
 
 def measure(pipeline: Pipeline, ray: Ray, piece: Cell) -> Measured:
     """The measured values at a piece's sample, and what the transfer function's search finds for them."""
-    return Sight(ray, pipeline.classification).measured(pipeline.march.sample(piece))
+    return RaySampler(ray, pipeline.classification).measured(pipeline.march.sample(piece))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
@@ -159,14 +159,14 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
 def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, _, classification, compositing = pipeline
-    stride, sight = march.stride(ray, front(march, at), at.index), Sight(ray, classification)
+    stride, sampler = march.stride(ray, front(march, at), at.index), RaySampler(ray, classification)
     after, alphas, color = at, [], None
     for piece in pieces(pipeline, ray, front(march, at), stride):
         measured = measure(pipeline, ray, piece)
         alphas.append(opacity(pipeline, ray, piece, measured))
         if not isinstance(compositing, Selection):
             transmittance = compositing.transmittance(after.composite)
-            color = sight.color(march.sample(piece), measured, transmittance)
+            color = sampler.color(march.sample(piece), measured, transmittance)
         after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1])
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     after = move(march, ray, stop(pipeline, after), transparent, stride)
@@ -177,7 +177,7 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
 
 def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
     """The rendering of a ray, with the outputs that it was begun with. A `Selection` leaves the pixel to
-    `finish`."""
+    `resolve`."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
     rgba, depth = pipeline.compositing.end(at.composite)
     # a product, since the derivative of a `where` would be 0
@@ -191,12 +191,12 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
     return Rendering(rgba, ~at.finished, details)
 
 
-def finishes(compositing: Compositing, lighting: Lighting | None) -> bool:
-    """Whether pixels are computed after the march, by `finish`. Rays are then marched without light."""
+def resolves(compositing: Compositing, lighting: Lighting | None) -> bool:
+    """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
     return isinstance(compositing, Selection) or (lighting is not None and lighting.shades_pixels)
 
 
-def finish(
+def resolve(
     pipeline: Pipeline,
     lighting: Lighting | None,
     space: Space,
@@ -212,10 +212,10 @@ def finish(
         assert lighting is not None
         return lighting.shade_pixel(classification, space, line, rgba, depth), depth
     ray = enter(space, *line)
-    rate = march.step / jax.lax.stop_gradient(march.step)
-    pixel, depth = compositing.pixel(Sight(ray, classification, rate), jax.lax.stop_gradient(selected))
+    scale = march.step / jax.lax.stop_gradient(march.step)
+    pixel, depth = compositing.pixel(RaySampler(ray, classification, scale), jax.lax.stop_gradient(selected))
     valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
-    return pixel * valid, ray.t_in + depth * rate
+    return pixel * valid, ray.t_in + depth * scale
 
 
 def render_ray_reference(
@@ -256,7 +256,7 @@ def render_ray_reference(
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
     lit = lit_classification(volume, transfer, space, lighting)
-    later = finishes(mode, lighting)
+    later = resolves(mode, lighting)
     pipeline = Pipeline(march, volume, lit._replace(light=None) if later else lit, mode)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
@@ -272,7 +272,8 @@ def render_ray_reference(
     given = jax.tree.map(
         lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), (rendering.depth, details.selected)
     )
-    rgba, depth = finish(pipeline._replace(classification=lit), lighting, space, line, rendering.rgba, *given)
+    pipeline = pipeline._replace(classification=lit)
+    rgba, depth = resolve(pipeline, lighting, space, line, rendering.rgba, *given)
     rgba, depth = jnp.where(visible, rgba, 0), jnp.where(visible, depth, jnp.inf)
     return replace(rendering, rgba=rgba, details=details._replace(depth=depth, selected=None))
 

@@ -22,7 +22,7 @@ from .engine.tiles import OwnRays
 from .engine.tiling import Tiling
 from .lighting.shading import Lighting
 from .march import March
-from .reference import finishes
+from .reference import resolves
 from .rendering import Details, Rendering
 from .transfer import Transfer
 from .volume import Volume
@@ -143,12 +143,12 @@ def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = No
     options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
     acceleration = VolumeAcceleration.of(volume, march)
     scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
-    if finishes(scene.compositing, lighting):
-        return _finished(scene, options, how, acceleration)
+    if resolves(scene.compositing, lighting):
+        return _resolved(scene, options, how, acceleration)
     return how.render(scene, options, acceleration)
 
 
-def _finished(
+def _resolved(
     scene: Scene, options: RenderOptions, how: AbstractAdjoint, acceleration: VolumeAcceleration
 ) -> Rendering:
     """The rays are marched without light, and pixels computed from what that found."""
@@ -158,7 +158,7 @@ def _finished(
         unlit = jax.lax.stop_gradient(unlit)
     rendering = how.render(unlit, options, acceleration)
     details = rendering.details
-    pixels = how.finish(scene, acceleration, (rendering.rgba, rendering.depth, details.selected))
+    pixels = how.resolve(scene, options, acceleration, (rendering.rgba, rendering.depth, details.selected))
     details = details._replace(depth=pixels[..., 4], selected=None) if all_ else Details()
     return Rendering(pixels[..., :4], rendering.exhausted, details)
 

@@ -13,8 +13,8 @@ from ._util.checks import finite, is_traced
 class Details(NamedTuple):
     """Outputs that cost time, each None where it was not asked for. See `Rendering`.
 
-    `selected`: the state of a `Selection` behind the march, which `reference.finish` makes pixels from; not
-    part of a finished image.
+    `selected`: the state of a `Selection` after the march, which `reference.resolve` makes pixels from; None
+    in an image.
     """
 
     depth: Float[Array, "*rays"] | None = None

@@ -51,6 +51,10 @@ class Classification(NamedTuple):
     light: Callable[[Any], Vec3] | None = None
     """From a `lighting.shading.Sample` to its shaded colour. None: colours are as classified."""
 
+    def at(self, coordinate: Vec3) -> Measured:
+        """What `classify` needs at a grid coordinate."""
+        return self.searched(self.measure(coordinate))
+
     def searched(self, measured: Measured) -> Measured:
         """The measured values, followed by what `search` finds for them."""
         return measured if self.search is None else (*measured, *self.search(measured))

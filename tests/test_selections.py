@@ -20,7 +20,7 @@ class Maximum(jv.Selection):
 
     thickness: float = eqx.field(static=True, default=0.5)
 
-    def begin(self, zero, asked):
+    def begin(self, zero, outputs):
         return zero - jnp.inf, zero + jnp.inf
 
     def add(self, state, fragment):
@@ -31,8 +31,8 @@ class Maximum(jv.Selection):
     def depth(self, state):
         return state[1]
 
-    def pixel(self, sight, state):
-        (r, g, b), extinction = sight.shaded(state[1])
+    def pixel(self, sampler, state):
+        (r, g, b), extinction = sampler.shaded(state[1])
         opacity = 1 - jnp.exp(-extinction * self.thickness)
         return opacity * jnp.stack([r, g, b, jnp.ones_like(r)]), state[1]
 
@@ -42,7 +42,7 @@ class Isosurface(jv.Selection):
 
     value: jax.Array
 
-    def begin(self, zero, asked):
+    def begin(self, zero, outputs):
         # the last depth and whether it lies above the value; and the ends of the first crossing
         return zero - jnp.inf, zero < 0, zero + jnp.inf, zero + jnp.inf
 
@@ -60,24 +60,24 @@ class Isosurface(jv.Selection):
     def depth(self, state):
         return state[3]
 
-    def visible(self, transfer, blocks):
+    def occupied(self, transfer, blocks):
         value = self.value.astype(blocks.low.dtype)
         return (blocks.low <= value) & (blocks.high >= value)
 
-    def pixel(self, sight, state):
+    def pixel(self, sampler, state):
         _, above, near, far = state  # `above`: behind the crossing
 
         def halved(_, ends):
             near, far = ends
             middle = (near + far) / 2
-            behind = (sight.measured(middle)[0] >= self.value) == above
+            behind = (sampler.measured(middle)[0] >= self.value) == above
             return jnp.where(behind, near, middle), jnp.where(behind, middle, far)
 
         root = jax.lax.stop_gradient(jax.lax.fori_loop(0, 40, halved, (near, far))[1])
         # the implicit function theorem: v(s) = value, so that ds = (dvalue - dv) / v'
-        value, slope = jax.jvp(lambda s: sight.measured(s)[0], (root,), (jnp.ones_like(root),))
+        value, slope = jax.jvp(lambda s: sampler.measured(s)[0], (root,), (jnp.ones_like(root),))
         root = root + (self.value - value) / jax.lax.stop_gradient(slope)
-        color, _ = sight.shaded(root)
+        color, _ = sampler.shaded(root)
         return jnp.stack([*color, jnp.ones_like(root)]), root
 
 
@@ -165,7 +165,7 @@ def test_rays_shift_where_they_are_transparent_alone():
     class FirstAbove(Isosurface):
         """At the sample behind the crossing."""
 
-        def pixel(self, sight, state):
+        def pixel(self, sampler, state):
             return jnp.ones(4), state[3]
 
     x = np.append(np.zeros(20), np.linspace(0.0, 1.0, 21)).astype(np.float32)
@@ -214,15 +214,73 @@ def test_a_selected_sample_is_lit():
     np.testing.assert_allclose(found.rgba, rgba, atol=2e-4)
 
 
-def test_nan_is_passed_on():
-    """From a voxel into the pixels whose rays meet it, and from the transfer function into all."""
+@pytest.mark.parametrize("mode", ["first visible", "maximum"])
+def test_nan_is_passed_on(mode):
+    """From voxels into the pixels whose rays meet them, and from the transfer function into all."""
     volume = eqx.tree_at(lambda v: v.data, NOISE, NOISE.data.at[10:14, 10:14, 10:14].set(jnp.nan))
     camera, march = around(NOISE), jv.March(0.11, (jv.SpaceLeaping(),))
-    hurt = jv.render(volume, soft_transfer(), camera, march, compositing=Maximum())
+    hidden = jv.TransferFunction.from_points([(0.0, (1, 1, 1), 0.0), (1.0, (1, 1, 1), 0.0)])
+    hurt = jv.render(volume, hidden, camera, march, compositing=MODES[mode])
     assert 0 < np.isnan(hurt.rgba).any(axis=-1).mean() < 0.3
-    broken = eqx.tree_at(lambda t: t.extinction, soft_transfer(), jnp.full(8, jnp.nan))
-    image = jv.render(NOISE, broken, camera, march, compositing=Maximum())
+    broken = eqx.tree_at(lambda t: t.extinction, hidden, jnp.full(2, jnp.nan))
+    image = jv.render(NOISE, broken, camera, march, compositing=MODES[mode])
     assert np.isnan(image.rgba).all()
+
+
+def test_a_face_between_labels_is_seen_from_the_side_of_its_cell():
+    """Cells begin at faces between labels; the pixel is of the label that the march found there."""
+    labels = np.random.default_rng(2).integers(0, 3, NOISE.shape)
+    volume = jv.Volume(NOISE.data, NOISE.spacing, NOISE.origin, labels=labels)
+    colors = np.eye(3)
+    transfer = jv.LabelTransferFunction(
+        {0: uniform_transfer(0.0), 1: uniform_transfer(9.0, colors[1]), 2: uniform_transfer(9.0, colors[2])}
+    )
+    march = jv.March(0.11, (jv.AlphaCorrection(labels=True),))
+    camera = around(volume, (40, 40))
+    found = jv.render(volume, transfer, camera, march, compositing=jv.FirstVisible())
+    expected, _ = reference_image(volume, transfer, camera, march, jv.FirstVisible())
+    assert np.mean(np.abs(found.rgba - expected).max(axis=-1) > 1e-3) < 2e-3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_image_of_nothing_has_the_gradient_0(mode):
+    camera = jv.Camera.looking_at(NOISE, size=(12, 10))
+    away = eqx.tree_at(lambda c: c.focal_point, camera, 2 * camera.position - camera.focal_point)
+
+    def loss(scene):
+        camera, march, volume = scene
+        return jnp.sum(jv.render(volume, soft_transfer(), camera, march, compositing=MODES[mode]).rgba)
+
+    gradient = eqx.filter_grad(loss)((away, jv.March(0.11), NOISE))
+    for leaf in jax.tree.leaves(gradient):
+        np.testing.assert_array_equal(leaf, 0)
+
+
+def test_no_rays_make_no_pixels():
+    none = np.zeros((0, 3))
+    found = jv.render_rays(NOISE, soft_transfer(), none, none, jv.March(0.11), compositing=Maximum())
+    assert found.rgba.shape == (0, 4)
+
+
+def test_a_selection_names_the_wrong_mode_of_differentiation():
+    camera, march = around(NOISE, (9, 8)), jv.March(0.11, max_samples=8)
+
+    def total(colors, adjoint):
+        transfer = eqx.tree_at(lambda t: t.colors, soft_transfer(), colors)
+        image = jv.render(NOISE, transfer, camera, march, compositing=Maximum(), adjoint=adjoint)
+        return jnp.sum(image.rgba)
+
+    colors = soft_transfer().colors
+    with pytest.raises(ValueError, match='adjoint="forward"'):
+        jax.jvp(lambda c: total(c, "replay"), (colors,), (colors,))
+    with pytest.raises(ValueError, match='adjoint="replay"'):
+        jax.grad(lambda c: total(c, "forward"))(colors)
+
+
+def test_first_hits_are_refused_where_something_else_is_selected():
+    march = jv.March(0.11, (jv.SpaceLeaping("min_distance"),))
+    with pytest.raises(ValueError, match="Maximum may select"):
+        jv.render(NOISE, soft_transfer(), around(NOISE), march, compositing=Maximum())
 
 
 def leaves(scene):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from ..compositing import FirstVisible
+from ..compositing import FirstVisible, Selection
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
@@ -43,7 +43,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
     if blocks is None:
         return None
     space = march.locate(volume)
-    visible = compositing.visible(transfer, blocks) | blocks.unordered
+    visible = compositing.occupied(transfer, blocks) | blocks.unordered
     if march.may_shift:  # what is leapt over is taken as transparent
         visible |= transfer.visible(blocks)
     occupancy = space.occupancy(visible)
@@ -51,6 +51,12 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         return march.empty_space(occupancy, None)
 
     def first_hit(index: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
+        if isinstance(compositing, Selection) and not isinstance(compositing, FirstVisible):
+            name = type(compositing).__name__
+            raise ValueError(
+                f'SpaceLeaping("min_distance") starts rays at what is visible first; {name} may select what '
+                "lies before. Use another method."
+            )
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
         through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
         own = OwnRays(*(jnp.stack(part, axis=-1) for part in (through.origin, through.direction)))

@@ -20,13 +20,13 @@ from ..volume import Volume
 from .acceleration import VolumeAcceleration
 from .gradients import render_vjp
 from .image import RenderOptions, march_image, scan_image
-from .pixels import Found, finish_image
+from .resolve import Found, resolve_image
 from .scene import Scene
 
 
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
 
-WRONG_WAY = {
+WRONG_MODE = {
     "replay": 'adjoint="replay" is for reverse mode (jax.grad, jax.vjp). For forward mode (jax.jvp, '
     'jax.jacfwd) pass adjoint="forward"; for both, and for higher derivatives, adjoint="direct".',
     "forward": 'adjoint="forward" is for forward mode (jax.jvp, jax.jacfwd). For reverse mode (jax.grad, '
@@ -41,9 +41,11 @@ class AbstractAdjoint(eqx.Module):
     def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
         """The image."""
 
-    def finish(self, scene: Scene, acceleration: VolumeAcceleration, found: Found) -> Array:
+    def resolve(
+        self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
+    ) -> Array:
         """Pixels and their depths (*rays, 5), where they are computed after the march."""
-        return _finish(scene, acceleration, found)
+        return _resolve(scene, options, acceleration, found)
 
 
 class ReplayAdjoint(AbstractAdjoint):
@@ -52,23 +54,29 @@ class ReplayAdjoint(AbstractAdjoint):
     def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
         if not is_traced(scene):  # going through a custom rule takes milliseconds
             return _march_in_turn(scene, options, acceleration)
-        kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
-        if any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds):
-            raise ValueError(WRONG_WAY["replay"])  # JAX's own error names neither argument nor remedy
+        kinds = _checked_for_forward_mode(scene)
         # inside `jax.shard_map`, JAX has custom rules only under `jax.jit`
         sharded = any("ShardMapTracer" in kind for kind in kinds)
         image = _replayed_in_shard if sharded else _replayed
         return image(scene, options, jax.lax.stop_gradient(acceleration))
 
-    def finish(self, scene: Scene, acceleration: VolumeAcceleration, found: Found) -> Array:
-        return _finish_again(scene, acceleration, found)
+    def resolve(
+        self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
+    ) -> Array:
+        _checked_for_forward_mode(scene)
+        return _resolve_again(scene, options, acceleration, found)
 
 
 class ForwardAdjoint(AbstractAdjoint):
     """Forward mode, by JAX, through the fast engine."""
 
     def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
-        return forward_only(_march(scene, options, acceleration), WRONG_WAY["forward"])
+        return forward_only(_march(scene, options, acceleration), WRONG_MODE["forward"])
+
+    def resolve(
+        self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
+    ) -> Array:
+        return forward_only(super().resolve(scene, options, acceleration, found), WRONG_MODE["forward"])
 
 
 class DirectAdjoint(AbstractAdjoint):
@@ -78,6 +86,15 @@ class DirectAdjoint(AbstractAdjoint):
 
     def render(self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
         return _scan(scene, options, acceleration, self.length)
+
+
+def _checked_for_forward_mode(scene: Scene) -> list[list[str]]:
+    """The transformations of JAX that each leaf of the scene undergoes. Raises where one is forward mode:
+    JAX's own error names neither argument nor remedy."""
+    kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
+    if any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds):
+        raise ValueError(WRONG_MODE["replay"])
+    return kinds
 
 
 def adjoint_of(name: Adjoint, volume: Volume, march: March) -> AbstractAdjoint:
@@ -103,8 +120,8 @@ _march_in_turn = compiled(_image)
 _march_recorded = compiled(partial(march_image, record=True))
 _render_vjp = compiled(render_vjp)
 _scan = compiled(scan_image, has_jvp=True)
-_finish = compiled(finish_image, has_jvp=True)
-_finish_again = recomputed(finish_image)
+_resolve = compiled(resolve_image, has_jvp=True)
+_resolve_again = recomputed(resolve_image)
 
 
 @eqx.filter_custom_vjp

@@ -172,11 +172,7 @@ class _OwnRayTiles(RayTiles):
         return padded.reshape(self.number, groups, self.tiling.group, *rest)
 
 
-def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
-    """The ray of an index into the flattened image."""
-    if isinstance(source, Camera):
-        width = source.size[0]
-        return _of_pixel(source, place % width, place // width)
+def _own_line(source: OwnRays, place: Int[Array, ""]) -> Line:
     (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[place] for rays in (source.origins, source.directions))
     return Line((x, y, z), (dx, dy, dz), source.pixel(place))
 
@@ -184,6 +180,14 @@ def line(source: Camera | OwnRays, place: Int[Array, ""]) -> Line:
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
     left, top = (first.astype(column.dtype) for first in source.first_pixel)
     return Line(*source.ray(column, row), (column + left, row + top))
+
+
+def lines_at(source: Camera | OwnRays, places: Int[Array, " rays"]) -> Line:
+    """The rays of indices into the flattened image, as the march rounds them."""
+    if not isinstance(source, Camera):
+        return jax.vmap(partial(_own_line, source))(places)
+    rows, columns = jnp.divmod(places, source.size[0])
+    return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None]))
 
 
 @jax.custom_jvp

@@ -117,7 +117,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
             i.astype(around.volume.spacing.dtype) * ((n - 1) / (m - 1))
             for i, n, m in zip(places, around.volume.shape, (nx, ny, nz), strict=True)
         )
-        measured = classification.searched(classification.measure((x, y, z)))
+        measured = classification.at((x, y, z))
         color, extinction = classification.classify(measured)
         zero, one = jnp.zeros_like(extinction), jnp.ones_like(extinction)
         column = row = jnp.zeros((), jnp.int32)

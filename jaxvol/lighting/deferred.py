@@ -68,7 +68,7 @@ class Deferred(Lighting):
         visible = opacity != 0  # NaN stays NaN
         red, green, blue = (rgba[i] / jnp.where(visible, opacity, 1) for i in range(3))
         point = along(line.origin, line.direction, jnp.where(visible, depth, 0))
-        measured = classification.searched(classification.measure(space.coordinate(point)))
+        measured = classification.at(space.coordinate(point))
         _, extinction = classification.classify(measured)
         one = jnp.ones_like(opacity)
         sample = Sample(point, line.direction, measured, (red, green, blue), extinction, one, line.pixel)

@@ -86,11 +86,7 @@ class Surroundings(eqx.Module):
             jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
-
-        def measured(coordinate: Vec3) -> Measured:
-            return classification.searched(classification.measure(coordinate))
-
-        return x * y * z, coordinate, self._in_memory(measured, coordinate)
+        return x * y * z, coordinate, self._in_memory(classification.at, coordinate)
 
     def _in_memory(self, f: Callable[[Any], Any], argument: Any) -> Any:
         return f(argument) if self.live is None else in_memory(self.live, f, argument)

@@ -13,7 +13,7 @@ import jaxvol as jv
 from jaxvol import compositing
 from jaxvol._util.vec3 import apart
 from jaxvol.engine import shading as engine_shading
-from jaxvol.engine.pixels import of_visible
+from jaxvol.engine.resolve import of_visible
 from jaxvol.lighting import (
     ConstantLight,
     Deferred,
@@ -55,10 +55,13 @@ def sample_at(around, point, pixel, transmittance):
 def shaded_pixels(lighting, classification, space, line, rgba, depth):
     """Pixels as shaded by a lighting that shades pixels."""
 
-    def one(place, rgba, depth, selected):
+    def one(rgba, depth):
         return jnp.append(lighting.shade_pixel(classification, space, line, rgba, depth), depth)
 
-    return of_visible(one, (rgba, depth, None))[:, :4]
+    def some(places, rgba, depth, selected):
+        return jax.vmap(one)(rgba, depth)
+
+    return of_visible(some, 2048, (rgba, depth, None))[:, :4]
 
 
 @eqx.filter_jit

@@ -1,0 +1,71 @@
+"""Computes pixels after the march, by chunks of those that are not transparent.
+
+For modes that select a depth, and for lightings that shade pixels: `reference.resolve` says what of each.
+"""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._util.compaction import in_front
+from .._util.vec3 import Scalar
+from ..reference import resolve
+from ..space import Line
+from .acceleration import VolumeAcceleration
+from .image import RenderOptions, fault_of, pipeline_of
+from .scene import Scene
+from .tiles import lines_at
+
+
+Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]
+"""What a march found, of rays: `Rendering.rgba`, `Rendering.depth` and `Details.selected`."""
+
+
+def resolve_image(
+    scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
+) -> Float[Array, "*rays 5"]:
+    """Pixels and their depths, from what the march found."""
+    scene = acceleration.packed(scene)
+    space, pipeline = pipeline_of(scene)
+
+    def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, "5"]:
+        rgba, depth = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)
+        return jnp.concatenate([rgba, depth[None]])
+
+    def some(places: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk 5"]:
+        return jax.vmap(one)(lines_at(scene.source, places), *found)
+
+    resolved = of_visible(some, options.tiling.chunk, found)
+    return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
+
+
+def of_visible(
+    some: Callable[..., Float[Array, "chunk 5"]], size: int, found: Found
+) -> Float[Array, "*rays 5"]:
+    """`some` of the indices of pixels, and of what was found of them, for all that are not transparent, so
+    many at a time; the others stay transparent, and infinitely far."""
+    shape = found[1].shape
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
+    visible = flat[0][:, 3] != 0
+    nothing = jnp.zeros((visible.size, 5), flat[0].dtype).at[:, 4].set(jnp.inf)
+    if visible.size == 0:
+        return nothing.reshape(*shape, 5)
+    # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
+    flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
+    place, count = in_front(visible, size), jnp.sum(visible, dtype=jnp.int32)
+
+    # recomputed in the backward pass, where its states would take memory for all rays
+    @jax.checkpoint
+    def computed(places: Int[Array, " chunk"]) -> Float[Array, "chunk 5"]:
+        places = jnp.minimum(places, visible.size - 1)
+        return some(places, *jax.tree.map(lambda leaf: leaf[places], flat))
+
+    def chunk(start: Int[Array, ""]) -> Float[Array, "chunk 5"]:
+        places = jax.lax.dynamic_slice_in_dim(place, start, size)
+        return jax.lax.cond(start < count, computed, lambda _: jnp.zeros((size, 5), nothing.dtype), places)
+
+    pixels = jax.lax.map(chunk, jnp.arange(0, place.size, size, dtype=jnp.int32)).reshape(-1, 5)
+    return nothing.at[place].set(pixels, mode="drop").reshape(*shape, 5)
