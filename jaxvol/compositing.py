@@ -30,10 +30,10 @@ Outputs: TypeAlias = Literal["all", "depth", "rgba"]
 class Fragment(NamedTuple):
     """A sample, as compositing sees it.
 
-    - `alpha`: opacity of its cell; 0 behind the ray's end.
+    - `alpha`: opacity of its cell; 0 past the ray's end.
     - `depth`: past the ray's entry. `value`: of the volume.
     - `color`: as shaded; None for a selection, or where nobody asks for it.
-    - `valid`: False for what is no sample: behind the ray's end, in a gap of the volume, or of width 0.
+    - `valid`: False for what is no sample: past the ray's end, in a gap of the volume, or of width 0.
     """
 
     alpha: Scalar

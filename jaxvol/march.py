@@ -9,7 +9,7 @@ At each seam the answers of all transforms are combined, so that they compose.
 |---|---|---|
 | `locate` | which grid coordinate is this world point? | spacing and origin |
 | `start` | how many steps past the entry is the first cell? | 0 |
-| `shift` | by what part of a step do samples behind the first transparent one move? | 0 |
+| `shift` | by what part of a step do samples after the first transparent one move? | 0 |
 | `empty_space` | where is nothing visible? | unknown |
 | `stride` | how many steps long may this cell be? | 1 |
 | `cut` | which part of its cell does a sample stand for? | all of it |
@@ -98,7 +98,7 @@ class Transform(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps the samples behind the ray's first transparent one move, in [-1, 0].
+        """By how many steps the samples after the ray's first transparent one move, in [-1, 0].
 
         A march shifts each ray once, after its first cell of opacity 0, so that at most this cell is sampled
         twice. Everywhere else rays advance by whole steps. The shifts of several transforms are summed, and
@@ -119,7 +119,7 @@ class Transform(eqx.Module):
         """How many steps long the cell at this depth may be.
 
         It depends on the ray and the depth alone. A march rounds it down to a power of two of at most
-        `longest_stride`, and so far that a cell of n steps begins a multiple of n steps behind the first one.
+        `longest_stride`, and so far that a cell of n steps begins a multiple of n steps after the first one.
         Rays leap to multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the
         shortest stride counts. Gradients take strides as given; the image jumps where one changes."""
         return jnp.ones(jnp.shape(depth), jnp.int32)
@@ -143,7 +143,7 @@ class March(eqx.Module):
     - `transforms`: applied in this order at every seam; none may be given twice.
     - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
       error falls with d. `"midpoint"`: in the middle; the error falls with d².
-    - `max_samples`: a ray's cells begin less than so many steps behind its first one; an integer from 1 to
+    - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
       2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
       default 131 072, so that every march ends.
 
@@ -228,7 +228,7 @@ class March(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps samples behind a ray's first transparent cell move, in [-1, 0]."""
+        """By how many steps samples after a ray's first transparent cell move, in [-1, 0]."""
         shift = jnp.zeros_like(ray.length)
         for transform in self.transforms:
             shift = shift + transform.shift(ray)
@@ -236,7 +236,7 @@ class March(eqx.Module):
         return jnp.clip(shift, -1, 0)
 
     def stride(self, ray: Ray, depth: Scalar, index: Int[Array, ""]) -> Int[Array, ""] | int:
-        """How many steps long the cell is that begins at this depth, `index` steps behind the first one."""
+        """How many steps long the cell is that begins at this depth, `index` steps after the first one."""
         longest = self.longest_stride
         if longest == 1:
             return 1

@@ -41,7 +41,7 @@ class Progress(eqx.Module):
 
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
-    the compositing mode's state behind all cells so far. `shift`, in steps, is added to `offset` behind the
+    the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
     first transparent cell, and is 0 from then on. What is not asked for is None.
     """
 
@@ -131,7 +131,7 @@ def add(
 
 
 def stop(pipeline: Pipeline, at: Progress) -> Progress:
-    """Finishes a ray, behind a cell, if it needs no other."""
+    """Finishes a ray that needs no other cell."""
     return replace(at, finished=at.finished | stopped(pipeline, at.composite))
 
 

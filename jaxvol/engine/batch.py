@@ -164,7 +164,7 @@ def over_transparent(march: March, ray: Ray, at: Progress, steps: Int[Array, ""]
 
 
 def finished_after(range_: CellRange | None, at: Progress) -> Progress:
-    """Finishes rays whose last visible cell is behind them."""
+    """Finishes rays that have passed their last visible cell."""
     return at if range_ is None else with_fields(at, finished=at.finished | (at.index >= range_.until))
 
 

@@ -103,7 +103,7 @@ class SampleVisitor(ABC):
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: PyTree, carry: PyTree, total: PyTree
     ) -> tuple[PyTree, PyTree, PyTree]:
-        """The state behind the samples of some rays, what these add to the rays' sums, and the new total."""
+        """The state after the samples of some rays, what these add to the rays' sums, and the new total."""
 
 
 def vmap_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
@@ -202,7 +202,7 @@ def pieces_ahead(pipeline: Pipeline, ray: Ray, at: Progress, ahead: Ahead) -> tu
 
 def _taken(march: March, at: Progress, samples: Samples) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
     """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
-    shift ahead goes no farther than its next transparent cell, behind which its samples lie elsewhere."""
+    shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
     left = samples.ahead.before(march.most_samples - at.index)
     number = jnp.arange(samples.number, dtype=at.index.dtype)
     transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=0)
