@@ -167,10 +167,11 @@ class Camera(eqx.Module):
         factor = number("zoom factor", factor, above=0)
         return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
-    def ray(self, column: Num[Array, ""], row: Num[Array, ""]) -> tuple[Vec3, Vec3]:
+    def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         dtype = self.position.dtype
-        x, y = self._column(column.astype(dtype) + 0.5), self._row(row.astype(dtype) + 0.5)
+        column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
+        x, y = self._column(column + 0.5), self._row(row + 0.5)
         right, up, forward = (apart(axis) for axis in self._axes())
         position = apart(self.position)
         if self.parallel_scale is not None:

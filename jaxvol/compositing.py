@@ -11,7 +11,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ._util.checks import described
 from ._util.vec3 import Scalar, Vec3, along
@@ -72,7 +72,8 @@ class Compositing(eqx.Module, Generic[State]):
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume may change a pixel. Rays leap over the others."""
+        """Which blocks of a volume may change a pixel, from the ranges of their values (float32). Rays leap
+        over the others, except those that hold NaN."""
         return transfer.visible(blocks)
 
 
@@ -128,7 +129,8 @@ class Weighting(Compositing[Composite]):
 
     @abstractmethod
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        """Derivative of a loss by the optical depth τ of a cell, for the second march.
+        """Derivative of a loss by the optical depth τ of a cell, for the second march. What it is given
+        suffices for weights that do not depend on `before`, and for (c - `before`) f(`alpha`).
 
         **Arguments:**
 
@@ -188,8 +190,7 @@ class Over(Weighting):
 class RaySampler(NamedTuple):
     """Measures, classifies and shades what is on a ray. Depths are past the entry.
 
-    `depth_scale`: a factor for depths. It is 1; where depths are numbers of steps, its derivative is that of
-    the step.
+    `depth_scale`: a factor for depths that stand for a number of steps. It is 1, and grows with the step.
     """
 
     ray: Ray
@@ -198,7 +199,11 @@ class RaySampler(NamedTuple):
 
     def measured(self, depth: Scalar) -> Measured:
         """The measured values at this depth, the volume's value first."""
-        return self.classification.at(self.ray.path(depth * self.depth_scale))
+        return self.classification.at(self.ray.path(self.length(depth)))
+
+    def length(self, depth: Scalar) -> Scalar:
+        """The depth as a number to compute with, as in a fog: it changes with the step."""
+        return depth * self.depth_scale
 
     def color(self, depth: Scalar, measured: Measured, transmittance: Scalar) -> Vec3:
         """The colour of these measured values, shaded where there is a lighting. `transmittance`: between
@@ -207,7 +212,7 @@ class RaySampler(NamedTuple):
         if self.classification.light is None:
             return color
         ray = self.ray
-        point = along(ray.entry, ray.direction, depth * self.depth_scale)
+        point = along(ray.entry, ray.direction, self.length(depth))
         return self.classification.light(
             Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
         )
@@ -236,8 +241,9 @@ class Selection(Compositing[State]):
 
     @abstractmethod
     def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
-        """Premultiplied colour and opacity, and the depth past the entry that is reported, of a ray for which
-        a depth was chosen. It is differentiated by JAX."""
+        """Premultiplied colour and opacity, and the depth that is reported, of a ray for which a depth was
+        chosen. It is differentiated by JAX. Depths, of the state and in the answer, are numbers of steps to
+        it: to compute with one, take `sampler.length(depth)`."""
 
     def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
         depth = self.depth(state)
@@ -274,6 +280,18 @@ class FirstVisible(Selection[Scalar]):
     def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
         color, _ = sampler.shaded(state)
         return jnp.stack([*color, jnp.ones_like(state)]), state
+
+
+def check_answer(compositing: Compositing[Any], method: str, answer: PyTree, expected: PyTree) -> None:
+    """Raise `ValueError` if the answer of a mode's method has other shapes or types than expected."""
+
+    def kinds(tree: PyTree) -> PyTree:
+        return jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), tree)
+
+    if kinds(answer) != kinds(expected):
+        found, wanted = (eqx.tree_pformat(tree) for tree in (answer, expected))
+        name = type(compositing).__name__
+        raise ValueError(f"compositing: {name}.{method} must return {wanted}; got {found}.")
 
 
 Mode: TypeAlias = Literal["over"]

@@ -17,7 +17,16 @@ from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, apart
 from .arguments import check_arguments
-from .compositing import Compositing, Fragment, Mode, Outputs, RaySampler, Selection, compositing_of
+from .compositing import (
+    Compositing,
+    Fragment,
+    Mode,
+    Outputs,
+    RaySampler,
+    Selection,
+    check_answer,
+    compositing_of,
+)
 from .lighting.shading import Lighting, lit_classification
 from .march import Cell, March
 from .rendering import Details, Rendering
@@ -127,7 +136,9 @@ def add(
     if met is not None:
         shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
         met = Met(met.samples + taken.astype(met.samples.dtype), met.aligned | (piece.cut & shows))
-    return replace(at, composite=compositing.add(at.composite, fragment), met=met)
+    composite = compositing.add(at.composite, fragment)
+    check_answer(compositing, "add", composite, at.composite)
+    return replace(at, composite=composite, met=met)
 
 
 def stop(pipeline: Pipeline, at: Progress) -> Progress:
@@ -138,7 +149,9 @@ def stop(pipeline: Pipeline, at: Progress) -> Progress:
 def stopped(pipeline: Pipeline, composite: Any) -> Bool[Array, ""]:
     """Whether a ray in this state of compositing needs no other cell."""
     march, _, _, compositing = pipeline
-    return march.stop(compositing.transmittance(composite)) | compositing.settled(composite)
+    stops, settled = march.stop(compositing.transmittance(composite)), compositing.settled(composite)
+    check_answer(compositing, "settled", settled, stops)
+    return stops | settled
 
 
 def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
@@ -213,7 +226,9 @@ def resolve(
         return lighting.shade_pixel(classification, space, line, rgba, depth), depth
     ray = enter(space, *line)
     scale = march.step / jax.lax.stop_gradient(march.step)
-    pixel, depth = compositing.pixel(RaySampler(ray, classification, scale), jax.lax.stop_gradient(selected))
+    found = compositing.pixel(RaySampler(ray, classification, scale), jax.lax.stop_gradient(selected))
+    check_answer(compositing, "pixel", found, (rgba, depth))
+    pixel, depth = found
     valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
     return pixel * valid, ray.t_in + depth * scale
 

@@ -321,13 +321,13 @@ MUTATIONS = [
         "reference.py",
         "return pixel * valid, ray.t_in + depth * scale",
         "return pixel * valid, ray.t_in + depth",
-        ("test_selections.py::test_gradients_are_central_differences[replay-maximum]",),
+        ("test_selections.py::test_gradients_are_central_differences[replay-fog]",),
     ),
     Mutation(
         "selection: finished rays go on looking",
         "reference.py",
-        "march.stop(compositing.transmittance(composite)) | compositing.settled(composite)",
-        "march.stop(compositing.transmittance(composite))",
+        "return stops | settled",
+        "return stops",
         ("test_selections.py::test_a_settled_ray_takes_no_more_samples",),
     ),
     Mutation(

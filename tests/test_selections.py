@@ -283,6 +283,44 @@ def test_first_hits_are_refused_where_something_else_is_selected():
         jv.render(NOISE, soft_transfer(), around(NOISE), march, compositing=Maximum())
 
 
+class Wrong(jv.FirstVisible):
+    """Answers that a mode must not give."""
+
+    method: str = eqx.field(static=True, default="")
+
+    def add(self, state, fragment):
+        state = super().add(state, fragment)
+        return state.astype(jnp.int32) if self.method == "add" else state
+
+    def settled(self, state):
+        return state if self.method == "settled" else super().settled(state)
+
+    def occupied(self, transfer, blocks):
+        return jnp.ones(3, bool) if self.method == "occupied" else super().occupied(transfer, blocks)
+
+    def pixel(self, sampler, state):
+        return (jnp.ones(3), state) if self.method == "pixel" else super().pixel(sampler, state)
+
+
+@pytest.mark.parametrize("method", ["add", "settled", "occupied", "pixel"])
+def test_a_wrong_answer_of_a_mode_is_named(method):
+    march = jv.March(0.11, (jv.SpaceLeaping(),))
+    with pytest.raises(ValueError, match=rf"compositing: Wrong.{method} must return .*; got "):
+        jv.render(NOISE, soft_transfer(), around(NOISE), march, compositing=Wrong(method))
+    if method != "occupied":
+        ray = jnp.asarray([-1.0, 0.0, 0.8]), jnp.asarray([1.0, 0.0, 0.0])
+        with pytest.raises(ValueError, match=rf"compositing: Wrong.{method} must return .*; got "):
+            jv.render_ray_reference(NOISE, soft_transfer(), *ray, march, compositing=Wrong(method))
+
+
+class Fog(Maximum):
+    """Farther maxima are darker."""
+
+    def pixel(self, sampler, state):
+        rgba, depth = super().pixel(sampler, state)
+        return rgba * jnp.exp(-0.3 * sampler.length(depth)), depth
+
+
 def leaves(scene):
     """Voxels, spacing, colours, extinction, camera position, step, and the value of an isosurface."""
     volume, transfer, camera, march, mode = scene
@@ -290,7 +328,7 @@ def leaves(scene):
     return (*found, mode.value) if isinstance(mode, Isosurface) else found
 
 
-@pytest.mark.parametrize("mode", ["maximum", "isosurface"])
+@pytest.mark.parametrize("mode", ["fog", "isosurface"])
 @pytest.mark.parametrize(
     "adjoint", ["replay", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "direct"))]
 )
@@ -299,7 +337,7 @@ def test_gradients_are_central_differences(mode, adjoint):
     with in_float64():
         volume = jv.Volume(np.asarray(NOISE.data, np.float64), NOISE.spacing)
         march = jv.March(0.11, (jv.AlphaCorrection(), jv.SpaceLeaping()), max_samples=64)
-        shown = Maximum() if mode == "maximum" else Isosurface(jnp.asarray(0.45, jnp.float64))
+        shown = Fog() if mode == "fog" else Isosurface(jnp.asarray(0.45, jnp.float64))
         scene = volume, soft_transfer(), around(volume, (9, 8)), march, shown
         hit = np.isfinite(jv.render(*scene[:4], compositing=shown).depth)
         assert hit.mean() > 0.2

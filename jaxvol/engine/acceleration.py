@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from ..compositing import FirstVisible, Selection
+from ..compositing import FirstVisible, Selection, check_answer
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
@@ -43,7 +43,9 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
     if blocks is None:
         return None
     space = march.locate(volume)
-    visible = compositing.occupied(transfer, blocks) | blocks.unordered
+    visible = compositing.occupied(transfer, blocks)
+    check_answer(compositing, "occupied", visible, blocks.unordered)
+    visible |= blocks.unordered
     if march.may_shift:  # what is leapt over is taken as transparent
         visible |= transfer.visible(blocks)
     occupancy = space.occupancy(visible)
