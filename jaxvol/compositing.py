@@ -273,10 +273,10 @@ class FirstVisible(Selection[Scalar]):
 Mode: TypeAlias = Literal["over"]
 """Names of modes."""
 
-MODES: dict[Mode, type[Compositing]] = {"over": Over}
+MODES: dict[Mode, type[Compositing[Any]]] = {"over": Over}
 
 
-def compositing_of(given: Mode | Any) -> Compositing:
+def compositing_of(given: Mode | Any) -> Compositing[Any]:
     """The mode of this name, or the mode itself.
 
     **Raises:** `ValueError`, naming the argument, for anything else, and for a `Weighting` whose fields are

@@ -10,10 +10,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from .._util.sharding import varying
-from .._util.trees import added, floats
+from .._util.trees import PyTree, added, floats
 from ..lighting.shading import Surroundings
 from ..rendering import Rendering
 from ..space import Ray, invalid
