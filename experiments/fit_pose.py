@@ -65,13 +65,14 @@ def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, lis
         for _ in range(starts):
             turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
             off = {"rotation": np.deg2rad(ANGLE) * turn, "translation": SHIFT * shift}
-            camera, losses = pose.forward(jax.tree.map(jnp.float32, off)), []
+            camera, losses, found = pose.forward(jax.tree.map(jnp.float32, off)), [], None
             begun = time.perf_counter()
             for sigma in sigmas:
                 residual = Difference((volume, transfer, march), target, blur(size, sigma))
                 found = jv.fit(residual, camera, max_steps=STEPS)
                 camera = found.parameters
                 losses += found.losses.tolist()
+            assert found is not None
             left = pose.inverse(camera)
             rows[name].append(
                 {

@@ -100,6 +100,7 @@ def measure(scene: Scene, size: int) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # undetermined colours of transparent points: recorded
             found = jv.fit(residual, start, max_steps=STEPS)
+        assert found.uncertainty is not None
         rows[name] = {
             "steps": len(found.losses),
             "message": found.message,

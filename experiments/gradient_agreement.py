@@ -165,7 +165,7 @@ def measure(scene: Scene, methods: Sequence[str], size: int, seed: int) -> dict[
                 g = here.gradient(probe.leaf, probe.weights)
                 slope = np.vdot(probe.weights, here.tangent(probe.leaf, probe.direction))
                 norm = np.linalg.norm(g)
-                errors = {"from forward": abs(np.vdot(g, probe.direction) - slope) / norm}
+                errors = {"from forward": abs(np.subtract(np.vdot(g, probe.direction), slope)) / norm}
                 if method not in ("none", "min_distance"):
                     errors["from no leaps"] = np.linalg.norm(g - without) / norm
                 for name, error in errors.items():

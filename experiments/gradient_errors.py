@@ -84,7 +84,7 @@ ALONE: dict[str, tuple[jv.Transform, ...]] = {
 
 def marches() -> dict[str, tuple[jv.Transform, ...]]:
     """Each transform alone, and with cells cut at the exit."""
-    pairs = {}
+    pairs: dict[str, tuple[jv.Transform, ...]] = {}
     for name, transforms in ALONE.items():
         pairs[name] = transforms
         pairs[name + CUT] = (*transforms, jv.AlphaCorrection())
@@ -179,14 +179,14 @@ def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path)
             errors = np.array(
                 [[rows[name].get(leaf, [np.nan] * 3)[number] for leaf in leaves] for name in names]
             )
-            image = panel.imshow(errors, norm=LogNorm(1e-4, 1, clip=True), cmap="YlOrRd", aspect="auto")
+            panel.imshow(errors, norm=LogNorm(1e-4, 1, clip=True), cmap="YlOrRd", aspect="auto")
             for row, column in np.argwhere(errors >= WRONG):
                 text = f"{errors[row, column]:.1f}"
                 panel.text(column, row, text, ha="center", va="center", fontsize=7, color="white")
             panel.set_title(f"{quadrature} rule, moves of ± {width:g} step", fontsize=9)
             panel.set_xticks(range(len(leaves)), leaves, rotation=40, ha="right", fontsize=8)
             panel.set_yticks(range(len(names)), names, fontsize=8)
-    bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.01)
+    bar = figure.colorbar(axes.flat[-1].images[0], ax=axes, shrink=0.6, pad=0.01)
     bar.set_label(f"|sum of gradients - change| / larger of both; in numbers from {WRONG:g} on", fontsize=8)
     figure.suptitle(NOTE, fontsize=9)
     common.save(figure, path)

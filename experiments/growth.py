@@ -90,6 +90,7 @@ def draw(sweeps: dict[str, Any], path: Path) -> None:
         1, len(sweeps), figsize=size, sharey=True, squeeze=False, layout="constrained"
     )
     for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
+        sizes = []
         for (method, found), style in zip(methods.items(), ("C7o-", "C0s-"), strict=True):
             sizes = [int(size) for size in found["sizes"]]
             times = np.array([row["seconds"] for row in found["sizes"].values()])

@@ -156,6 +156,7 @@ def one_ball(
                 constraints=constraints,
                 max_steps=STEPS,
             )
+            assert found.uncertainty is not None
             errors = found.uncertainty.standard_errors
             row[name] = {
                 "ratio": float(found.parameters["material"].mean_free_path) / path,

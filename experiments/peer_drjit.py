@@ -8,6 +8,7 @@ at once, so that memory does not grow with the number of samples.
 Importing this file raises ImportError, with the reason, where Dr.Jit cannot run.
 """
 
+from importlib import import_module
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -19,8 +20,8 @@ from .peer_vtk import dense
 
 
 try:
-    import drjit as dr
-    import mitsuba as mi
+    dr: Any = import_module("drjit")
+    mi: Any = import_module("mitsuba")
 except ImportError as fault:
     raise ImportError("mitsuba is not installed: pip install jaxvol[peers]") from fault
 if not dr.has_backend(dr.JitBackend.LLVM):

@@ -6,6 +6,9 @@ plane rather than from the entry. Like our space leaping, it skips blocks of 4³
 visible.
 """
 
+# pyright: reportMissingImports=false
+# VTK is optional, as `missing` says.
+
 import importlib.util
 import os
 import subprocess

@@ -27,6 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.lines import Line2D
 
 import jaxvol as jv
 from jaxvol._util.xla import OPTIONS
@@ -100,6 +101,7 @@ def occupancy(scene: Scene) -> Any:
 
 
 def drjit(scene: Scene) -> Any:
+    assert peer_drjit is not None
     scene = scene._replace(transfer=peer_vtk.dense(scene.transfer, scene.volume))
     return peer_drjit.prepare(*scene, opacity_left=LEFT, threads=THREADS)
 
@@ -168,8 +170,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set_ylim(len(volumes) - 0.5, -0.6)
         panel.set_xlabel(f"time / ours, {pixels} x {pixels} pixels; dotted: {GOAL:.0f}", fontsize=9)
     shown = [name for name in PEERS if any(name in r for v in volumes.values() for r in v.values())]
-    colors = dict(zip(PEERS, ("C7", "C0", "C9", "C3"), strict=True))
-    marks = [plt.Line2D([], [], color=colors[name], marker="o", linestyle="") for name in shown]
+    colors: dict[str, str] = dict(zip(PEERS, ("C7", "C0", "C9", "C3"), strict=True))
+    marks = [Line2D([], [], color=colors[name], marker="o", linestyle="") for name in shown]
     figure.legend(marks, shown, loc="outside upper center", ncols=4, fontsize=8)
     common.save(figure, path)
 

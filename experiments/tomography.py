@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from skimage.transform import iradon, iradon_sart
 
 import jaxvol as jv
@@ -178,6 +179,7 @@ def measure(truth: Density, views: int, photons: float | None, setting: Setting,
     for name, method in METHODS.items():
         progress, counts = method(sinogram, truth, setting)
         nearest, last = min(progress.rows, key=lambda row: row["rmse"]), progress.rows[-1]
+        assert progress.nearest is not None
         rows[name] = {
             "rmse": nearest["rmse"],
             "psnr": psnr(progress.nearest, truth, truth.max()),
@@ -192,9 +194,9 @@ def measure(truth: Density, views: int, photons: float | None, setting: Setting,
 
 def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
-    figure = plt.figure(figsize=(10, 2.75 * len(result) + 3.2), layout="constrained")
-    figure.get_layout_engine().set(h_pad=0.08)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(2.75 * len(result), 3))
+    size = (10, 2.75 * len(result) + 3.2)
+    figure = plt.figure(figsize=size, layout=ConstrainedLayoutEngine(h_pad=0.08))
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(2.75 * len(result), 3))
     shown = upper.subplots(len(result), 1 + len(METHODS), squeeze=False)
     for number, (line, (photons, rows)) in enumerate(zip(shown, result.items(), strict=True)):
         pictures = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}

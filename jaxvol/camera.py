@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
 from ._util.checks import Arrayable, described, finite_array, integer, number, require
-from ._util.vec3 import Vec3, along, apart
+from ._util.vec3 import Scalar, Vec3, along, apart
 from .volume import Volume
 
 
@@ -217,12 +217,12 @@ class Camera(eqx.Module):
         right = right / jnp.linalg.norm(right)
         return right, jnp.cross(right, forward), forward
 
-    def _column(self, column):
+    def _column(self, column: Scalar | int) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
         left, right = self.window[0], self.window[1]
         return left + (right - left) * (column / self.size[0])
 
-    def _row(self, row):
+    def _row(self, row: Scalar | int) -> Scalar:
         bottom, top = self.window[2], self.window[3]
         return top - (top - bottom) * (row / self.size[1])
 

@@ -11,9 +11,10 @@ from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from ._util.checks import described
+from ._util.trees import PyTree
 from ._util.vec3 import Scalar, Vec3, along
 from .lighting.shading import Sample
 from .occupancy import Blocks
@@ -300,7 +301,7 @@ Mode: TypeAlias = Literal["over"]
 MODES: dict[str, type[Compositing[Any]]] = {"over": Over}
 
 
-def compositing_of(given: Mode | Any) -> Compositing:
+def compositing_of(given: Mode | Any) -> Compositing[Any]:
     """The mode of this name, or the mode itself.
 
     **Raises:** `ValueError`, naming the argument, for anything else, and for a `Weighting` whose fields are

@@ -84,7 +84,7 @@ def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     return save_image(path, linear)
 
 
-CHANNELS = {
+CHANNELS: dict[str, tuple[int, ...]] = {
     ".png": (3, 4),
     ".jpg": (3,),
     ".jpeg": (3,),

@@ -170,8 +170,8 @@ class March(eqx.Module):
                 f"transforms must be a tuple, such as (AlphaCorrection(),); got {described(transforms)}."
             )
         self.transforms = tuple(transforms)
-        kinds = [type(t) for t in self.transforms]
-        for transform in self.transforms:
+        kinds = [type(t) for t in transforms]
+        for transform in transforms:
             if not isinstance(transform, Transform):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
             if kinds.count(type(transform)) > 1:

@@ -153,7 +153,9 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
     return _over_blocks(bits, jnp.bitwise_or)
 
 
-def _over_blocks(data: Shaped[Array, "nx ny nz"], combine: Callable) -> Shaped[Array, "bx by bz"]:
+def _over_blocks(
+    data: Shaped[Array, "nx ny nz"], combine: Callable[[Array, Array], Array]
+) -> Shaped[Array, "bx by bz"]:
     """Combines all nodes of each block, axis by axis."""
     for axis in range(3):
         count = -(-(data.shape[axis] - 1) // BLOCK)

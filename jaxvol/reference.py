@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import Arrayable, all_finite, finite_array, is_traced
 from ._util.sharding import varying
+from ._util.trees import PyTree
 from ._util.vec3 import Scalar, Vec3, apart
 from .arguments import check_arguments
 from .compositing import (
@@ -42,7 +43,7 @@ class Pipeline(NamedTuple):
     march: March
     volume: Volume
     classification: Classification
-    compositing: Compositing
+    compositing: Compositing[Any]
 
 
 class Progress(eqx.Module):
@@ -204,7 +205,7 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
     return Rendering(rgba, ~at.finished, details)
 
 
-def resolves(compositing: Compositing, lighting: Lighting | None) -> bool:
+def resolves(compositing: Compositing[Any], lighting: Lighting | None) -> bool:
     """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
     return isinstance(compositing, Selection) or (lighting is not None and lighting.shades_pixels)
 
@@ -241,7 +242,7 @@ def render_ray_reference(
     march: March | Any,
     *,
     pixel: tuple[Any, Any] = (0, 0),
-    compositing: Mode | Compositing | Any = "over",
+    compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
 ) -> Rendering:
     """What one ray sees, by a plain scan over its cells.

@@ -38,7 +38,7 @@ def main(chosen: Namespace) -> None:
     page.draw(0, 0, whole[part], "", "no leaping")
     small = scene._replace(camera=replace(scene.camera, size=(side, side)))
     axes = page.draw(1, 0, frame(small, march(scene, None)).image(BLACK), "the whole image")
-    corner = [at * side / size for at in (left, top)]
+    corner = left * side / size, top * side / size
     shown = side / WHOLE
     axes.add_patch(Rectangle(corner, shown, shown, fill=False, color="white", linewidth=0.8))
     for column, cell in enumerate(CELLS, 1):

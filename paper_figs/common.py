@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from matplotlib.axes import Axes
 
 import jaxvol as jv
 from experiments import record
@@ -149,7 +150,7 @@ class Page:
         self.figure = plt.figure(figsize=(self.width / DPI, self.height / DPI), dpi=DPI)
         self.figure.text(GAP / self.width, 1 - 5 / self.height, title, va="top", fontsize=8, weight="bold")
 
-    def draw(self, row: int, column: int, linear: Any, below: str, above: str = "") -> plt.Axes:
+    def draw(self, row: int, column: int, linear: Any, below: str, above: str = "") -> Axes:
         left = GAP + column * (self.side + GAP)
         bottom = self.height - HEAD - row * (self.side + TEXT) - self.side
         box = left / self.width, bottom / self.height, self.side / self.width, self.side / self.height

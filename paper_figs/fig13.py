@@ -29,8 +29,8 @@ def main(chosen: Namespace) -> None:
         axes = page.draw(0, column, image, caption, look)
         if look == "whole":
             side = size / view.factor
-            corner = [middle * size - side / 2 for middle in view.middle]
-            axes.add_patch(Rectangle(corner, side, side, fill=False, color="white", linewidth=0.8))
+            x, y = (middle * size - side / 2 for middle in view.middle)
+            axes.add_patch(Rectangle((x, y), side, side, fill=False, color="white", linewidth=0.8))
         print(f"fig13 {look}: {caption}")
     page.save(chosen.output / "fig13.png")
 

@@ -7,6 +7,7 @@ the sample that they light, and the ring the centre of their light.
 from argparse import Namespace
 
 import numpy as np
+from matplotlib.axes import Axes
 
 import jaxvol as jv
 from experiments.common import plt, save
@@ -26,14 +27,13 @@ def centre(template: ScattererTemplate) -> np.ndarray:
     return (np.asarray(template.offset) * intensity).sum(-2) / intensity.sum(-2)
 
 
-def draw(axes: plt.Axes, template: ScattererTemplate) -> plt.Artist:
+def draw(axes: Axes, template: ScattererTemplate) -> None:
     seen = np.asarray(template.intensity > 0)
     (x, y, z), intensity = np.asarray(template.offset)[seen].T, np.asarray(template.intensity)[seen]
-    dots = axes.scatter(x, y, 1500 * intensity, z, cmap="viridis", alpha=0.75, vmin=-3, vmax=3, linewidths=0)
+    axes.scatter(x, y, 1500 * intensity, z, cmap="viridis", alpha=0.75, vmin=-3, vmax=3, linewidths=0)
     axes.plot(0, 0, "k+", markersize=14, markeredgewidth=1.5)
     axes.plot(*centre(template)[:2], "o", color="C3", markersize=11, fillstyle="none", markeredgewidth=1.5)
     axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", xlabel="x / λ", ylabel="y / λ")
-    return dots
 
 
 @figure(__doc__)
@@ -42,7 +42,7 @@ def main(chosen: Namespace) -> None:
     page, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
     for panel, packets, title in zip(axes, (1, 4), ("one packet", "four packets"), strict=True):
         template = jv.scatterer_template(skin, 0, packets=packets, threshold=THRESHOLD)
-        dots = draw(panel, template)
+        draw(panel, template)
         many = scatterer_templates(skin, 0, count=TEMPLATES, packets=packets, threshold=THRESHOLD)
         aside, mean = (np.linalg.norm(centre(t), axis=-1).mean() for t in (template, many))
         caption = (
@@ -50,7 +50,7 @@ def main(chosen: Namespace) -> None:
         )
         panel.set_title(caption, fontsize=10)
         print(f"lee_fig1 {' '.join(caption.split())}; {np.sum(template.intensity > 0)} photons")
-    page.colorbar(dots, ax=axes, label="z / λ")
+    page.colorbar(axes[-1].collections[0], ax=axes, label="z / λ")
     save(page, chosen.output / "lee_fig1.png")
 
 

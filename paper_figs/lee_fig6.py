@@ -9,7 +9,7 @@ are the same.
 
 from argparse import Namespace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jaxvol as jv
 from experiments.lighting import FLESH, march
@@ -65,7 +65,8 @@ def frog(resolution: int, size: int) -> Subject:
     ]
     camera = jv.Camera.looking_at(volume, (-0.3, -0.8, 1), (0, 0, 1), size=(size, size)).zoom(1.5)
     step = float(volume.spacing[0]) / 2
-    scene = Scene(volume, jv.LabelTransferFunction(functions), camera, step)
+    transfer = cast(Any, jv.LabelTransferFunction(functions))  # Scene: for VTK and Dr.Jit, not used here
+    scene = Scene(volume, transfer, camera, step)
     return Subject(scene, materials, (0.7, 0.5, -0.7))
 
 

@@ -601,7 +601,9 @@ def check(tests: tuple[str, ...], mutation: Mutation | None, folder: Path, progr
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.mutations", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.mutations", description=str(__doc__).splitlines()[0]
+    )
     parser.add_argument("--only", action="append", metavar="NAME", help="faults whose name contains this")
     parser.add_argument("-j", type=int, default=1, metavar="N", help="number of parallel jobs")
     parser.add_argument("--list", action="store_true", help="list the faults and run nothing")

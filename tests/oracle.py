@@ -34,7 +34,7 @@ def march(
     midpoint=False,
     align=False,
     opacity_left=None,
-    start=0.0,
+    start: float | np.ndarray = 0.0,
     front_residual=False,
     empty_jump=None,
 ):

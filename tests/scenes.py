@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import combinations
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -52,7 +52,7 @@ def anisotropic_noise(seed: int = 0) -> jv.Volume:
     return jv.Volume(data, spacing=(0.05, 0.08, 0.11), origin=(0.3, -1.2, 0.4))
 
 
-def counting() -> type[jv.TransferFunction]:
+def counting() -> type[Any]:
     """A new class of transfer functions whose `traces` counts the programs traced with it."""
 
     class Counting(jv.TransferFunction):

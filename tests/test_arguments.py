@@ -1,5 +1,8 @@
 """Errors for wrong arguments in place of a volume, transfer function, camera or march, and their advice."""
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +30,7 @@ class Denser(jv.Volume):
 
 BAD = {
     "a volume of another class": (
-        lambda: jv.render(Denser(VOLUME.data), TRANSFER, CAMERA, MARCH),
+        lambda: jv.render(cast(Any, Denser)(VOLUME.data), TRANSFER, CAMERA, MARCH),
         r"volume must be a jaxvol Volume itself; got its subclass Denser, .*field=",
     ),
     "camera and march swapped": (
@@ -99,12 +102,14 @@ def test_wrong_argument_types_are_named(case):
 
 
 def test_rays_of_any_type_of_numbers_see_the_same():
-    expected = jv.render_rays(VOLUME, TRANSFER, *(jnp.asarray(part) for part in RAYS), MARCH).rgba
+    expected = jv.render_rays(VOLUME, TRANSFER, *(jnp.asarray(part) for part in RAYS), march=MARCH).rgba
     assert expected[0, 3] > 0.1
-    for convert in (np.int64, np.int8, np.float16, np.float64, lambda rays: rays):
-        seen = jv.render_rays(VOLUME, TRANSFER, *(convert(part) for part in RAYS), MARCH).rgba
+    several: list[Callable[[Any], Any]] = [np.int64, np.int8, np.float16, np.float64, lambda rays: rays]
+    for convert in several:
+        seen = jv.render_rays(VOLUME, TRANSFER, *(convert(part) for part in RAYS), march=MARCH).rgba
         np.testing.assert_array_equal(seen, expected)
-    for convert in (np.array, np.int64, lambda ray: ray):
-        one = jv.render_ray_reference(VOLUME, TRANSFER, *(convert(part) for part in RAY), MARCH)
+    single: list[Callable[[Any], Any]] = [np.array, np.int64, lambda ray: ray]
+    for convert in single:
+        one = jv.render_ray_reference(VOLUME, TRANSFER, *(convert(part) for part in RAY), march=MARCH)
         assert one.rgba.dtype == jnp.float32
         np.testing.assert_allclose(one.rgba, expected[0], atol=2e-6)

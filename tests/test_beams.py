@@ -19,7 +19,7 @@ ROUNDING = 1e-4
 
 
 WAYS = [(1, 0, 0), (0, -1, 0), (0, 0, 1), (-1, -1, -1), (-0.6, 0.2, 0.1)]
-SIZES = tuple(4 * spacing for spacing in apart(VOLUME.spacing))
+SIZES = apart(4 * VOLUME.spacing)
 BLOCKS = tuple(-(-(n - 1) // 4) for n in VOLUME.shape)
 
 
@@ -34,7 +34,7 @@ def beams(way, parallel=None):
         rays = [np.asarray(part, np.float64) for part in camera.rays()]
         ends = slice(None, None, SIDE - 1), slice(None, None, SIDE - 1)
         corners = [jnp.asarray(part[ends].reshape(4, 3), jnp.float32) for part in rays]
-        yield rays, [tuple(part[:, i] for i in range(3)) for part in corners]
+        yield rays, [(part[:, 0], part[:, 1], part[:, 2]) for part in corners]
 
 
 def blocks_at(rays, distance):

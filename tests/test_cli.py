@@ -172,6 +172,7 @@ def test_ctrl_c_ends_a_command_at_once_with_one_line(volume_file, tmp_path):
     run = subprocess.Popen(
         [sys.executable, "-c", STARTED, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    assert run.stdout is not None
     assert run.stdout.readline() == "under way\n"
     time.sleep(0.3)
     run.send_signal(signal.SIGINT)

@@ -27,18 +27,20 @@ def test_png_holds_srgb_and_clips(tmp_path):
     np.testing.assert_array_equal(found[0, 0], 0)
 
 
-RGBA = np.float32([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]])
+RGBA = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]], np.float32)
 
 
 def test_transparent_png_has_straight_alpha(tmp_path):
     found = imread(jv.save_image(tmp_path / "x.PNG", RGBA))
-    straight = np.asarray(jv.to_srgb(np.float32([[0.4, 0.2, 0.0], [0, 0, 0], [1, 1, 1]])))
+    straight = np.asarray(jv.to_srgb(np.array([[0.4, 0.2, 0.0], [0, 0, 0], [1, 1, 1]], np.float32)))
     np.testing.assert_array_equal(found[0, :, :3], (straight * 255).round())
     np.testing.assert_array_equal(found[0, :, 3], [128, 0, 255])
 
 
 @pytest.mark.parametrize("ending", [".tif", ".tiff", ".npy"])
-@pytest.mark.parametrize("image", [RGBA, 7 * RGBA[..., :3], np.float32([[1.5, np.inf], [2.5, 3.0]])])
+@pytest.mark.parametrize(
+    "image", [RGBA, 7 * RGBA[..., :3], np.array([[1.5, np.inf], [2.5, 3.0]], np.float32)]
+)
 def test_linear_formats_keep_every_float(ending, image, tmp_path):
     path = jv.save_image(tmp_path / f"x{ending}", jnp.asarray(image))
     found = np.load(path) if ending == ".npy" else imread(path)
@@ -47,10 +49,12 @@ def test_linear_formats_keep_every_float(ending, image, tmp_path):
 
 
 def test_a_tiff_says_that_its_colours_are_premultiplied(tmp_path):
-    from tifffile import EXTRASAMPLE, TiffFile
+    from tifffile import EXTRASAMPLE, TiffFile, TiffPage
 
     with TiffFile(jv.save_image(tmp_path / "x.tif", RGBA)) as file:
-        assert file.pages[0].extrasamples == (EXTRASAMPLE.ASSOCALPHA,)
+        page = file.pages[0]
+        assert isinstance(page, TiffPage)
+        assert page.extrasamples == (EXTRASAMPLE.ASSOCALPHA,)
 
 
 def test_jpeg_is_jpeg(tmp_path):

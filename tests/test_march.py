@@ -47,7 +47,7 @@ class Long(jv.Transform):
     beyond: float = eqx.field(static=True, default=0.0)
 
     @property
-    def longest_stride(self):
+    def longest_stride(self) -> int:
         return 4
 
     def stride(self, ray, depth):

@@ -122,7 +122,7 @@ def test_harmonics_fold_at_nyquist_and_are_never_counted_twice():
 )
 @pytest.mark.parametrize("phase", [0.0, 1.0])
 def test_a_wave_is_all_structure(frequency, phase):
-    image = wave(*frequency, phase, amplitude=0.3)
+    image = wave(*frequency, phase=phase, amplitude=0.3)
     assert wood_grain_energy(image + 5) == pytest.approx(0.3**2 / 2, rel=0.01)
     assert wood_grain_energy(10 * image) == pytest.approx(100 * wood_grain_energy(image))
 

@@ -103,7 +103,7 @@ def drawn_ranges(rng, values, count=200):
     exact = rng.random((2, count)) < 0.3
     low = np.where(exact[0], values[at_points[0]], low)
     high = np.maximum(low, np.where(exact[1], values[at_points[1]], high))
-    return np.float32(low), np.float32(high)
+    return low.astype(np.float32), high.astype(np.float32)
 
 
 @pytest.mark.parametrize("points", [2, 8, 40])
@@ -145,7 +145,7 @@ def test_ranges_that_only_touch_visible_values_are_invisible():
         ((-9, 9), True),
         ((3, 3), True),
     ]
-    low, high = np.float32([ends for ends, _ in cases]).T
+    low, high = np.array([ends for ends, _ in cases], np.float32).T
     seen = positive_between(values, extinction, jnp.asarray(low), jnp.asarray(high))
     np.testing.assert_array_equal(seen, [expected for _, expected in cases])
 
@@ -216,7 +216,7 @@ def test_distances_are_those_of_a_chessboard(count):
     for _ in range(4):
         occupied = np.zeros((12, 9, 15), bool)
         occupied.reshape(-1)[rng.integers(0, occupied.size, count)] = True
-        expected = distance_transform_cdt(~occupied, metric="chessboard")
+        expected = np.asarray(distance_transform_cdt(~occupied, metric="chessboard"))
         np.testing.assert_array_equal(distances(occupied), expected.reshape(-1))
 
 

@@ -28,7 +28,7 @@ SUN, IRRADIANCE, SKY = (-0.3, 1.0, -0.6), (6.0, 8.0, 10.0), (0.3, 0.2, 0.1)
 @pytest.fixture(scope="module", autouse=True)
 def variant():
     """Use the LLVM variant if LLVM is available, else the scalar one, which always is."""
-    import drjit as dr
+    dr: Any = pytest.importorskip("drjit")
 
     mi.set_variant("llvm_ad_rgb" if dr.has_backend(dr.JitBackend.LLVM) else "scalar_rgb")
 

@@ -116,7 +116,7 @@ def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
         slow = {}
         for pattern in ("white", "blue"):
             noise = Noise(seed, pattern, stream=0)
-            drawn = np.asarray(jax.vmap(lambda x, y, noise=noise: noise((x, y), jnp.float32))(*pixel))
+            drawn = np.asarray(jax.vmap(lambda x, y, *, noise=noise: noise((x, y), jnp.float32))(*pixel))
             slow[pattern] = low_frequency_energy(drawn.reshape(256, 256))
         assert slow["blue"] <= slow["white"] / 5, seed
 

@@ -73,8 +73,8 @@ class Recording(Fetch):
     - `asked`: indices into the flattened voxels, filled while a program is traced.
     """
 
-    added: list
-    asked: list = eqx.field(static=True)
+    added: list[Shaped[Array, "..."]]
+    asked: list[Int[Array, "..."]] = eqx.field(static=True)
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         def voxel(flat: Int[Array, ""]) -> Shaped[Array, ""]:

@@ -47,4 +47,4 @@ def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return one
 
 
-_MEMORY: dict = {}
+_MEMORY: dict[tuple[int, Callable[..., Any]], Any] = {}

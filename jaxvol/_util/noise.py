@@ -1,7 +1,7 @@
 """Per-pixel random numbers: hashes, and a tile of blue noise."""
 
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,9 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from .checks import described, integer, is_traced
 from .vec3 import Vec3
+
+
+Word: TypeAlias = UInt32[Array, "..."]
 
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:
@@ -60,7 +63,7 @@ def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""
 
 
 def hashed_uniforms_4(
-    a: UInt32[Array, "..."], b: UInt32[Array, "..."], c: UInt32[Array, "..."], d: UInt32[Array, "..."]
+    a: Word, b: Word, c: Word, d: Word
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Four float32 numbers in [0, 1), independent of each other and from key to key of four words.
 
@@ -73,14 +76,14 @@ def hashed_uniforms_4(
     return a, b, c, d
 
 
-def _mix(a, b, c):
+def _mix(a: Word, b: Word, c: Word) -> tuple[Word, Word, Word]:
     a = a + b * c
     b = b + c * a
     c = c + a * b
     return a, b, c
 
 
-def _mix_4(a, b, c, d):
+def _mix_4(a: Word, b: Word, c: Word, d: Word) -> tuple[Word, Word, Word, Word]:
     a = a + b * d
     b = b + c * a
     c = c + a * b

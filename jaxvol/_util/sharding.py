@@ -6,10 +6,12 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Int
+
+from .trees import PyTree
 
 
-def varies_over(leaf: Any) -> frozenset:
+def varies_over(leaf: Any) -> frozenset[Any]:
     """The mesh axes over which an array varies inside `jax.shard_map`; none under `check_vma=False`, where
     JAX does not track them."""
     if not isinstance(leaf, jax.core.Tracer):
@@ -34,7 +36,7 @@ def varying(tree: PyTree, *like: PyTree) -> PyTree:
             return leaf
         if hasattr(jax.lax, "pcast"):
             return jax.lax.pcast(leaf, missing, to="varying")
-        return jax.lax.pvary(leaf, missing)  # pyright: ignore  (up to jax 0.8)
+        return jax.lax.pvary(leaf, missing)  # pyright: ignore[reportAttributeAccessIssue]  (up to jax 0.8)
 
     return jax.tree.map(one, tree)
 

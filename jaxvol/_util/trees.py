@@ -1,9 +1,14 @@
 """Differentiable leaves of trees, and sums of trees."""
 
+from typing import Any, TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+
+
+PyTree: TypeAlias = Any
+"""A tree of arrays. The type of this name in jaxtyping is one that type checkers cannot know, on purpose."""
 
 
 def floats(tree: PyTree) -> PyTree:

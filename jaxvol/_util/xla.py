@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool
 
 from .checks import is_traced
 from .sharding import varying
+from .trees import PyTree
 
 
 OPTIONS = {
@@ -141,7 +142,7 @@ def forward_only(tree: PyTree, message: str) -> PyTree:
         return leaf
 
     @same.defjvp
-    def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
+    def _(primal: tuple[Array], tangent: tuple[Array]) -> tuple[Array, Array]:
         return primal[0], _TANGENT.bind(*tangent, message=message)
 
     return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)

@@ -7,9 +7,10 @@ from typing import NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Int
 
 from .._util.sharding import varying
+from .._util.trees import PyTree
 from .._util.xla import gather
 from ..beams import Box
 from ..march import EmptySpaceIndex, March
@@ -36,6 +37,7 @@ class VisibleRangeRecorder(SampleVisitor):
     `until` = 0, and a `first` that is not one of its cells."""
 
     given = sums = total = None
+    carry: CellRange
 
     def __init__(self, shape: tuple[int, ...]):
         self.carry = CellRange(

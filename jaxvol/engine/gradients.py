@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.sharding import varying
-from .._util.trees import added, floats
+from .._util.trees import PyTree, added, floats
 from ..lighting.shading import Surroundings
 from ..march import EmptySpaceIndex
 from ..reference import Pipeline

@@ -6,8 +6,11 @@ and one in two for 16-bit voxels. It takes four or two times the memory of the v
 each array of them.
 """
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Shaped, UInt32
 
 from .._util.checks import is_traced
@@ -23,7 +26,7 @@ LIMIT = 2**30
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     """The packed copy of a volume's voxels. None for other types of voxels, traced ones, and NumPy arrays;
     where a field replaces them; and where the copy would take too much memory."""
-    data = volume.data
+    data = cast(Array | np.ndarray, volume.data)
     small = data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
     if (
         not small

@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree, UInt32
+from jaxtyping import Array, Float, UInt32
 
 from .._util.fetching import Recording, scatter_add
-from .._util.trees import added, floats
+from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing import Weighting
 from ..march import March
@@ -108,6 +108,18 @@ class Replay(SampleVisitor):
     - `places`: whether volume, camera, rays or march have a gradient.
     """
 
+    volume: Volume
+    words: UInt32[Array, " voxels"] | None
+    transfer: Transfer
+    pipeline: Pipeline
+    places: bool
+    light: Lit | None
+    tiling: Tiling
+    given: Cotangents
+    carry: Scalar
+    sums: PyTree
+    total: Total
+
     def __init__(
         self,
         pipeline: Pipeline,
@@ -176,7 +188,7 @@ class Replay(SampleVisitor):
 
     def _placed(
         self, ray: Ray, at: Progress, ahead: Ahead, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
-    ) -> tuple:
+    ) -> tuple[PyTree, PyTree, PyTree, list[Array], list[Array]]:
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
         its depth where the loss depends on that, and of its point where it is shaded; then the voxels that
         were fetched, and their cotangents. The number of samples counts as constant."""
@@ -193,7 +205,7 @@ class Replay(SampleVisitor):
             ray_rest: PyTree,
             at: Progress,
             ahead: Ahead,
-        ):
+        ) -> tuple[list[Any], list[Array]]:
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
             record = Recording(taps or [], [])
@@ -210,7 +222,7 @@ class Replay(SampleVisitor):
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, ahead.axis_of_rays))
         cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
 
-        def all_(march: PyTree, volume: PyTree, ray: PyTree, taps: list | None) -> PyTree:
+        def all_(march: PyTree, volume: PyTree, ray: PyTree, taps: list[Array] | None) -> PyTree:
             return cells(march, volume, ray, taps, ray_rest, at, ahead)
 
         taps = []

@@ -8,9 +8,10 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from .._util.compaction import in_front
+from .._util.trees import PyTree
 from .._util.vec3 import Scalar
 from ..reference import resolve
 from ..space import Line

@@ -1,6 +1,6 @@
 """What is rendered?"""
 
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from ..camera import Camera
 from ..compositing import Compositing, Over
@@ -22,5 +22,5 @@ class Scene(NamedTuple):
     transfer: Transfer
     source: Source
     march: March
-    compositing: Compositing = Over()
+    compositing: Compositing[Any] = Over()
     lighting: Lighting | None = None

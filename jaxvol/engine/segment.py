@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Int
 
+from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..compositing import Selection

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from .._util.fetching import scatter_add
-from .._util.trees import added, floats
+from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Shading, Surroundings, lit
 from ..reference import Pipeline

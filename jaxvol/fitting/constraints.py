@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
+from .._util.trees import PyTree
 from ..camera import Camera
 from ..lighting import Material
 from ..march import March
@@ -20,9 +20,12 @@ from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInt
 
 Where = Callable[[Any], Any]
 
+FreeVariables: TypeAlias = tuple[PyTree, ...]
+"""One entry per bijection, None where fixed."""
+
 
 class Free(eqx.Module):
-    """Parameters as the free variables that a solver moves: one entry per bijection, None where fixed."""
+    """Parameters as the free variables that a solver moves."""
 
     bijections: list[Bijection]
     held: list[Any]
@@ -30,7 +33,7 @@ class Free(eqx.Module):
     structure: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", tuple]:
+    def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", FreeVariables]:
         """The mapping from free variables to parameters, and the free variables for `parameters`.
 
         **Raises:** `ValueError` for constraints or a `where` that do not match the parameters, parameters
@@ -47,16 +50,16 @@ class Free(eqx.Module):
         held = [n if isinstance(b, Fixed) else None for b, n in zip(bijections, nodes, strict=True)]
         return cls(bijections, held, places, structure), start
 
-    def forward(self, free: tuple) -> PyTree:
+    def forward(self, free: FreeVariables) -> PyTree:
         """Parameters for these free variables."""
         return jax.tree.unflatten(self.structure, self._nodes(free))
 
-    def moved(self, free: tuple) -> list[Any]:
+    def moved(self, free: FreeVariables) -> list[Any]:
         """Parts of the parameters that are fitted."""
         nodes = zip(self.bijections, self._nodes(free), strict=True)
         return [None if isinstance(b, Fixed) else b.moved(node) for b, node in nodes]
 
-    def names(self, free: tuple) -> list[str]:
+    def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []
         for place, node in zip(self.places, self.moved(free), strict=True):
@@ -65,12 +68,12 @@ class Free(eqx.Module):
                 names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
 
-    def _nodes(self, free: tuple) -> list[Any]:
+    def _nodes(self, free: FreeVariables) -> list[Any]:
         each = zip(self.bijections, self.held, free, strict=True)
         return [held if isinstance(b, Fixed) else b.forward(u) for b, held, u in each]
 
 
-def size(free: tuple) -> int:
+def size(free: FreeVariables) -> int:
     """Number of free variables."""
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(free))
 

@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
+
+from .._util.trees import PyTree
 
 
 FLOOR = 0.1
@@ -22,10 +24,10 @@ away. (From two images of a head, a transfer function is recovered to rounding a
 in a wrong minimum.)"""
 
 
-class ScaledDescent(optx.AbstractDescent):
+class ScaledDescent(optx.AbstractDescent[Any, Any, Any]):
     """The step d that minimises |J d + r|² + λ |D d|², with λ = 1 / step size."""
 
-    damped: optx.DampedNewtonDescent = optx.DampedNewtonDescent(lx.QR())
+    damped: optx.DampedNewtonDescent[Any] = optx.DampedNewtonDescent(lx.QR())
 
     def init(self, y: PyTree, f_info_struct: Any) -> Any:
         return self.damped.init(y, f_info_struct)
@@ -45,12 +47,12 @@ class ScaledDescent(optx.AbstractDescent):
         return jax.tree.map(jnp.multiply, unit, step), result
 
 
-class LevenbergMarquardt(optx.AbstractGaussNewton):
+class LevenbergMarquardt(optx.AbstractGaussNewton[Any, Any, Any]):
     """`optimistix.LevenbergMarquardt` with Marquardt's scaling, and a step that grows after any fair step."""
 
     rtol: float
     atol: float
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
-    descent: optx.AbstractDescent = ScaledDescent()
-    search: optx.AbstractSearch = optx.ClassicalTrustRegion(high_cutoff=0.75)
+    descent: optx.AbstractDescent[Any, Any, Any] = ScaledDescent()
+    search: optx.AbstractSearch[Any, Any, Any, Any] = optx.ClassicalTrustRegion(high_cutoff=0.75)
     verbose: Callable[..., None] = lambda **_: None

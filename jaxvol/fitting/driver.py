@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from .._util.checks import integer, output_file
+from .._util.trees import PyTree
 from . import checkpoints
-from .constraints import Free, Where
+from .constraints import Free, FreeVariables, Where
 from .damping import LevenbergMarquardt
 from .residuals import OwnResidual, Problem, Residual, check_residual, tile_entries
 from .uncertainty import Uncertainty, uncertainty
@@ -28,11 +29,15 @@ from .uncertainty import Uncertainty, uncertainty
 
 Solver: TypeAlias = Literal["levenberg_marquardt", "gauss_newton", "bfgs", "adam"]
 
+OptimistixSolver: TypeAlias = (
+    optx.AbstractLeastSquaresSolver[Any, Any, Any, Any] | optx.AbstractMinimiser[Any, Any, Any]
+)
+
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
 
 
-class Outcome(optx.RESULTS):  # pyright: ignore
+class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """How a fit ended: Optimistix's results, and `stalled`."""
 
     stalled = (
@@ -52,7 +57,7 @@ class Fit(eqx.Module):
     """
 
     parameters: PyTree
-    solution: optx.Solution
+    solution: optx.Solution[Any, Any]
     losses: Float[np.ndarray, " steps"]
     uncertainty: Uncertainty | None
 
@@ -81,7 +86,7 @@ def fit(
     residual: Residual | Callable[[Any], PyTree] | Any,
     parameters: PyTree,
     *,
-    solver: Solver | optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | Any = "levenberg_marquardt",
+    solver: Solver | OptimistixSolver | Any = "levenberg_marquardt",
     constraints: PyTree = None,
     where: Where | None = None,
     rtol: float = 1e-4,
@@ -192,7 +197,7 @@ def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
         return optx.BFGS(rtol, atol), 10
     if solver == "adam" or (hasattr(solver, "init") and hasattr(solver, "update")):
         try:
-            import optax
+            import optax  # pyright: ignore[reportMissingImports]
         except ImportError as fault:
             raise ImportError('solver="adam" needs Optax: pip install "jaxvol[fit]".') from fault
         optim = optax.adam(LEARNING_RATE) if solver == "adam" else solver
@@ -206,11 +211,11 @@ def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
 class _Run(eqx.Module):
     """State of a fit: everything that the next step depends on."""
 
-    y: tuple
+    y: FreeVariables
     state: Any
-    seen: tuple
+    seen: FreeVariables
     """The solver's point whose loss is known."""
-    best: tuple
+    best: FreeVariables
     triangle: Array | None
     """At the best point."""
     done: Array
@@ -218,7 +223,7 @@ class _Run(eqx.Module):
     losses: list[float] = eqx.field(static=True)
 
     @classmethod
-    def begin(cls, solver: Any, problem: Problem, y: tuple) -> "_Run":
+    def begin(cls, solver: Any, problem: Problem, y: FreeVariables) -> "_Run":
         """State after the first step, which evaluates the loss at the start."""
         state = _init_state(solver, problem, y)
         done = jnp.zeros((), bool)
@@ -253,13 +258,13 @@ class _Run(eqx.Module):
         return None
 
 
-def _squares(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, Array]]:
+def _squares(y: FreeVariables, problem: Problem) -> tuple[Array, tuple[Array, FreeVariables, Array]]:
     """Residual for a least-squares solver, with auxiliary output: the loss, its point, and the triangle."""
     triangle = problem.condensed(y)
     return triangle[:, -1], (jnp.sum(triangle[:, -1] ** 2) / 2, y, triangle)
 
 
-def _loss(y: tuple, problem: Problem) -> tuple[Array, tuple[Array, tuple, None]]:
+def _loss(y: FreeVariables, problem: Problem) -> tuple[Array, tuple[Array, FreeVariables, None]]:
     """Objective of a minimiser, with the same auxiliary output but no triangle."""
     loss = problem.loss(y)
     return loss, (loss, y, None)
@@ -270,7 +275,7 @@ def _function(solver: Any) -> Callable[..., Any]:
 
 
 @eqx.filter_jit
-def _init_state(solver: Any, problem: Problem, y: tuple) -> Any:
+def _init_state(solver: Any, problem: Problem, y: FreeVariables) -> Any:
     function = _function(solver)
     with _allow_promotion():
         out, aux = eqx.filter_eval_shape(function, y, problem)
@@ -278,7 +283,7 @@ def _init_state(solver: Any, problem: Problem, y: tuple) -> Any:
 
 
 @eqx.filter_jit
-def _advance(solver: Any, problem: Problem, y: tuple, state: Any) -> Any:
+def _advance(solver: Any, problem: Problem, y: FreeVariables, state: Any) -> Any:
     function = _function(solver)
     with _allow_promotion():
         y, state, previous_aux = solver.step(function, y, problem, {}, state, frozenset())

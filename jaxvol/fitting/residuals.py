@@ -20,9 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from .._util.checks import Arrayable, described, finite, finite_array
+from .._util.trees import PyTree
 from ..camera import Camera
 from ..compositing import Compositing, Mode, compositing_of
 from ..lighting.shading import Lighting
@@ -30,7 +31,7 @@ from ..march import March
 from ..render import Adjoint, render
 from ..transfer import Transfer
 from ..volume import Volume
-from .constraints import Free, size
+from .constraints import Free, FreeVariables, size
 
 
 TANGENTS = 64
@@ -136,7 +137,7 @@ class ImageResidual(Residual):
     scene: Scene
     groups: list[_Group]
     background: Float[Array, "3"]
-    compositing: Compositing
+    compositing: Compositing[Any]
 
     def __init__(
         self,
@@ -144,7 +145,7 @@ class ImageResidual(Residual):
         views: Sequence[tuple[Camera, Arrayable]] | Any,
         background: Arrayable = (1.0, 1.0, 1.0),
         *,
-        compositing: Mode | Compositing | Any = "over",
+        compositing: Mode | Compositing[Any] | Any = "over",
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
@@ -209,7 +210,7 @@ class ImageResidual(Residual):
         self, parameters: PyTree, group: _Group, view: Int[Array, ""]
     ) -> tuple[Volume, Transfer, Camera, March, Lighting | None]:
         of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
-        result = self.scene(parameters, of_view)
+        result = cast(Any, self.scene(parameters, of_view))
         kinds = Volume, Transfer, Camera, March, Lighting | None
         if not (
             isinstance(result, tuple)
@@ -286,13 +287,13 @@ class Problem(eqx.Module):
     tile: int = eqx.field(static=True)
     """Entries of the residual differentiated at once."""
 
-    def loss(self, free: tuple) -> Float[Array, ""]:
+    def loss(self, free: FreeVariables) -> Float[Array, ""]:
         """Half the sum of squares. Its gradient is summed tile by tile, in reverse mode."""
 
         def add(tiles: Tiles, total: Array, item: Any) -> Array:
             return total + self._loss_of(tiles, item, free)
 
-        def value_and_gradient(free: tuple) -> tuple[Array, tuple]:
+        def value_and_gradient(free: FreeVariables) -> tuple[Array, FreeVariables]:
             def add(tiles: Tiles, total: Any, item: Any) -> Any:
                 one = jax.value_and_grad(lambda free: self._loss_of(tiles, item, free))(free)
                 return jax.tree.map(jnp.add, total, one)
@@ -300,34 +301,34 @@ class Problem(eqx.Module):
             return self._accumulate(add, (self._zero, jax.tree.map(jnp.zeros_like, free)))
 
         @jax.custom_jvp
-        def loss(free: tuple) -> Array:
+        def loss(free: FreeVariables) -> Array:
             return self._accumulate(add, self._zero)
 
         @loss.defjvp
-        def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
+        def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Array, Array]:
             value, gradient = value_and_gradient(*primal)
             products = jax.tree.map(jnp.vdot, gradient, *tangent)
             return value, jnp.sum(jnp.stack(jax.tree.leaves(products)))
 
         return loss(free)
 
-    def condensed(self, free: tuple) -> Float[Array, "numbers numbers"]:
+    def condensed(self, free: FreeVariables) -> Float[Array, "numbers numbers"]:
         """The triangle, whose last column of n + 1 numbers replaces the residual, in value and derivative.
         Forward mode."""
 
         @jax.custom_jvp
-        def condensed(free: tuple) -> Array:
+        def condensed(free: FreeVariables) -> Array:
             return self._triangle(free)
 
         @condensed.defjvp
-        def _(primal: tuple, tangent: tuple) -> tuple[Array, Array]:
+        def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Array, Array]:
             triangle = self._triangle(*primal)
             change = triangle[:, :-1] @ ravel_pytree(*tangent)[0]
             return triangle, jnp.zeros_like(triangle).at[:, -1].set(change)
 
         return condensed(free)
 
-    def _triangle(self, free: tuple) -> Float[Array, "numbers numbers"]:
+    def _triangle(self, free: FreeVariables) -> Float[Array, "numbers numbers"]:
         """The triangle [R c; 0 ρ] of the QR factorisation of [J r], with a non-negative diagonal."""
         flat, unravel = ravel_pytree(free)
         n = flat.size
@@ -347,7 +348,7 @@ class Problem(eqx.Module):
     def _zero(self) -> Float[Array, ""]:
         return jnp.zeros(())
 
-    def _loss_of(self, tiles: Tiles, item: Any, free: tuple) -> Float[Array, ""]:
+    def _loss_of(self, tiles: Tiles, item: Any, free: FreeVariables) -> Float[Array, ""]:
         return jnp.sum(tiles.of(self.free.forward(free), item, "replay") ** 2) / 2
 
     def _accumulate(self, add: Callable[[Tiles, Any, Any], Any], total: Any) -> Any:
@@ -371,7 +372,7 @@ def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Arra
     return jnp.concatenate([columns, value[:1]]).T
 
 
-def tile_entries(residual: Residual, free: tuple, max_jacobian: int, least_squares: bool) -> int:
+def tile_entries(residual: Residual, free: FreeVariables, max_jacobian: int, least_squares: bool) -> int:
     """Number of residual entries differentiated at once: as many as have rows [J r] that fit into
     `max_jacobian` bytes; all of them if no Jacobian is computed."""
     if not least_squares:

@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from .constraints import Free
+from .constraints import Free, FreeVariables
 
 
 SHARE = 0.5
@@ -42,7 +42,11 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty(
-    triangle: Float[np.ndarray, "numbers numbers"], count: int, free: Free, at: tuple, scale: float = 0.0
+    triangle: Float[np.ndarray, "numbers numbers"],
+    count: int,
+    free: Free,
+    at: FreeVariables,
+    scale: float = 0.0,
 ) -> Uncertainty:
     """Uncertainty of the parameters `free.forward(at)`, from the triangle [R c; 0 ρ] there, the number of
     residuals, and the norm `scale` of the compared data.

@@ -19,7 +19,7 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
     header.refuse(path)
     n_bytes = file_size(path)
     try:
-        import SimpleITK as sitk
+        import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
     except ImportError as fault:
         raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault
     reader = sitk.ImageFileReader()
@@ -65,7 +65,7 @@ def _inflated_metaimage(path: Path, reader: Any) -> Any | None:
     The header may state the number of compressed bytes. If that is too small, ITK still trusts it and leaves
     the rest of the volume unset; here the end is that of the compressed stream itself.
     """
-    import SimpleITK as sitk
+    import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
 
     fields: dict[str, str] = {}
     if not path.name.lower().endswith((".mha", ".mhd")):

@@ -167,7 +167,7 @@ class ScattererTemplates(Lighting):
         energy: Energy | Any = "conserving",
         critical_angle: float | None = None,
         levels: int | None = None,
-        given: ScattererTemplate | None = None,
+        given: ScattererTemplate | Any | None = None,
     ):
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), bool(blend)
@@ -269,7 +269,7 @@ class ScattererTemplates(Lighting):
         return bake(TemplateShading(self, self.grown(blend=True), self._optics, None), around, nodes)
 
 
-def _bake_cache(_: Array) -> dict:
+def _bake_cache(_: Array) -> dict[Any, Any]:
     """Cache of a volume's baked light: the last one only, keyed by its other inputs."""
     return {}
 

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from .._util.fetching import Recording
+from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..march import March

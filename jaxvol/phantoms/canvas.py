@@ -8,6 +8,7 @@ values is painted, later layers over earlier ones.
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
+from jaxtyping import Float
 
 from .shapes import Block, Point, Shape
 
@@ -19,6 +20,10 @@ FAR = 10.0  # world units; more than any distance in the cube
 
 class Canvas:
     """Values, or signed distances, at the nodes of [-1, 1]³."""
+
+    axis: Float[np.ndarray, " nodes"]
+    spacing: float
+    values: Block
 
     def __init__(self, resolution: int, fill: float = 0.0):
         self.axis = np.linspace(-1, 1, resolution, dtype=np.float32)
@@ -53,12 +58,12 @@ class Canvas:
         it equally far out, so the first shape of a field is given the widest blend that follows.
         """
         for where, distance in self._distances(shapes, blend):
-            self.values[where] = _smooth_min(self.values[where], distance, blend)
+            self.values[where] = smooth_min(self.values[where], distance, blend)
 
     def carve(self, shapes: Shape | Iterable[Shape], blend: float = 0.0) -> None:
         """Difference from a field of distances; edges are rounded over a distance `blend`."""
         for where, distance in self._distances(shapes, blend):
-            self.values[where] = -_smooth_min(-self.values[where], distance, blend)
+            self.values[where] = -smooth_min(-self.values[where], distance, blend)
 
     def paint(
         self,
@@ -84,7 +89,7 @@ class Canvas:
         return np.rint(np.clip(self.values, 0, 255, out=self.values), out=self.values).astype(np.uint8)
 
 
-def _smooth_min(a: Block, b: Block, blend: float) -> Block:
+def smooth_min(a: Block, b: Block, blend: float) -> Block:
     if not blend:
         return np.minimum(a, b)
     overlap = np.maximum(blend - abs(a - b), 0)

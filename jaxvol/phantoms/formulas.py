@@ -20,28 +20,28 @@ def maker(value: Callable[..., Block]) -> Callable[[int, np.random.Generator], n
     return make
 
 
-def plane(x, y, z):
+def plane(x: Block, y: Block, z: Block) -> Block:
     height = 0.25 + 0.35 * (x + 1) / 2
     return _logistic(((z + 1) / 2 - height) / 0.004)
 
 
-def cut_block(x, y, z):
+def cut_block(x: Block, y: Block, z: Block) -> Block:
     return np.where(x < 0, 0.5 + 0.1 * np.sin(20 * (z + 1)), plane(x, y, z))
 
 
-def sphere(x, y, z):
+def sphere(x: Block, y: Block, z: Block) -> Block:
     return _logistic((0.5 - np.sqrt(x * x + y * y + z * z)) / 0.008)
 
 
-def constant(x, y, z):
+def constant(x: Block, y: Block, z: Block) -> Block:
     return np.ones_like(x)
 
 
-def linear(x, y, z):
+def linear(x: Block, y: Block, z: Block) -> Block:
     return (x + 1) / 2
 
 
-def gaussian(x, y, z):
+def gaussian(x: Block, y: Block, z: Block) -> Block:
     return np.exp((x * x + y * y + z * z) / (-2 * 0.3**2))
 
 

@@ -4,12 +4,16 @@ A CT-like head, face towards -y, crown towards +z; 1 world unit is about 14 cm. 
 everything else is painted over them.
 """
 
+from typing import TypeVar
+
 import numpy as np
 
 from .canvas import FAR, Canvas
-from .shapes import Shape, ball, box, capsule, ellipsoid, lengths, pair, tube
+from .shapes import Block, Shape, ball, box, capsule, ellipsoid, lengths, pair, tube
 from .waves import PlaneWaves
 
+
+Number = TypeVar("Number", float, np.ndarray)
 
 _BRAIN = (
     ellipsoid((0, 0.08, 0.345), (0.425, 0.565, 0.445)),
@@ -51,7 +55,7 @@ def make(n: int, rng: np.random.Generator) -> np.ndarray:
     )
     canvas.paint(lambda x, y, z, d: 222 - 36 * np.exp(-((middle(x, y, z) / 0.012) ** 2)), vault)
 
-    def brain(x, y, z, d):
+    def brain(x: Block, y: Block, z: Block, d: Block) -> Block:
         # furrows follow the zeros of a wave, and narrow from the surface inwards; grey matter lines both
         wave, depth = folds(x, y, z), np.clip(-d / 0.17, 0, 1)
         furrow = np.exp(-((wave / 0.3) ** 2)) * np.clip(2 - 2.5 * depth, 0, 1)
@@ -129,7 +133,7 @@ def _bones(n: int) -> Canvas:
     return bone
 
 
-def _arch(x):
+def _arch(x: Number) -> Number:
     """The dental arch: y of a tooth at x, a number or an array."""
     return -0.585 + 7.5 * x * x
 

@@ -36,7 +36,7 @@ def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
     (cx, cy, cz), (rx, ry, rz) = center, radii
     c, s, small = float(np.cos(yaw)), float(np.sin(yaw)), min(radii)
 
-    def distance(x, y, z):
+    def distance(x: Block, y: Block, z: Block) -> Block:
         x, y, z = x - cx, y - cy, z - cz
         if yaw:
             x, y = c * x + s * y, c * y - s * x
@@ -66,7 +66,7 @@ def capsule(a: Point, b: Point, radius: float, end_radius: float | None = None) 
     """A capsule along the segment a b, its radius linear from `radius` to `end_radius`."""
     end = radius if end_radius is None else end_radius
 
-    def distance(x, y, z):
+    def distance(x: Block, y: Block, z: Block) -> Block:
         away, t = to_segment(x, y, z, a, b)
         return away - (radius + t * (end - radius))
 
@@ -81,7 +81,7 @@ def tube(points: Sequence[Point], radius: float) -> list[Shape]:
 
 
 def box(center: Point, half: Point, rounding: float = 0.02) -> Shape:
-    def distance(x, y, z):
+    def distance(x: Block, y: Block, z: Block) -> Block:
         q = [abs(v - c) - (h - rounding) for v, c, h in zip((x, y, z), center, half, strict=True)]
         outside = np.sqrt(sum(np.maximum(v, 0) ** 2 for v in q))
         return outside + np.minimum(np.maximum(np.maximum(q[0], q[1]), q[2]), 0) - rounding
@@ -94,7 +94,7 @@ def cylinder(axis: int, center: Point, radius: float, half: float, sides: int = 
     tooth = 0.012 if wave else 0.0
     turns = (np.arange(sides) * (2 * np.pi / max(sides, 1))).tolist()
 
-    def distance(x, y, z):
+    def distance(x: Block, y: Block, z: Block) -> Block:
         p = [v - float(c) for v, c in zip((x, y, z), center, strict=True)]
         along = p.pop(axis)
         u, v = p
@@ -114,7 +114,7 @@ def ring(center: Point, radius: float, thickness: float) -> Shape:
     """A torus about the z direction."""
     cx, cy, cz = center
 
-    def distance(x, y, z):
+    def distance(x: Block, y: Block, z: Block) -> Block:
         across = np.sqrt((x - cx) ** 2 + (y - cy) ** 2) - radius
         return np.sqrt(across**2 + (z - cz) ** 2) - thickness
 

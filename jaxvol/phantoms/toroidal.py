@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from .._util.checks import integer
 from ..transforms.toroidal_map import ToroidalMap
 from ..volume import Volume
-from .canvas import SLAB, _smooth_min
+from .canvas import SLAB, smooth_min
 from .shapes import Block, Shape, ball, capsule, ellipsoid, tube
 
 
@@ -30,7 +30,7 @@ def toroidal_phantom(
     name: str,
     shape: tuple[int, int, int] | Any = (64, 96, 160),
     *,
-    probe: ToroidalMap | None = None,
+    probe: ToroidalMap | Any | None = None,
     speckle: bool = True,
     seed: int | Any = 0,
 ) -> tuple[Volume, ToroidalMap]:
@@ -142,8 +142,8 @@ def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     _paint(echo, 4, ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at))
     head, limbs = _joined(HEAD, at, 4), _joined(LIMBS, either_side, 2)
     body = _joined(TRUNK, at, 8)
-    body = _smooth_min(_smooth_min(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
-    body = _smooth_min(_smooth_min(limbs, body, 4), _joined(CORD, at, 0), 2)
+    body = smooth_min(smooth_min(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
+    body = smooth_min(smooth_min(limbs, body, 4), _joined(CORD, at, 0), 2)
     _paint(echo, 120, body)
     _paint(echo, 70, body + 2)
     _paint(echo, 170, head + 2.5)
@@ -155,7 +155,7 @@ def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
 
 def _joined(shapes: Iterable[Shape], at: tuple[Block, Block, Block], blend: float) -> Block:
     """Distance to the union of shapes, with rounded seams."""
-    return reduce(lambda a, b: _smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
+    return reduce(lambda a, b: smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
 
 
 # parts of the fetus; of paired ones, that at y > 0

@@ -7,6 +7,7 @@ it feeds and splits them between two children, whose radii follow Murray's law.
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Float
 
 from .canvas import FAR, Canvas
 from .shapes import capsule
@@ -19,7 +20,13 @@ GENERATIONS = 8
 def make(n: int, rng: np.random.Generator) -> np.ndarray:
     field = Canvas(n, FAR)
 
-    def grow(start, heading, radius, cloud, generation):
+    def grow(
+        start: Float[np.ndarray, "3"],
+        heading: Float[np.ndarray, "3"],
+        radius: float,
+        cloud: Float[np.ndarray, "points 3"],
+        generation: int,
+    ) -> None:
         # the last branch reaches the centroid of its points, the others go half of the way
         middle = cloud.mean(axis=0)
         end = start + (middle - start) * (0.5 if generation < GENERATIONS else 1)

@@ -1,12 +1,16 @@
 """Smooth random textures that are the same at every resolution."""
 
 import numpy as np
+from jaxtyping import Float
 
 from .shapes import Block
 
 
 class PlaneWaves:
     """A smooth random texture: a sum of plane waves with wavelengths of a given range, variance 1."""
+
+    wave_vector: Float[np.ndarray, "waves 3"]
+    phase: Float[np.ndarray, " waves"]
 
     def __init__(self, rng: np.random.Generator, shortest: float, longest: float, count: int = 32):
         direction = rng.normal(size=(count, 3))

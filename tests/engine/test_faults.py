@@ -153,7 +153,7 @@ def test_the_gradient_does_not_march_with_a_nan_step():
 def test_rays_that_are_not_finite_fail_when_the_program_runs():
     volume, transfer, camera, march = scene()
     origins, directions = camera.rays()
-    image = jax.jit(lambda *rays: jv.render_rays(volume, transfer, *rays, march, outputs="rgba").rgba)
+    image = jax.jit(lambda *rays: jv.render_rays(volume, transfer, *rays, march=march, outputs="rgba").rgba)
     assert np.isfinite(image(origins, directions)).all()
     for fault in (np.nan, np.inf):
         with pytest.raises(Exception, match="origins must be finite"):

@@ -276,7 +276,7 @@ def test_adjoints_agree_to_rounding(name):
             assert_slopes(slopes(scene), expected, scene, 1e-9, camera, absent)
             for method in EXACT:
                 leapt = scene_of(name, method, "float64", camera)
-                assert_same(gradient(leapt), expected, 1e-9, (camera, method), absent)
+                assert_same(gradient(leapt), expected, 1e-9, f"{camera}, {method}", absent)
 
 
 @slow
@@ -363,7 +363,7 @@ def test_rays_of_ones_own(method):
 
         def of(given, leaps, adjoint):
             volume, transfer, _, march = scene_of("jittered", leaps)
-            rendering = jv.render_rays(volume, transfer, *given, march, adjoint=adjoint)
+            rendering = jv.render_rays(volume, transfer, *given, march=march, adjoint=adjoint)
             weights = np.random.default_rng(5).normal(size=rendering.rgba.shape)
             return jnp.sum(rendering.rgba * jnp.asarray(weights))
 

@@ -205,7 +205,9 @@ def workspace(samples, size=512, resolution=256):
         return jnp.sum(jv.render(volume, transfer, camera, march).rgba ** 2)
 
     compiled = jax.jit(jax.grad(loss)).lower((data, soft_transfer(), camera)).compile()
-    return compiled.memory_analysis().temp_size_in_bytes
+    analysis = compiled.memory_analysis()
+    assert analysis is not None
+    return analysis.temp_size_in_bytes
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -67,11 +68,14 @@ def sharded(scene, tmp_path_factory):
     """Results on two devices, computed in a subprocess."""
     volume, transfer, (origins, directions), weights = scene
     folder = tmp_path_factory.mktemp("sharded")
+    points: dict[str, Any] = {
+        name: np.asarray(getattr(transfer, name)) for name in ("values", "colors", "extinction")
+    }
     np.savez(
         folder / "given.npz",
         data=np.asarray(volume.data),
         spacing=np.asarray(volume.spacing),
-        **{name: np.asarray(getattr(transfer, name)) for name in ("values", "colors", "extinction")},
+        **points,
         origins=origins,
         directions=directions,
         weights=weights,
@@ -93,7 +97,7 @@ def test_image_and_gradient_are_those_of_one_device(scene, sharded):
 
     @jax.jit  # as for the shards, since compiled programs round differently
     def image(transfer):
-        return jv.render_rays(volume, transfer, *rays, march).rgba
+        return jv.render_rays(volume, transfer, *rays, march=march).rgba
 
     whole, pull = jax.vjp(image, transfer)
     gradient = pull(jnp.asarray(weights))[0]
@@ -103,10 +107,12 @@ def test_image_and_gradient_are_those_of_one_device(scene, sharded):
     np.testing.assert_allclose(sharded["unchecked"], whole, atol=5e-6, rtol=0)
     for leaf in ("colors", "extinction"):
         expected = np.asarray(getattr(gradient, leaf))
-        np.testing.assert_allclose(sharded[leaf], expected, atol=1e-5 * np.linalg.norm(expected), rtol=0)
+        np.testing.assert_allclose(
+            sharded[leaf], expected, atol=1e-5 * float(np.linalg.norm(expected)), rtol=0
+        )
 
 
 def test_pixels_must_be_integers_for_every_ray(scene):
     volume, transfer, rays, _ = scene
     with pytest.raises(ValueError, match=r"pixels must be integers of shape \(512, 2\); got float32"):
-        jv.render_rays(volume, transfer, *rays, jv.March(0.05), pixels=np.zeros((512, 2), np.float32))
+        jv.render_rays(volume, transfer, *rays, march=jv.March(0.05), pixels=np.zeros((512, 2), np.float32))

@@ -27,8 +27,8 @@ class Patchy(jv.Transform):
 
 
 def with_strides(scene):
-    *rest, march = scene
-    return *rest, jv.March(march.step, (*march.transforms, Patchy()), march.quadrature)
+    volume, transfer, camera, march = scene
+    return volume, transfer, camera, jv.March(march.step, (*march.transforms, Patchy()), march.quadrature)
 
 
 @pytest.mark.parametrize(

@@ -54,10 +54,12 @@ def test_a_custom_field_is_used_for_image_and_gradient(dtype):
     )
     assert float(truth[..., 3].max()) > 0.3
     np.testing.assert_allclose(image, truth, atol=2e-5, rtol=0)
-    np.testing.assert_allclose(of_position, expected, atol=2e-4 * np.linalg.norm(expected), rtol=0)
+    np.testing.assert_allclose(of_position, expected, atol=2e-4 * float(np.linalg.norm(expected)), rtol=0)
     if dtype == "float32":
         expected = -of_values / 255
-        np.testing.assert_allclose(of_data, expected, atol=2e-4 * np.linalg.norm(expected) + 1e-6, rtol=0)
+        np.testing.assert_allclose(
+            of_data, expected, atol=2e-4 * float(np.linalg.norm(expected)) + 1e-6, rtol=0
+        )
 
 
 @pytest.mark.parametrize("dtype", ["float16", pytest.param("bfloat16", marks=pytest.mark.slow)])

@@ -20,6 +20,7 @@ from jaxvol.fitting import Outcome, checkpoints
 from jaxvol.fitting.bijections import Bijection
 from jaxvol.fitting.constraints import Free
 from jaxvol.fitting.residuals import OwnResidual, Problem
+from jaxvol.fitting.uncertainty import Uncertainty
 from jaxvol.metrics import psnr
 
 from ..scenes import in_float64
@@ -197,6 +198,11 @@ def test_views_may_differ_in_size_and_channels():
 # uncertainty
 
 
+def uncertainty_of(found: jv.Fit) -> Uncertainty:
+    assert found.uncertainty is not None
+    return found.uncertainty
+
+
 def test_covariance_of_a_line_is_that_of_the_textbook():
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(30, 3)).astype(np.float32)
@@ -205,7 +211,7 @@ def test_covariance_of_a_line_is_that_of_the_textbook():
     solution, square, *_ = np.linalg.lstsq(matrix.astype(float), data.astype(float))
     np.testing.assert_allclose(result.parameters, solution, rtol=1e-4)
     expected = square / (30 - 3) * np.linalg.inv(matrix.T.astype(float) @ matrix)
-    uncertainty = result.uncertainty
+    uncertainty = uncertainty_of(result)
     np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-3, atol=1e-3 * abs(expected).max())
     assert uncertainty.names == ["[0]", "[1]", "[2]"]
     assert uncertainty.standard_errors["[1]"] == pytest.approx(np.sqrt(expected[1, 1]), rel=1e-3)
@@ -213,8 +219,8 @@ def test_covariance_of_a_line_is_that_of_the_textbook():
 
 
 def test_covariance_is_of_the_parameters_and_not_of_the_free_numbers():
-    free = jv.fit(curve, CURVE, constraints=jv.Unconstrained(), rtol=1e-6).uncertainty
-    bound = jv.fit(curve, CURVE, constraints=jv.Positive(), rtol=1e-6).uncertainty
+    free = uncertainty_of(jv.fit(curve, CURVE, constraints=jv.Unconstrained(), rtol=1e-6))
+    bound = uncertainty_of(jv.fit(curve, CURVE, constraints=jv.Positive(), rtol=1e-6))
     np.testing.assert_allclose(free.covariance, bound.covariance, rtol=1e-2)
     assert free.names == ["['rate'][0]", "['top']"]
 
@@ -236,7 +242,7 @@ def test_covariance_is_the_scatter_of_repeated_fits():
     scatter = np.cov(
         [[float(f.parameters["rate"][0]), float(f.parameters["top"])] for f in fits], rowvar=False
     )
-    reported = np.mean([f.uncertainty.covariance for f in fits], axis=0)
+    reported = np.mean([uncertainty_of(f).covariance for f in fits], axis=0)
     np.testing.assert_allclose(np.sqrt(np.diag(reported)), np.sqrt(np.diag(scatter)), rtol=0.2)
 
 
@@ -246,7 +252,7 @@ def test_a_direction_that_nothing_shows_is_named():
     start = jv.TransferFunction(values, GREY.colors, GREY.extinction)
     with pytest.warns(UserWarning, match=r"of 32 directions are not determined .*\.extinction\[7\]"):
         result = jv.fit(RESIDUAL, start, max_steps=3)
-    uncertainty = result.uncertainty
+    uncertainty = uncertainty_of(result)
     assert [".extinction[7]"] in uncertainty.undetermined
     for name in (".extinction[7]", ".colors[7, 0]", ".colors[7, 2]"):
         assert uncertainty.standard_errors[name] == np.inf
@@ -258,7 +264,7 @@ def test_a_direction_that_nothing_shows_is_named():
 def test_as_many_parameters_as_residuals_leave_the_variance_unknown():
     result = jv.fit(lambda p: p**2 - jnp.asarray([4.0, 9.0]), jnp.asarray([1.0, 1.0]))
     np.testing.assert_allclose(result.parameters, [2, 3], rtol=1e-4)
-    assert np.all(np.diag(result.uncertainty.covariance) == np.inf)
+    assert np.all(np.diag(uncertainty_of(result).covariance) == np.inf)
 
 
 # free parameters
@@ -573,9 +579,11 @@ def test_a_fit_that_is_killed_at_random_ends_with_the_same_bits(tmp_path):
             command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": root}
         )
 
-    assert start("whole").wait() == 0
+    run = start("whole")
+    assert run.wait() == 0
     for _ in range(3):
         run = start("killed")
+        assert run.stdout is not None
         run.stdout.readline()  # wait until it has started
         time.sleep(rng.uniform(0, 1))
         run.send_signal(signal.SIGKILL)

@@ -2,9 +2,11 @@
 
 import functools
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -106,7 +108,7 @@ MATERIALS = (
 IRRADIANCE = np.array([1.0, 2.0, 3.0])
 
 
-def radiance_of(opacity, irradiance=1.0):
+def radiance_of(opacity, irradiance: float | np.ndarray = 1.0):
     """Factor of E b (c + s) in a sample's radiance: 4 / (3π) times the reflectance of a half-space."""
     gamma = np.sqrt(opacity)
     return 4 / (3 * np.pi) * (1 - gamma) / (1 + gamma) * (1 - gamma / (3 * (1 + gamma))) * irradiance
@@ -733,6 +735,7 @@ def test_baked_light_comes_closer_to_the_blended_one_as_its_grid_gets_finer():
     for resolution in (5, 37):
         lighting = ScattererTemplates(FLESH, DAY, baked=resolution, **how)
         ready = lighting.prepared(volume, PLAIN, jv.March(0.1))
+        assert isinstance(ready, BakedLighting)
         assert ready.shape == (resolution,) * 3
         errors.append(np.abs(shade(ready, volume, PLAIN, points) - exact).mean())
     assert errors[1] < errors[0]
@@ -757,15 +760,14 @@ def test_light_is_baked_once_for_what_stays_the_same(monkeypatch):
     assert prepared() is first
     assert prepared(step=0.2) is first
     assert len(calls) == 1
-    for number, changed in enumerate(
-        (
-            {"light": DirectionalLight((0, 1.0, -1))},
-            {"path": 0.2},
-            {"transfer": eqx.tree_at(lambda t: t.colors, PLAIN, PLAIN.colors / 2)},
-            {"volume": jv.Volume(volume.data + 0.1, volume.spacing, volume.origin)},
-            {"volume": jv.Volume(volume.data, 2 * volume.spacing, volume.origin)},
-        )
-    ):
+    changes: list[dict[str, Any]] = [
+        {"light": DirectionalLight((0, 1.0, -1))},
+        {"path": 0.2},
+        {"transfer": eqx.tree_at(lambda t: t.colors, PLAIN, PLAIN.colors / 2)},
+        {"volume": jv.Volume(volume.data + 0.1, volume.spacing, volume.origin)},
+        {"volume": jv.Volume(volume.data, 2 * volume.spacing, volume.origin)},
+    ]
+    for number, changed in enumerate(changes):
         assert prepared(**changed) is prepared(**changed)
         assert len(calls) == number + 2, changed
 
@@ -804,7 +806,7 @@ def loss_of_an_image(kind, lighting):
     march, camera = jv.March(0.2, (jv.AlphaCorrection(),), max_samples=32), around(volume, (9, 7))
 
     def loss(scene, adjoint):
-        return jnp.sum(jv.render(*scene, march, lighting=lighting, adjoint=adjoint).rgba ** 2)
+        return jnp.sum(jv.render(*scene, march=march, lighting=lighting, adjoint=adjoint).rgba ** 2)
 
     return loss, (volume, transfer, camera)
 
@@ -956,7 +958,8 @@ class Dimmed(Lighting):
             return None
 
         def color(self, sample, notes, sums):
-            return tuple(part / 2 for part in sample.color)
+            r, g, b = (part / 2 for part in sample.color)
+            return r, g, b
 
     def shading(self, around):
         return Dimmed.Half()

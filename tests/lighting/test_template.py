@@ -88,7 +88,7 @@ def test_a_conserving_template_never_holds_more_than_the_light_it_began_with(gro
 
 
 def test_photons_are_sorted_brightest_first(grown):
-    assert np.all(np.diff(np.asarray(grown.intensity), axis=-1) <= 0)
+    assert np.all(jnp.diff(grown.intensity, axis=-1) <= 0)
 
 
 def test_no_template_has_more_photons_than_room_is_made_for(grown):
@@ -332,7 +332,7 @@ def test_a_blend_holds_the_mean_energy_and_all_photons(grown):
     blend = grown.blended()
     assert blend.intensity.shape == (len(OPACITIES), TEMPLATES * grown.intensity.shape[-1])
     np.testing.assert_allclose(totals(blend), totals(grown).mean(axis=1), rtol=1e-5)
-    assert np.all(np.diff(np.asarray(blend.intensity), axis=-1) <= 0)
+    assert np.all(jnp.diff(blend.intensity, axis=-1) <= 0)
     where = np.einsum("mn,mnx->mx", blend.intensity, blend.offset)
     np.testing.assert_allclose(
         where, np.einsum("mtn,mtnx->mx", grown.intensity, grown.offset) / TEMPLATES, atol=1e-4

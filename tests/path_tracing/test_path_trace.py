@@ -41,7 +41,8 @@ FURNACE = lit(ConstantLight())
 
 
 def trace(volume, transfer, camera, lights, **how: Any) -> jv.PathTraced:
-    return jv.path_trace(volume, transfer, camera, lights, **({"paths": PATHS} | how))
+    how.setdefault("paths", PATHS)
+    return jv.path_trace(volume, transfer, camera, lights, **how)
 
 
 def often(times: int, *scene: Any, **how: Any) -> jv.PathTraced:
@@ -410,7 +411,7 @@ def test_what_is_invisible_is_empty():
     volume = anisotropic_noise()
     traced = trace(volume, uniform_transfer(0.0), around(volume), lit(SUN, LAMP, SKY))
     assert float(traced.opacity.max()) == 0
-    np.testing.assert_array_equal(traced.image((0.2, 0.4, 0.6))[0, 0], np.float32([0.2, 0.4, 0.6]))
+    np.testing.assert_array_equal(traced.image((0.2, 0.4, 0.6))[0, 0], np.array([0.2, 0.4, 0.6], np.float32))
     assert float(traced.standard_error.max()) == 0
 
 

@@ -38,10 +38,11 @@ def test_cosines_are_sampled_from_the_phase_function(g):
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, -0.64, 0.48)])
 def test_directions_turn_around_the_one_before(axis):
-    axis = np.float32(axis)
+    axis = np.asarray(axis, np.float32)
     first, second = jax.random.uniform(jax.random.key(0), (2, 40_000))
     around = sample_phase(jnp.float32(0.4), first, second)
-    x, y, z = turned(around, tuple(jnp.full(40_000, a) for a in axis))
+    x, y, z = (jnp.full(40_000, a) for a in axis)
+    x, y, z = turned(around, (x, y, z))
     direction = np.stack([x, y, z], axis=-1).astype(float)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-6)
     np.testing.assert_allclose(direction @ axis, around[2], atol=1e-6)

@@ -590,6 +590,7 @@ def reference_rays(volume, transfer, origin, direction, march):
 
 def test_one_program_serves_a_session():
     """New cameras, transfer functions, seeds and voxels on every frame."""
+    before = None
     for i in range(11):
         volume = jv.Volume(bytes_of(contents("blobs", i)), SPACING)
         transforms = (jv.EmptySpaceJitter(i), jv.AlphaCorrection(), jv.EarlyTermination(0.01 + 0.01 * i))

@@ -1,6 +1,7 @@
 """The toroidal map: does it match the paper's formula, where do rays meet the sector, are images right?"""
 
 import itertools
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -77,7 +78,7 @@ def nodes(probe, shape):
     """(β, σ, γ) of the nodes of a grid."""
     return np.stack(
         np.meshgrid(
-            *(np.linspace(*ends, n) for ends, n in zip(probe[2:], shape, strict=True)), indexing="ij"
+            *(np.linspace(*ends, num=n) for ends, n in zip(probe[2:], shape, strict=True)), indexing="ij"
         ),
         -1,
     )
@@ -245,7 +246,7 @@ def test_entry_and_exit_are_the_first_and_last_place_inside(name):
     t_in, length = (np.asarray(part) for part in part_inside(probe_of(name), origins, directions))
     found = missed = within = gaps = 0
     for origin, direction, near, extent in zip(origins, directions, t_in, length, strict=True):
-        pieces = pieces_inside(origin, direction, probe, reach=3 * size + np.linalg.norm(origin))
+        pieces = pieces_inside(origin, direction, probe, reach=3 * size + float(np.linalg.norm(origin)))
         if len(pieces) == 0:
             missed += 1
             # a ray that grazes the sector may get an empty interval
@@ -278,8 +279,8 @@ def test_a_ray_from_the_hollow_begins_at_the_near_face():
     (near,), (extent,) = part_inside(probe_of("across the middle"), jnp.zeros((1, 3)), jnp.eye(3)[2:])
     np.testing.assert_allclose([near, extent], [50, 60], atol=1e-4)
     origins, directions = (
-        np.float32([[0, 0, 45], [0, 0, 50], [0, 0, 110], [0, 0, 80]]),
-        np.float32([[0, 1, 0]]),
+        np.array([[0, 0, 45], [0, 0, 50], [0, 0, 110], [0, 0, 80]], np.float32),
+        np.array([[0, 1, 0]], np.float32),
     )
     directions = np.repeat(directions, 4, 0)
     t_in, length = part_inside(probe_of("across the middle"), origins, directions)
@@ -330,6 +331,7 @@ def test_gradients_of_entry_and_length_match_finite_differences(name):
 
         ends = jax.jit(ends)
         random, changed = np.random.default_rng(0), jax.jit(lambda p, c: jax.jvp(ends, (p,), (c,))[1])
+        change = {}
         for key, leaf in leaves.items():
             change = {k: jnp.zeros_like(v) for k, v in leaves.items()}
             change[key] = jnp.asarray(random.normal(size=leaf.shape))
@@ -481,11 +483,12 @@ def view(probe, size=(9, 7)):
 def reference_image(volume, transfer, camera, march):
     width, height = camera.size
     column, row = jnp.meshgrid(jnp.arange(width), jnp.arange(height))
+    origins, directions = camera.rays()
 
     def one(origin, direction, column, row):
         return jv.render_ray_reference(volume, transfer, origin, direction, march, pixel=(column, row))
 
-    return jax.vmap(jax.vmap(one))(*camera.rays(), column, row)
+    return jax.vmap(jax.vmap(one))(origins, directions, column, row)
 
 
 @pytest.mark.slow
@@ -589,7 +592,9 @@ def test_world_gradient_is_the_slope_of_the_value_in_the_world():
         flat = jv.Volume((0.3 * i - 0.7 * j + 0.2 * k).astype(np.float32))
         points = world_of(nodes(PROBES["apex behind the axis"], (4, 4, 4))[1:-1, 1:-1, 1:-1] + 0.011, -15, 40)
         noise = noise_volume()
-        for volume, method in ((noise, "trilinear"), (flat, "trilinear"), (flat, "central")):
+        cases: list[tuple[jv.Volume, Literal["trilinear", "central"]]]
+        cases = [(noise, "trilinear"), (flat, "trilinear"), (flat, "central")]
+        for volume, method in cases:
             space = jv.March(1.0, (probe,)).locate(volume)
 
             def value(point, volume=volume, space=space):
@@ -610,7 +615,7 @@ def test_image_gradients_in_the_probe_match_central_differences(adjoint):
     """From behind the probe, where no ray meets a gap: the motion of gap faces is not in the gradient."""
     with in_float64():
         names = ("a", "b", "beta", "sigma", "gamma")
-        leaves = dict(zip(names, map(jnp.asarray, PROBES["across the middle"]), strict=True))
+        leaves: dict[str, Any] = dict(zip(names, map(jnp.asarray, PROBES["across the middle"]), strict=True))
         leaves["position"] = jnp.asarray([6.0, -9.0, -150.0])
         volume = jv.Volume(np.random.default_rng(0).random((6, 5, 7)))
         weights = jnp.asarray(np.random.default_rng(5).normal(size=(5, 6, 4)))
@@ -623,8 +628,7 @@ def test_image_gradients_in_the_probe_match_central_differences(adjoint):
             return jnp.sum(weights * jv.render(volume, ramp_transfer(), camera, march, adjoint=adjoint).rgba)
 
         random = np.random.default_rng(1)
-        if adjoint == "replay":
-            gradient = jax.jit(jax.grad(loss))(leaves)
+        gradient = jax.jit(jax.grad(loss))(leaves) if adjoint == "replay" else {}
         for key, leaf in leaves.items():
             change = {k: jnp.zeros_like(v) for k, v in leaves.items()}
             change[key] = jnp.asarray(random.normal(size=leaf.shape))
