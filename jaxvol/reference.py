@@ -58,12 +58,12 @@ class Progress(eqx.Module):
     index: Int[Array, ""]
     offset: Scalar
     composite: PyTree
-    met: "Met | None"
+    stats: "SampleStats | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
 
 
-class Met(eqx.Module):
+class SampleStats(eqx.Module):
     """What `Rendering.samples` and `Rendering.aligned` report."""
 
     samples: Int[Array, ""]
@@ -86,7 +86,7 @@ def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Prog
         index=count,
         offset=march.start(ray),
         composite=compositing.begin(zero, outputs),
-        met=Met(count, no) if outputs == "all" else None,
+        stats=SampleStats(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
     )
@@ -120,7 +120,7 @@ def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Sc
     return 2 * t / (1 + t)
 
 
-def counts(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
+def is_sample(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
     """Whether a piece counts as a sample. Where a cell is not divided, some of its pieces have width 0."""
     return (march.sample(piece) < ray.length) & (piece.width > 0)
 
@@ -130,16 +130,17 @@ def add(
 ) -> Progress:
     """Composites a piece of the next cell. A ray that is finished sees no more."""
     march, _, _, compositing = pipeline
-    depth, taken = march.sample(piece), ~at.finished & counts(march, ray, piece)
+    depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece)
     alpha = jnp.where(at.finished, 0, alpha)
     fragment = Fragment(alpha, depth, value, color, taken & contained(ray, depth))
-    met = at.met
-    if met is not None:
+    stats = at.stats
+    if stats is not None:
         shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
-        met = Met(met.samples + taken.astype(met.samples.dtype), met.aligned | (piece.cut & shows))
+        samples = stats.samples + taken.astype(stats.samples.dtype)
+        stats = SampleStats(samples, stats.aligned | (piece.cut & shows))
     composite = compositing.add(at.composite, fragment)
     check_answer(compositing, "add", composite, at.composite)
-    return replace(at, composite=composite, met=met)
+    return replace(at, composite=composite, stats=stats)
 
 
 def stop(pipeline: Pipeline, at: Progress) -> Progress:
@@ -198,8 +199,8 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
     rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
     if depth is not None:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
-    if at.met is not None:
-        details = details._replace(samples=at.met.samples, aligned=at.met.aligned)
+    if at.stats is not None:
+        details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
     if isinstance(pipeline.compositing, Selection):
         details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)

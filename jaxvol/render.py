@@ -17,8 +17,8 @@ from .compositing import Compositing, Mode, Selection, compositing_of
 from .engine.acceleration import VolumeAcceleration
 from .engine.adjoints import AbstractAdjoint, Adjoint, adjoint_of
 from .engine.image import RenderOptions
+from .engine.rays import OwnRays
 from .engine.scene import Scene
-from .engine.tiles import OwnRays
 from .engine.tiling import Tiling
 from .lighting.shading import Lighting
 from .march import March

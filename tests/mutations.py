@@ -90,7 +90,7 @@ MUTATIONS = [
     ),
     Mutation(
         "camera: rays round differently in each program that differentiates them",
-        "engine/tiles.py",
+        "engine/rays.py",
         "return in_memory(all_finite(camera), vmap_rays(partial(_of_pixel, camera)), columns, rows)",
         "return vmap_rays(partial(_of_pixel, camera))(columns, rows)",
         ("test_camera.py::test_rays_round_alike_whether_or_not_they_are_differentiated",),
@@ -104,14 +104,14 @@ MUTATIONS = [
     ),
     Mutation(
         "jitter: keyed by the position within a beam, not by the pixel",
-        "engine/tiles.py",
+        "engine/rays.py",
         "(column + left, row + top))",
         "((column + left) % 8, (row + top) % 8))",
         (f"{RENDERED}[jittered-left]",),
     ),
     Mutation(
         "jitter: every shard draws the same numbers",
-        "engine/tiles.py",
+        "engine/rays.py",
         "return self.first + place, jnp.zeros_like(place)",
         "return place, jnp.zeros_like(place)",
         ("engine/test_sharding.py::test_image_and_gradient_are_those_of_one_device",),
@@ -283,7 +283,7 @@ MUTATIONS = [
     ),
     Mutation(
         "rays: index of 64 bits added to one of 32 under x64",
-        "engine/tiles.py",
+        "engine/rays.py",
         "place = place.astype(jnp.int32)  # from 64 bits under x64",
         "pass",
         ("engine/test_tiling.py::test_rays_of_ones_own_draw_the_same_numbers_in_float64",),
@@ -311,7 +311,7 @@ MUTATIONS = [
     ),
     Mutation(
         "selection: rays are rounded as the compiler likes",
-        "engine/tiles.py",
+        "engine/rays.py",
         "return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None]))",
         "return jax.vmap(partial(_of_pixel, source))(columns, rows)",
         ("test_selections.py::test_a_face_between_labels_is_seen_from_the_side_of_its_cell",),
@@ -527,8 +527,8 @@ MUTATIONS = [
     Mutation(
         "replay: camera gradient of the last tile only",
         "engine/gradients.py",
-        "return (total, added(of_source, of_rays_source)), None",
-        "return (total, jax.tree.map(jnp.zeros_like, of_source)), None",
+        "return _Sums(total, added(sums.source, of_source))",
+        "return _Sums(total, jax.tree.map(jnp.zeros_like, of_source))",
         (FORWARD_GRADIENT,),
     ),
     # compiled programs

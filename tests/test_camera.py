@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.engine.tiles import RayTiles
+from jaxvol.engine.rays import RayTiles
 from jaxvol.engine.tiling import Tiling
 from jaxvol.space import Affine
 

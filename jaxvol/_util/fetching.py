@@ -69,27 +69,28 @@ class Recording(Fetch):
     """Records which voxels are fetched, and adds a value to each, so that the VJP with respect to these
     values returns one cotangent per fetch.
 
-    - `added`: the values, in the order of the fetches; if empty, nothing is added (to count the fetches).
-    - `asked`: indices into the flattened voxels, filled while a program is traced.
+    - `perturbations`: the values, in the order of the fetches; if empty, nothing is added (to count the
+      fetches).
+    - `indices`: indices into the flattened voxels, filled while a program is traced.
     """
 
-    added: list[Shaped[Array, "..."]]
-    asked: list[Int[Array, "..."]] = eqx.field(static=True)
+    perturbations: list[Shaped[Array, "..."]]
+    indices: list[Int[Array, "..."]] = eqx.field(static=True)
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         def voxel(flat: Int[Array, ""]) -> Shaped[Array, ""]:
-            self.asked.append(flat)
+            self.indices.append(flat)
             value = jax.lax.stop_gradient(fetched(data, flat))
-            return value if not self.added else value + self.added[len(self.asked) - 1]
+            return value if not self.perturbations else value + self.perturbations[len(self.indices) - 1]
 
         return cube_of(voxel, data.shape, coordinate)
 
 
 def scatter_add(
-    voxels: Float[Array, " voxels"], asked: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
+    voxels: Float[Array, " voxels"], indices: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
 ) -> Float[Array, " voxels"]:
-    """Add the cotangents `parts` of fetches to the voxels `asked` that they read."""
-    for place, part in zip(asked, parts, strict=True):
+    """Add the cotangents `parts` of fetches to the voxels `indices` that they read."""
+    for place, part in zip(indices, parts, strict=True):
         voxels = voxels.at[place].add(
             part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
         )

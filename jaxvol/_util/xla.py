@@ -111,7 +111,7 @@ _batch = compiled(_each)
 def recomputed(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function as one program, and its reverse-mode derivative as another, which recomputes the function
     instead of keeping residuals. Both are `compiled`. For functions from trees to one array."""
-    forward, backward = compiled(function), compiled(_pulled)
+    forward, backward = compiled(function), compiled(_vjp_of)
 
     @eqx.filter_custom_vjp
     def run(args: tuple[Any, ...]) -> Any:
@@ -128,7 +128,7 @@ def recomputed(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *args: run(args)
 
 
-def _pulled(function: Callable[..., Any], perturbed: PyTree, args: tuple[Any, ...], cotangent: Any) -> Any:
+def _vjp_of(function: Callable[..., Any], perturbed: PyTree, args: tuple[Any, ...], cotangent: Any) -> Any:
     moving, fixed = eqx.partition(args, perturbed)
     _, pull = jax.vjp(lambda moving: function(*eqx.combine(moving, fixed)), moving)
     return pull(cotangent)[0]

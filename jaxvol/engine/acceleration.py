@@ -14,8 +14,8 @@ from ..reference import Pipeline, end
 from ..volume import Volume
 from .batch import Beams
 from .packing import with_words, words_of
+from .rays import OwnRays, RayTiles, lines, vmap_rays
 from .scene import Scene
-from .tiles import OwnRays, RayTiles, lines, vmap_rays
 from .tiling import Tiling
 from .wavefront import march_rays
 

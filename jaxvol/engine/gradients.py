@@ -23,10 +23,10 @@ from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
 from .image import RenderOptions, fault_of, pipeline_of
+from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
 from .scene import Scene
 from .shading_gradient import Lit
-from .tiles import RayTiles
 from .tiling import Tiling
 from .wavefront import march_rays
 
@@ -49,7 +49,9 @@ def render_vjp(
         *(rendering, cotangent),
         is_leaf=lambda leaf: leaf is None,
     )
-    found = eqx.filter(_pulled(scene, perturbed, options, acceleration, rendering, ranges, whole), perturbed)
+    found = eqx.filter(
+        _vjp_by_tiles(scene, perturbed, options, acceleration, rendering, ranges, whole), perturbed
+    )
     # rays that are NaN are not marched, and would leave a gradient of 0
     floats_of = (jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)) for tree in (rendering, whole))
     lost = [jnp.any(jnp.isnan(leaf) & (part != 0)) for leaf, part in zip(*floats_of, strict=True)]
@@ -117,7 +119,7 @@ class _Image(NamedTuple):
         return _Sums(total, added(sums.source, of_source))
 
 
-def _pulled(
+def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,
     options: RenderOptions,

@@ -17,8 +17,8 @@ from ..rendering import Rendering
 from ..space import Ray, Space, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, VisibleRangeRecorder
+from .rays import RayTiles, vmap_rays
 from .scene import Scene
-from .tiles import RayTiles, vmap_rays
 from .tiling import Tiling
 from .wavefront import march_rays
 

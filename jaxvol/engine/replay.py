@@ -39,9 +39,9 @@ from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
 from .segment import Ahead, Samples, SampleVisitor, pieces_ahead, vmap_cells
-from .shading import Weights, weights_of
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
 from .tiling import Tiling
+from .visible_samples import Weights, weights_of
 
 
 class Cotangents(NamedTuple):
@@ -171,18 +171,18 @@ class Replay(SampleVisitor):
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if lit is None else lit[i].of_extinction)
-            of_transfer, pulled = self.transfer.pull(measured, of_color[i], of_extinction)
+            of_transfer, of_read = self.transfer.pull(measured, of_color[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
-            of_measured.append(pulled if lit is None else added(pulled, lit[i].of_measured))
+            of_measured.append(of_read if lit is None else added(of_read, lit[i].of_measured))
         if not self.places:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
-        of_march, of_volume, of_rays, asked, of_voxels = self._placed(
+        of_march, of_volume, of_rays, indices, of_voxels = self._placed(
             ray, at, samples.ahead, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
-        voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_voxels)
+        voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return carry, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
@@ -201,44 +201,44 @@ class Replay(SampleVisitor):
             march: PyTree,
             volume: PyTree,
             ray: PyTree,
-            taps: Any,
+            perturbations: Any,
             ray_rest: PyTree,
             at: Progress,
             ahead: Ahead,
         ) -> tuple[list[Any], list[Array]]:
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
-            record = Recording(taps or [], [])
+            record = Recording(perturbations or [], [])
             here = with_fetch(placed, record) if voxels else with_words(placed, self.words)
             found = []
             for piece in pieces_ahead(self.pipeline._replace(march=march, volume=here), ray, at, ahead):
                 depth = march.sample(piece)
                 measured = self.transfer.measured(here, ray.path(depth))
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
-                asked = depth if self.given.depth is not None else None
-                found.append((floats(measured), piece.width, asked, point))
-            return found, record.asked
+                at_depth = depth if self.given.depth is not None else None
+                found.append((floats(measured), piece.width, at_depth, point))
+            return found, record.indices
 
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, ahead.axis_of_rays))
         cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
 
-        def all_(march: PyTree, volume: PyTree, ray: PyTree, taps: list[Array] | None) -> PyTree:
-            return cells(march, volume, ray, taps, ray_rest, at, ahead)
+        def all_(march: PyTree, volume: PyTree, ray: PyTree, perturbations: list[Array] | None) -> PyTree:
+            return cells(march, volume, ray, perturbations, ray_rest, at, ahead)
 
-        taps = []
+        perturbations = []
         if voxels:
-            _, asked = jax.eval_shape(lambda: all_(march, volume, ray_floats, None))
-            if not asked and self.volume.field is not None:
+            _, indices = jax.eval_shape(lambda: all_(march, volume, ray_floats, None))
+            if not indices and self.volume.field is not None:
                 kind = type(self.volume.field).__name__
                 raise ValueError(
                     f"the gradient to the voxels of a volume with the field {kind}, which asks for none by"
                     ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
                     " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
-            taps = [jnp.zeros(place.shape, self.volume.data.dtype) for place in asked]
-        _, pull, asked = jax.vjp(all_, march, volume, ray_floats, taps, has_aux=True)
-        of_march, of_volume, of_ray, of_taps = pull(cotangents)
-        return of_march, of_volume, of_ray, asked, of_taps
+            perturbations = [jnp.zeros(place.shape, self.volume.data.dtype) for place in indices]
+        _, pull, indices = jax.vjp(all_, march, volume, ray_floats, perturbations, has_aux=True)
+        of_march, of_volume, of_ray, of_perturbations = pull(cotangents)
+        return of_march, of_volume, of_ray, indices, of_perturbations
 
     def _slopes(
         self, alphas: list[Scalar], weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar

@@ -17,8 +17,8 @@ from ..reference import resolve
 from ..space import Line
 from .acceleration import VolumeAcceleration
 from .image import RenderOptions, fault_of, pipeline_of
+from .rays import lines_at
 from .scene import Scene
-from .tiles import lines_at
 
 
 Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]

@@ -8,7 +8,7 @@ from ..lighting.shading import Lighting
 from ..march import March
 from ..transfer import Transfer
 from ..volume import Volume
-from .tiles import OwnRays
+from .rays import OwnRays
 
 
 Source: TypeAlias = Camera | OwnRays

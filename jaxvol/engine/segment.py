@@ -23,8 +23,8 @@ from ..march import Cell, March
 from ..reference import Pipeline, Progress, add, front, move, opacity, pieces, stop
 from ..space import Ray
 from ..transfer import Measured
-from .shading import shaded_colors
 from .tiling import Tiling
+from .visible_samples import shaded_colors
 
 
 class Ahead(NamedTuple):

@@ -1,6 +1,6 @@
 """Vector–Jacobian product of shading: each visible sample is shaded again, and pulled back.
 
-The counterpart of `shading.shaded_colors` in the second march.
+The counterpart of `visible_samples.shaded_colors` in the second march.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from ..lighting.shading import Shading, Surroundings, lit
 from ..reference import Pipeline
 from ..space import Ray
 from .segment import Samples
-from .shading import Weights, samples_of, visible
+from .visible_samples import Weights, samples_of, visible
 
 
 class Lit(NamedTuple):
@@ -74,21 +74,23 @@ def shading_vjp(
         some = samples_of(chosen, places, pipeline, ray, samples.cells, samples.measured, weights)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
-        def colors(moving: PyTree, moving_sample: PyTree, taps: Any) -> tuple[Vec3, Any]:
+        def colors(moving: PyTree, moving_sample: PyTree, perturbations: Any) -> tuple[Vec3, Any]:
             (shading, space), transfer = eqx.combine(moving, fixed)
             here = Surroundings(around.volume, transfer, space)
             each = eqx.combine(moving_sample, fixed_sample)
-            return jax.vmap(lambda sample, taps: lit(shading, here, sample, taps))(each, taps)
+            return jax.vmap(lambda sample, perturbations: lit(shading, here, sample, perturbations))(
+                each, perturbations
+            )
 
-        taps = None
+        perturbations = None
         if total.voxels is not None:
-            _, asked = jax.eval_shape(lambda: colors(moving, moving_sample, []))
-            taps = [jnp.zeros(each.shape, around.volume.data.dtype) for each in asked]
-        color, pull, asked = jax.vjp(colors, moving, moving_sample, taps, has_aux=True)
+            _, indices = jax.eval_shape(lambda: colors(moving, moving_sample, []))
+            perturbations = [jnp.zeros(each.shape, around.volume.data.dtype) for each in indices]
+        color, pull, indices = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
         real = places < size
         cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, places))
-        (of_light, of_transfer), of_sample, of_taps = pull(cotangent)
-        voxels = None if total.voxels is None else scatter_add(total.voxels, asked, of_taps)
+        (of_light, of_transfer), of_sample, of_perturbations = pull(cotangent)
+        voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_perturbations)
         total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
         return chosen.put(found, places, part), total

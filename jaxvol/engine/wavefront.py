@@ -23,11 +23,11 @@ from .._util.compaction import in_front
 from .._util.sharding import varying
 from ..compositing import Outputs, Weighting
 from ..march import EmptySpaceIndex
-from ..reference import Pipeline, Progress, begin, counts, front, measure, move, opacity, pieces
+from ..reference import Pipeline, Progress, begin, front, is_sample, measure, move, opacity, pieces
 from ..space import Ray
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
+from .rays import vmap_rays
 from .segment import SampleVisitor, regular_from_here
-from .tiles import vmap_rays
 from .tiling import Tiling
 
 
@@ -108,10 +108,10 @@ def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
         alphas = [opacity(pipeline, ray, piece, measure(pipeline, ray, piece)) for piece in cut]
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
         moved = move(march, ray, at, jnp.ones((), bool), stride)
-        if moved.met is not None:
-            taken = jnp.sum(jnp.stack([counts(march, ray, piece) for piece in cut]))
-            samples = moved.met.samples + taken.astype(moved.met.samples.dtype)
-            moved = eqx.tree_at(lambda moved: moved.met.samples, moved, samples)
+        if moved.stats is not None:
+            taken = jnp.sum(jnp.stack([is_sample(march, ray, piece) for piece in cut]))
+            samples = moved.stats.samples + taken.astype(moved.stats.samples.dtype)
+            moved = eqx.tree_at(lambda moved: moved.stats.samples, moved, samples)
         return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
 
     return vmap_rays(one)(ray, at)

@@ -159,12 +159,14 @@ def lit_classification(
     return classification._replace(light=lambda sample: lit(shading, around, sample)[0])
 
 
-def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None) -> tuple[Vec3, Any]:
+def lit(
+    shading: Shading, around: Surroundings, sample: Sample, perturbations: Any = None
+) -> tuple[Vec3, Any]:
     """The colour of a sample as lit.
 
-    `taps`: for a gradient of the voxels, what `replay` adds to each voxel that a term asks for: arrays with a
-    leading axis for the terms. Returned are also the voxels that were asked for, in the same way: none where
-    there are no terms. None: nobody wants to know.
+    `perturbations`: for a gradient of the voxels, what `replay` adds to each voxel that a term asks for:
+    arrays with a leading axis for the terms. Returned are also the voxels that were asked for, in the same
+    way: none where there are no terms. None: nobody wants to know.
     """
     notes = shading.about(around, sample)
 
@@ -172,18 +174,18 @@ def lit(shading: Shading, around: Surroundings, sample: Sample, taps: Any = None
     # each of them.
     @jax.checkpoint
     def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
-        number, taps = each
-        volume, live, asked = around.volume, number >= 0, None
-        if taps is not None:
-            asked, live = [], None
-            volume = with_fetch(volume, Recording(taps, asked))
+        number, perturbations = each
+        volume, live, indices = around.volume, number >= 0, None
+        if perturbations is not None:
+            indices, live = [], None
+            volume = with_fetch(volume, Recording(perturbations, indices))
         here = Surroundings(volume, around.transfer, around.space, live)
         added = shading.term(here, sample, notes, number)
-        return jax.tree.map(jnp.add, sums, added), asked
+        return jax.tree.map(jnp.add, sums, added), indices
 
     if shading.terms == 0:
-        return shading.color(sample, notes, None), None if taps is None else []
+        return shading.color(sample, notes, None), None if perturbations is None else []
     term = jax.eval_shape(lambda: shading.term(around, sample, notes, jnp.zeros((), jnp.int32)))
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
-    sums, asked = jax.lax.scan(one, none, (jnp.arange(shading.terms), taps))
-    return shading.color(sample, notes, sums), asked
+    sums, indices = jax.lax.scan(one, none, (jnp.arange(shading.terms), perturbations))
+    return shading.color(sample, notes, sums), indices

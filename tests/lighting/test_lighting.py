@@ -14,7 +14,7 @@ import pytest
 import jaxvol as jv
 from jaxvol import compositing
 from jaxvol._util.vec3 import apart
-from jaxvol.engine import shading as engine_shading
+from jaxvol.engine import visible_samples
 from jaxvol.engine.resolve import of_visible
 from jaxvol.lighting import (
     ConstantLight,
@@ -1108,7 +1108,7 @@ def test_one_opaque_surface_is_lit_as_its_samples_are():
 def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     """All lighting goes through these names, which the programs of lit images call."""
     called = []
-    for module in (lighting_shading, compositing, engine_shading):
+    for module in (lighting_shading, compositing, visible_samples):
         for name in ("lit", "shaded_colors", "Chosen", "Sample"):
             if hasattr(module, name):
                 original = getattr(module, name)
