@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ._util.checks import described
-from ._util.trees import PyTree
 from ._util.vec3 import Scalar, Vec3, along
 from .lighting.shading import Sample
 from .occupancy import Blocks
@@ -281,18 +280,6 @@ class FirstVisible(Selection[Scalar]):
     def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
         color, _ = sampler.shaded(state)
         return jnp.stack([*color, jnp.ones_like(state)]), state
-
-
-def check_answer(compositing: Compositing[Any], method: str, answer: PyTree, expected: PyTree) -> None:
-    """Raise `ValueError` if the answer of a mode's method has other shapes or types than expected."""
-
-    def kinds(tree: PyTree) -> PyTree:
-        return jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), tree)
-
-    if kinds(answer) != kinds(expected):
-        found, wanted = (eqx.tree_pformat(tree) for tree in (answer, expected))
-        name = type(compositing).__name__
-        raise ValueError(f"compositing: {name}.{method} must return {wanted}; got {found}.")
 
 
 Mode: TypeAlias = Literal["over"]

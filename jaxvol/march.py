@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.checks import described, integer, number
+from ._util.checks import check_answer, described, integer, number
 from ._util.vec3 import Scalar, Vec3
 from .beams import Box
 from .occupancy import Occupancy
@@ -193,6 +193,8 @@ class March(eqx.Module):
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """Where nothing is visible, as the first transform that overrides `empty_space` has it."""
         indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
+        for transform, index in zip(self.transforms, indices, strict=True):
+            _check_kind(transform, "empty_space", index, EmptySpaceIndex | None)
         return next((index for index in indices if index is not None), None)
 
     def _overriding(self, seam: str) -> list[Transform]:
@@ -218,20 +220,21 @@ class March(eqx.Module):
         space: Space = Affine(volume)
         for transform in self.transforms:
             space = transform.locate(space, volume)
+            _check_kind(transform, "locate", space, Space)
         return space
 
     def start(self, ray: Ray) -> Scalar:
         """Steps from the entry to the first cell."""
         steps = jnp.zeros_like(ray.length)
         for transform in self.transforms:
-            steps = transform.start(steps, ray)
+            steps = _checked(transform, "start", transform.start(steps, ray), steps)
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
         """By how many steps samples after a ray's first transparent cell move, in [-1, 0]."""
         shift = jnp.zeros_like(ray.length)
         for transform in self.transforms:
-            shift = shift + transform.shift(ray)
+            shift = shift + _checked(transform, "shift", transform.shift(ray), shift)
         # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
@@ -243,10 +246,10 @@ class March(eqx.Module):
         ray, depth = jax.lax.stop_gradient((ray, depth))
         power = jnp.full_like(index, longest)
         for transform in self._overriding("stride"):
-            stride = jnp.asarray(transform.stride(ray, depth))
-            if not jnp.issubdtype(stride.dtype, jnp.integer):
-                name = type(transform).__name__
-                raise ValueError(f"{name}.stride must return integers; got {stride.dtype}.")
+            stride, name = transform.stride(ray, depth), type(transform).__name__
+            if jnp.shape(stride) != depth.shape or not jnp.issubdtype(jnp.result_type(stride), jnp.integer):
+                raise ValueError(f"{name}.stride must return an integer for each depth; got {stride!r}.")
+            stride = jnp.asarray(stride)
             for shorter in (2**k for k in reversed(range(longest.bit_length() - 1))):
                 power = jnp.where(stride < 2 * shorter, jnp.minimum(power, shorter), power)
         # the largest power of two that divides the index
@@ -257,14 +260,14 @@ class March(eqx.Module):
         """The pieces of a cell, front to back."""
         pieces = (cell,)
         for transform in self.transforms:
-            pieces = tuple(part for piece in pieces for part in transform.cut(piece, ray, volume))
+            pieces = tuple(part for piece in pieces for part in _cut(transform, piece, ray, volume))
         return pieces
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
         """Whether a ray with this much transmittance left ends before its exit."""
         stopped = jnp.zeros(jnp.shape(transmittance), bool)
         for transform in self.transforms:
-            stopped = transform.stop(stopped, transmittance)
+            stopped = _checked(transform, "stop", transform.stop(stopped, transmittance), stopped)
         return stopped
 
     def sample(self, cell: Cell) -> Scalar:
@@ -274,6 +277,30 @@ class March(eqx.Module):
 
 def _overrides(transform: Transform, seam: str) -> bool:
     return getattr(type(transform), seam) is not getattr(Transform, seam)
+
+
+def _checked(transform: Transform, seam: str, answer: Any, expected: Array) -> Array:
+    """A transform's answer, if it is an array like the one expected."""
+    check_answer(transform, seam, answer, expected)
+    return answer
+
+
+def _check_kind(transform: Transform, seam: str, answer: Any, kind: Any) -> None:
+    if not isinstance(answer, kind):
+        wanted = getattr(kind, "__name__", str(kind))
+        raise ValueError(
+            f"{type(transform).__name__}.{seam} must return a {wanted}; got {described(answer)}."
+        )
+
+
+def _cut(transform: Transform, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+    pieces = transform.cut(cell, ray, volume)
+    _check_kind(transform, "cut", pieces, tuple)
+    if not pieces:
+        raise ValueError(f"{type(transform).__name__}.cut must return at least one cell; got ().")
+    for piece in pieces:
+        _check_kind(transform, "cut", piece, Cell)
+    return pieces
 
 
 def _check_stride(transform: Transform) -> None:

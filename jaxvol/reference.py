@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.checks import Arrayable, all_finite, finite_array, is_traced
+from ._util.checks import Arrayable, all_finite, check_answer, finite_array, is_traced
 from ._util.sharding import varying
 from ._util.trees import PyTree
 from ._util.vec3 import Scalar, Vec3, apart
@@ -25,7 +25,6 @@ from .compositing import (
     Outputs,
     RaySampler,
     Selection,
-    check_answer,
     compositing_of,
 )
 from .lighting.shading import Lighting, lit_classification

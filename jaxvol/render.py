@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, finite_array, require
 from ._util.sharding import shard_number, varying
+from ._util.trees import strong
 from .arguments import check_arguments
 from .camera import Camera
 from .compositing import Compositing, Mode, Selection, compositing_of
@@ -136,6 +137,7 @@ def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = No
     for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
+    scene = strong(scene)
     volume, transfer, _, march, _, lighting = scene
     how = adjoint_of(adjoint, volume, march)
     if lighting is not None:

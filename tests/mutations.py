@@ -520,8 +520,8 @@ MUTATIONS = [
     Mutation(
         "replay: one of the eight voxels of a sample gets no gradient",
         "_util/fetching.py",
-        "for place, part in zip(asked, parts, strict=True):",
-        "for place, part in list(zip(asked, parts, strict=True))[1:]:",
+        "for place, part in zip(indices, parts, strict=True):",
+        "for place, part in list(zip(indices, parts, strict=True))[1:]:",
         (DIFFERENCES,),
     ),
     Mutation(

@@ -1,5 +1,7 @@
 """The methods that a march calls on its transforms, and custom transforms."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -256,3 +258,59 @@ def test_bad_input_is_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+class Faulty(jv.Transform):
+    """Answers one of the seams with `answer`."""
+
+    seam: str = eqx.field(static=True)
+    answer: Any = eqx.field(static=True)
+
+    def locate(self, space, volume):
+        return self.answer if self.seam == "locate" else space
+
+    def start(self, steps, ray):
+        return self.answer if self.seam == "start" else steps
+
+    def shift(self, ray):
+        return self.answer if self.seam == "shift" else jnp.zeros_like(ray.length)
+
+    def empty_space(self, occupancy, view):
+        return self.answer if self.seam == "empty_space" else None
+
+    def cut(self, cell, ray, volume):
+        return self.answer if self.seam == "cut" else (cell,)
+
+    def stop(self, stopped, transmittance):
+        return self.answer if self.seam == "stop" else stopped
+
+
+@pytest.mark.parametrize("answer", [None, 3, "a", ()], ids=repr)
+@pytest.mark.parametrize("seam", ["locate", "start", "shift", "empty_space", "cut", "stop"])
+def test_a_wrong_answer_of_a_transform_is_named(seam, answer):
+    if seam == "empty_space" and answer is None:
+        return  # unknown
+    march = jv.March(0.1, (Faulty(seam, answer),))
+    with pytest.raises(ValueError, match=f"Faulty.{seam} must return"):
+        jv.render_rays(jv.phantom("sphere", 8), soft_transfer(), [[-3.0, 0, 0]], [[1.0, 0, 0]], march)
+
+
+class Thinner(jv.Transform):
+    """Cells of a part of their width."""
+
+    part: Any
+
+    def cut(self, cell, ray, volume):
+        return (Cell(cell.front, cell.width * self.part, cell.cut),)
+
+
+def test_a_python_number_has_a_gradient():
+    """Its type is weak, and JAX's custom rules lose the gradients of weak types."""
+    volume, transfer = jv.phantom("sphere", 8), soft_transfer(100.0)
+
+    def total(part):
+        rays = [[-3.0, 0, 0]], [[1.0, 0, 0]]
+        return jv.render_rays(volume, transfer, *rays, jv.March(0.1, (Thinner(part),))).rgba.sum()
+
+    assert abs(float(jax.grad(total)(0.5))) > 0
+    assert jax.grad(total)(0.5) == jax.grad(total)(jnp.asarray(0.5, jnp.float32))

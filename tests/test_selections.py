@@ -305,11 +305,11 @@ class Wrong(jv.FirstVisible):
 @pytest.mark.parametrize("method", ["add", "settled", "occupied", "pixel"])
 def test_a_wrong_answer_of_a_mode_is_named(method):
     march = jv.March(0.11, (jv.SpaceLeaping(),))
-    with pytest.raises(ValueError, match=rf"compositing: Wrong.{method} must return .*; got "):
+    with pytest.raises(ValueError, match=rf"Wrong.{method} must return .*; got "):
         jv.render(NOISE, soft_transfer(), around(NOISE), march, compositing=Wrong(method))
     if method != "occupied":
         ray = jnp.asarray([-1.0, 0.0, 0.8]), jnp.asarray([1.0, 0.0, 0.0])
-        with pytest.raises(ValueError, match=rf"compositing: Wrong.{method} must return .*; got "):
+        with pytest.raises(ValueError, match=rf"Wrong.{method} must return .*; got "):
             jv.render_ray_reference(NOISE, soft_transfer(), *ray, march, compositing=Wrong(method))
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .sharding import varies_over
+from .trees import PyTree
 
 
 T = TypeVar("T")
@@ -171,3 +172,19 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
     except OSError as fault:
         raise ValueError(f"{name}: {path} cannot be written ({fault.strerror or fault}).") from fault
     return path
+
+
+def check_answer(owner: Any, method: str, answer: PyTree, expected: PyTree) -> None:
+    """Raise `ValueError` if what a method of a user's class returned has other shapes or types of numbers
+    than expected."""
+
+    def kinds(tree: PyTree) -> PyTree:
+        return jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), tree)
+
+    try:
+        same = kinds(answer) == kinds(expected)
+    except TypeError:  # something that is no array
+        same = False
+    if not same:
+        found, wanted = (eqx.tree_pformat(tree) for tree in (answer, expected))
+        raise ValueError(f"{type(owner).__name__}.{method} must return {wanted}; got {found}.")

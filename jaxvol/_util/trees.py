@@ -16,6 +16,16 @@ def floats(tree: PyTree) -> PyTree:
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
+def strong(tree: PyTree) -> PyTree:
+    """The tree with leaves of weak type, which come from Python numbers, as plain arrays: `jax.custom_vjp`
+    loses the gradients of weak ones."""
+
+    def plain(leaf: Any) -> Any:
+        return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf
+
+    return jax.tree.map(plain, tree)
+
+
 def added(a: PyTree, b: PyTree) -> PyTree:
     """Sum of two trees, leaf by leaf."""
     return jax.tree.map(jnp.add, a, b)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from ..compositing import FirstVisible, Selection, check_answer
+from .._util.checks import check_answer
+from ..compositing import FirstVisible, Selection
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end

@@ -90,7 +90,8 @@ class Jitter(Transform):
         if not self.front_residual:
             return (cell,)
         front = jnp.maximum(cell.front, 0)
-        return (Cell(front, cell.width - (front - cell.front), cell.cut),)
+        width = jnp.maximum(cell.width - (front - cell.front), 0)  # of a piece that ends before the entry
+        return (Cell(front, width, cell.cut),)
 
 
 class EmptySpaceJitter(Transform):

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol._util.vec3 import apart
+from jaxvol.march import Cell
+from jaxvol.space import Affine, enter
 
 from ..scenes import anisotropic_noise, around, counting, soft_transfer, uniform_transfer
 
@@ -13,6 +16,7 @@ from ..scenes import anisotropic_noise, around, counting, soft_transfer, uniform
 BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
 STEP = 0.3
 SIDE = 128
+PIXEL = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
 
 
 @jax.jit
@@ -109,6 +113,14 @@ def test_front_residual_gives_back_what_jitter_leaves_out(pattern):
     np.testing.assert_allclose(rendering.rgba[:, 3], 1 - np.exp(-2), atol=1e-6)
     narrow = parts(jitter) * STEP
     np.testing.assert_array_equal(rendering.samples, 1 + np.ceil((2 - narrow) / STEP))
+
+
+def test_front_residual_of_an_empty_piece_is_empty():
+    """Of one that another transform left before the entry."""
+    piece = Cell(jnp.asarray(-0.2), jnp.asarray(0.0), jnp.asarray(False))
+    ray = enter(Affine(BOX), apart(jnp.asarray([-1.0, 1, 1])), apart(jnp.asarray([1.0, 0, 0])), PIXEL)
+    (cut,) = jv.Jitter(3, front_residual=True).cut(piece, ray, BOX)
+    assert float(cut.width) == 0
 
 
 def test_empty_space_jitter_leaves_rays_without_empty_space_alone():
