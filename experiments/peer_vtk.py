@@ -6,8 +6,8 @@ plane rather than from the entry. Like our space leaping, it skips blocks of 4³
 visible.
 """
 
+# VTK is optional:
 # pyright: reportMissingImports=false
-# VTK is optional, as `missing` says.
 
 import importlib.util
 import os
