@@ -178,7 +178,7 @@ MUTATIONS = [
     Mutation(
         "leap: range of visible cells ends one cell too early",
         "engine/batch.py",
-        "until = jnp.max(jnp.where(visible, end, carry.until[None]), axis=0)",
+        "until = jnp.max(jnp.where(visible, begin + 1, carry.until[None]), axis=0)",
         "until = jnp.max(jnp.where(visible, begin, carry.until[None]), axis=0)",
         (LEAPING_GRADIENT,),
     ),
@@ -227,8 +227,8 @@ MUTATIONS = [
     Mutation(
         "empty space: blocks with NaN count as empty",
         "engine/acceleration.py",
-        "transfer.visible(blocks) | blocks.unordered",
-        "transfer.visible(blocks)",
+        "visible |= blocks.unordered",
+        "pass",
         (NAN,),
     ),
     Mutation(
@@ -418,15 +418,15 @@ MUTATIONS = [
     Mutation(
         "NaN: the backward march of an invalid scene takes the maximum number of samples",
         "engine/gradients.py",
-        "return invalid(tiles.rays(source_, space, number), fault)",
-        "return tiles.rays(source_, space, number)",
+        "return invalid(self.tiles.rays(source_, space, number), self.fault)",
+        "return self.tiles.rays(source_, space, number)",
         ("engine/test_faults.py::test_the_gradient_does_not_march_with_a_nan_step",),
     ),
     Mutation(
         "NaN: a NaN image has derivative 0",
         "reference.py",
-        "rgba = at.composite.rgba() * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)",
-        "rgba = jnp.where(valid, at.composite.rgba(), jnp.nan)",
+        "rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)",
+        "rgba = jnp.where(valid, rgba, jnp.nan)",
         ("engine/test_faults.py::test_nan_reaches_image_and_derivative_of_other_adjoints[direct]",),
     ),
     Mutation(

@@ -90,6 +90,11 @@ MODES = {
 }
 
 
+def slow(*names):
+    """Parameters whose tests are slow."""
+    return [pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
 def reference_image(volume, transfer, camera, march, mode, lighting=None):
     """rgba and depth of every pixel, ray by ray."""
     column, row = jnp.meshgrid(*(jnp.arange(n) for n in camera.size))
@@ -143,8 +148,8 @@ def test_an_isosurface_is_where_the_value_is_reached():
         np.testing.assert_allclose(found.rgba, [[*color, 1.0], [0.0] * 4], atol=1e-5)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("camera", ["around", pytest.param("inside", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["isosurface", *slow("first visible", "maximum")])
+@pytest.mark.parametrize("camera", ["around", *slow("inside")])
 def test_selections_are_those_of_the_reference(mode, camera):
     """With leaps and without, where samples shift."""
     camera = CAMERAS[camera](NOISE)
@@ -214,7 +219,7 @@ def test_a_selected_sample_is_lit():
     np.testing.assert_allclose(found.rgba, rgba, atol=2e-4)
 
 
-@pytest.mark.parametrize("mode", ["first visible", "maximum"])
+@pytest.mark.parametrize("mode", ["maximum", *slow("first visible")])
 def test_nan_is_passed_on(mode):
     """From voxels into the pixels whose rays meet them, and from the transfer function into all."""
     volume = eqx.tree_at(lambda v: v.data, NOISE, NOISE.data.at[10:14, 10:14, 10:14].set(jnp.nan))
@@ -242,7 +247,7 @@ def test_a_face_between_labels_is_seen_from_the_side_of_its_cell():
     assert np.mean(np.abs(found.rgba - expected).max(axis=-1) > 1e-3) < 2e-3
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["isosurface", *slow("first visible", "maximum")])
 def test_an_image_of_nothing_has_the_gradient_0(mode):
     camera = jv.Camera.looking_at(NOISE, size=(12, 10))
     away = eqx.tree_at(lambda c: c.focal_point, camera, 2 * camera.position - camera.focal_point)
@@ -328,10 +333,8 @@ def leaves(scene):
     return (*found, mode.value) if isinstance(mode, Isosurface) else found
 
 
-@pytest.mark.parametrize("mode", ["fog", "isosurface"])
-@pytest.mark.parametrize(
-    "adjoint", ["replay", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "direct"))]
-)
+@pytest.mark.parametrize("mode", ["fog", *slow("isosurface")])
+@pytest.mark.parametrize("adjoint", ["replay", *slow("forward", "direct")])
 def test_gradients_are_central_differences(mode, adjoint):
     """Of colours and depths, by each leaf alone under replay, and by all of them together."""
     with in_float64():
