@@ -310,13 +310,6 @@ MUTATIONS = [
         ("test_selections.py::test_an_image_of_nothing_has_the_gradient_0",),
     ),
     Mutation(
-        "selection: rays are rounded as the compiler likes",
-        "engine/rays.py",
-        "return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None]))",
-        "return jax.vmap(partial(_of_pixel, source))(columns, rows)",
-        ("test_selections.py::test_a_face_between_labels_is_seen_from_the_side_of_its_cell",),
-    ),
-    Mutation(
         "selection: depths do not grow with the step",
         "reference.py",
         "return pixel * valid, ray.t_in + depth * scale",

@@ -259,6 +259,10 @@ def test_an_image_of_nothing_has_the_gradient_0(mode):
     gradient = eqx.filter_grad(loss)((away, jv.March(0.11), NOISE))
     for leaf in jax.tree.leaves(gradient):
         np.testing.assert_array_equal(leaf, 0)
+    # and among pixels that see something
+    gradient = eqx.filter_grad(loss)((around(NOISE, (12, 10)), jv.March(0.11), NOISE))
+    for leaf in jax.tree.leaves(gradient):
+        assert np.isfinite(leaf).all()
 
 
 def test_no_rays_make_no_pixels():
