@@ -51,7 +51,8 @@ def render(
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
     - `march`: step and transforms.
-    - `compositing`: how the cells of a ray become a pixel: `"over"`, or a `Compositing`.
+    - `compositing`: how the cells of a ray become a pixel: `"over"`, or a `Weighting` or `Selection`. Where
+      a `Selection` chooses a depth, no adjoint marches again: JAX differentiates what is computed there.
     - `lighting`: how samples are shaded, such as `lighting.ScattererTemplates`. Without, colours are those of
       the transfer function.
     - `outputs`: `"rgba"` computes the image and `exhausted` only, in some 5 % less time; `"all"` everything
