@@ -72,7 +72,7 @@ class Compositing(eqx.Module, Generic[State]):
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume may change a pixel, from the ranges of their values (float32). Rays leap
+        """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap
         over the others, except those that hold NaN."""
         return transfer.visible(blocks)
 
