@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxvol as jv
 
@@ -27,6 +28,12 @@ SOFT = [
     (0.85, (0.9, 0.9, 0.9), 0.8),
     (1.0, (1.0, 1.0, 1.0), 0.9),
 ]
+
+
+def slow(*cases: Any) -> list[Any]:
+    """Parameters with which a test is slow."""
+    marks = pytest.mark.slow
+    return [pytest.param(*(c if isinstance(c, tuple) else (c,)), marks=marks) for c in cases]
 
 
 def soft_transfer(unit_distance: float = 0.5) -> jv.TransferFunction:

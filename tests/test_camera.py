@@ -13,6 +13,8 @@ from jaxvol.engine.rays import RayTiles
 from jaxvol.engine.tiling import Tiling
 from jaxvol.space import Affine
 
+from .scenes import slow
+
 
 POSITION, FOCUS = (3.0, -4.0, 2.0), (0.5, 1.0, 0.0)
 BOX = jv.Volume(np.zeros((4, 5, 6), np.uint8), spacing=(10, 3, 1), origin=(7, -5, 2))
@@ -146,7 +148,7 @@ def test_rays_are_differentiable_in_the_camera():
     np.testing.assert_allclose(jacobian, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("parallel_scale", [None, 2.1])
+@pytest.mark.parametrize("parallel_scale", [None, *slow(2.1)])
 def test_rays_round_alike_whether_or_not_they_are_differentiated(parallel_scale):
     """Otherwise image, replay and forward mode would sample different positions, 1e-4 voxels apart."""
     # numbers that are not exact in float32

@@ -117,6 +117,7 @@ def losses(mode, method):
     return loss, (transfer.extinction, camera.position, march.step)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_mode_of_ones_own_are_central_differences():
     """Extinctions of 0 stay 0."""
     with in_float64():

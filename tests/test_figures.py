@@ -40,9 +40,8 @@ def measured(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    "name", [n if n == "fig13" else pytest.param(n, marks=pytest.mark.slow) for n in FIGURES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIGURES)
 def test_figure_is_drawn(name, tmp_path):
     script = importlib.import_module(f"paper_figs.{name}")
     script.main(["--quick", "--output", str(tmp_path)])

@@ -12,7 +12,7 @@ import jaxvol as jv
 from jaxvol.march import Cell
 from jaxvol.space import Affine
 
-from .scenes import around, scaled_phantom, soft_transfer, uniform_transfer
+from .scenes import around, scaled_phantom, slow, soft_transfer, uniform_transfer
 
 
 class Shift(jv.Transform):
@@ -45,8 +45,8 @@ class Halves(jv.Transform):
 class Long(jv.Transform):
     """Cells of so many steps from the grid coordinate x = `beyond` on."""
 
-    steps: int = eqx.field(static=True)
-    beyond: float = eqx.field(static=True, default=0.0)
+    steps: jax.Array = eqx.field(converter=jnp.asarray)  # arrays, so that all values share one program
+    beyond: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
 
     @property
     def longest_stride(self) -> int:
@@ -109,6 +109,7 @@ def test_start_moves_the_first_cell():
     assert opacity((Shift(), jv.AlphaCorrection())) == (seen(2 - 0.15), 7, True)
 
 
+@pytest.mark.slow
 def test_cut_may_divide_a_cell():
     assert opacity((Halves(),)) == (seen(2.1), 14, False)  # half cells at 0, 0.15, … 1.95
     for order in ((Halves(), jv.AlphaCorrection()), (jv.AlphaCorrection(), Halves())):
@@ -152,7 +153,7 @@ def test_stride_lengthens_cells(transforms, length, samples):
     assert int(reference.samples) == samples
 
 
-@pytest.mark.parametrize(("limit", "cells"), [(1, 1), (4, 1), (5, 2), (8, 2)])
+@pytest.mark.parametrize(("limit", "cells"), [(5, 2), *slow((1, 1), (4, 1), (8, 2))])
 def test_cells_of_several_steps_begin_within_the_limit(limit, cells):
     """On a ray of seven steps, in all engines."""
     march, box = jv.March(0.3, (Long(4),), max_samples=limit), (BOX, uniform_transfer(1.0))
@@ -304,6 +305,7 @@ class Thinner(jv.Transform):
         return (Cell(cell.front, cell.width * self.part, cell.cut),)
 
 
+@pytest.mark.slow
 def test_a_python_number_has_a_gradient():
     """Its type is weak, and JAX's custom rules lose the gradients of weak types."""
     volume, transfer = jv.phantom("sphere", 8), soft_transfer(100.0)

@@ -23,6 +23,7 @@ def test_a_text_that_is_not_there_any_more_is_told():
         MUTATIONS[0]._replace(file="march.py", old="no such line").applied(ROOT)
 
 
+@pytest.mark.slow
 def test_every_test_that_is_named_exists_and_is_fast():
     named = {test for mutation in MUTATIONS for test in mutation.tests}
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-n", "0"]

@@ -12,7 +12,7 @@ from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
 from jaxvol.render import _render
 
-from .scenes import CAMERAS, anisotropic_noise, around, in_float64, soft_transfer, uniform_transfer
+from .scenes import CAMERAS, anisotropic_noise, around, in_float64, slow, soft_transfer, uniform_transfer
 
 
 class Maximum(jv.Selection):
@@ -88,11 +88,6 @@ MODES = {
     "maximum": Maximum(),
     "isosurface": Isosurface(jnp.asarray(0.45)),
 }
-
-
-def slow(*names):
-    """Parameters whose tests are slow."""
-    return [pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
 def reference_image(volume, transfer, camera, march, mode, lighting=None):
@@ -197,6 +192,7 @@ def test_a_settled_ray_takes_no_more_samples():
     np.testing.assert_array_equal(found.samples, 6)
 
 
+@pytest.mark.slow
 def test_more_tiles_than_one_show_nothing():
     camera = around(NOISE, (37, 50))
     scene = NOISE, soft_transfer(), camera, jv.March(0.11, (jv.SpaceLeaping(),))
@@ -206,6 +202,7 @@ def test_more_tiles_than_one_show_nothing():
     np.testing.assert_array_equal(whole.depth, small.depth)
 
 
+@pytest.mark.slow
 def test_a_selected_sample_is_lit():
     """By the same light in both engines."""
     lighting = ScattererTemplates(
@@ -232,6 +229,7 @@ def test_nan_is_passed_on(mode):
     assert np.isnan(image.rgba).all()
 
 
+@pytest.mark.slow
 def test_a_face_between_labels_is_seen_from_the_side_of_its_cell():
     """Cells begin at faces between labels; the pixel is of the label that the march found there."""
     labels = np.random.default_rng(2).integers(0, 3, NOISE.shape)

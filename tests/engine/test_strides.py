@@ -51,11 +51,15 @@ def test_strides_are_those_of_the_reference(name):
 @pytest.mark.parametrize(
     "method", ["hierarchy", *(pytest.param(m, marks=pytest.mark.slow) for m in ("distance", "beam"))]
 )
-def test_leaps_and_adjoints_agree_under_strides(method):
+def test_leaping_does_not_change_gradients_under_strides(method):
     leapt, plain = (with_strides(scene_of("moving", m, "float32")) for m in (method, None))
-    expected = gradient(plain)
-    assert_same(gradient(leapt), expected, 1e-4)
-    assert_slopes(slopes(leapt), expected, leapt, 1e-4)
+    assert_same(gradient(leapt), gradient(plain), 1e-4)
+
+
+@pytest.mark.slow
+def test_forward_and_replay_gradients_agree_under_strides():
+    leapt = with_strides(scene_of("moving", "hierarchy", "float32"))
+    assert_slopes(slopes(leapt), gradient(leapt), leapt, 1e-4)
 
 
 @pytest.mark.slow

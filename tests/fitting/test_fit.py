@@ -122,6 +122,7 @@ def test_colours_are_recovered_from_the_first_visible_samples():
     assert found.loss < 1e-6 * found.losses[0]
 
 
+@pytest.mark.slow
 def test_a_residual_is_composited_as_it_was_told():
     (view, _), how = VIEWS[0], jv.FirstVisible()
     target = jv.render(*seen(TRUTH, view), compositing=how).image()

@@ -33,7 +33,7 @@ from jaxvol.lighting.shading import Sample, Shading, Surroundings, lit
 from jaxvol.space import Affine, Line
 
 from ..half_space import chandrasekhar, reflected, under_sky
-from ..scenes import anisotropic_noise, around, in_float64, scaled_phantom, soft_transfer, to_float64
+from ..scenes import anisotropic_noise, around, in_float64, scaled_phantom, slow, soft_transfer, to_float64
 
 
 # ---------------------------------------------------------------- samples lit one by one
@@ -320,7 +320,7 @@ def test_where_a_place_belongs_to_two_materials_the_first_counts(occlusion):
         same(found, COLOR[SKIN] * np.pi * POWER * part)
 
 
-@pytest.mark.parametrize("occlusion", ["soft", pytest.param("hard", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("occlusion", ["soft", *slow("hard")])
 def test_materials_by_label_are_where_the_label_is(occlusion):
     """Nodes have label 1 for x < 0, and elsewhere label 2, which belongs to no material."""
     data = np.full((9, 9, 9), SKIN, np.float32)
@@ -538,6 +538,7 @@ def slopes_in_the_path(occlusion, *steps):
             yield inside, float(loss(way[-1])[0] - loss(way[0])[0]) / (2 * h)
 
 
+@pytest.mark.slow
 def test_the_soft_gradient_in_the_path_is_the_difference_at_any_step():
     """A jump would show only in the difference."""
     for (adjoint, difference), error in zip(
@@ -671,7 +672,7 @@ def grown_in_the_program(occlusion="soft", **of_lights):
     return ScattererTemplates(MATERIALS, lights(**of_lights), occlusion=occlusion, **how)
 
 
-@pytest.mark.parametrize("occlusion", ["soft", "hard"])
+@pytest.mark.parametrize("occlusion", ["soft", *slow("hard")])
 def test_nan_in_light_or_material_reaches_the_sample(occlusion):
     """Inserted by `tree_at`, as an optimiser does."""
     lighting = grown_in_the_program(occlusion, sun=(1, 0, 0))
@@ -697,6 +698,7 @@ def test_a_traced_opacity_that_leaves_no_photon_makes_nan():
     assert np.isnan(shade(faint, nodes({}), TRANSFER, [(0, 0, 0)])).all()
 
 
+@pytest.mark.slow
 def test_nan_in_what_is_baked_reaches_all_of_it():
     volume, points, how = baked_scene()
     broken = eqx.tree_at(lambda lights: lights[0].irradiance, DAY, jnp.full(3, jnp.nan))
@@ -704,6 +706,7 @@ def test_nan_in_what_is_baked_reaches_all_of_it():
     assert np.isnan(shade(lighting, volume, PLAIN, points)).all()
 
 
+@pytest.mark.slow
 def test_a_ray_that_has_seen_nan_stays_nan_where_light_is_deferred():
     volume, space = nodes({}), Affine(nodes({}))
     lighting = ScattererTemplates(MATERIALS, lights(sky=True), given=given(PAIR, PAIR), reach=(2.0,))
@@ -811,7 +814,7 @@ def loss_of_an_image(kind, lighting):
     return loss, (volume, transfer, camera)
 
 
-@pytest.mark.parametrize("kind", ["float32", "uint8"])
+@pytest.mark.parametrize("kind", ["uint8", *slow("float32")])
 def test_there_is_a_gradient_of_an_image_by_baked_light(kind):
     """A slow test below checks its values, which take minutes to compile."""
     loss, scene = loss_of_an_image(kind, by_hand(baked=8))
@@ -1237,6 +1240,7 @@ def test_gradients_of_deferred_light_match_central_differences():
         check_slopes(program(scene)[1], scene, expected)
 
 
+@pytest.mark.slow
 def test_rays_that_see_nothing_leave_the_gradient_of_deferred_light_finite():
     """Here only the shading of pixels; a slow test below renders an image."""
     volume, space, zero = nodes({}), Affine(nodes({})), jnp.zeros((), jnp.int32)

@@ -204,7 +204,7 @@ def test_light_scattered_once_is_that_of_quadrature_and_its_error_is_the_one_tol
     assert abs(z_of_regions(more.radiance - expected, more.standard_error**2)).max() < 4
 
 
-@pytest.mark.parametrize("albedo", [(0.7, 0.7, 0.7), (0.5, 0.8, 0.95)])
+@pytest.mark.parametrize("albedo", [(0.7,) * 3, pytest.param((0.5, 0.8, 0.95), marks=pytest.mark.slow)])
 def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(albedo):
     # approximate a half-space by the middle of a face of a cube of 60 mean free paths
     albedo, cosine, volume = np.array(albedo), 0.6, cube()

@@ -9,10 +9,13 @@ from scipy import ndimage
 
 from jaxvol.phantoms import PHANTOMS, colon_path, phantom
 
+from ..scenes import slow
+
 
 UINT8 = ("head", "engine", "colon", "vessels", "labels")
 FLOAT = ("plane", "cut_block", "sphere", "constant", "linear", "gaussian")
 SEEDED = ("head", "colon", "vessels")
+QUICK = [name for name in UINT8 if name != "vessels"]
 
 
 @functools.cache
@@ -68,14 +71,14 @@ def test_every_phantom_fills_the_cube_with_finite_values_of_its_type(name):
     assert (made.labels is not None) == (name == "labels")
 
 
-@pytest.mark.parametrize("name", PHANTOMS)
+@pytest.mark.parametrize("name", [*QUICK, *FLOAT, *slow("vessels")])
 def test_the_same_seed_gives_the_same_voxels_and_another_seed_another_scene_where_promised(name):
     again, other = np.asarray(phantom(name, 24, seed=0).data), voxels(name, 24, seed=1)
     np.testing.assert_array_equal(again, voxels(name, 24))
     assert np.array_equal(other, again) == (name not in SEEDED)
 
 
-@pytest.mark.parametrize("name", UINT8)
+@pytest.mark.parametrize("name", [*QUICK, *slow("vessels")])
 def test_resolutions_show_one_scene_and_finer_ones_agree_better(name):
     """The nodes of resolution n are among those of 2n - 1; only boundary ramps, 2 voxels wide, may differ."""
 
@@ -213,7 +216,7 @@ def test_the_colon_path_has_even_steps_and_room_for_a_camera():
     assert np.mean(at(colon, around) < 60) > 0.99
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *slow(1)])
 def test_vessels_are_one_thin_tree_from_the_root_in_mostly_empty_space(seed):
     vessels = voxels("vessels", 129, seed)
     filled = vessels > 115

@@ -27,6 +27,7 @@ ALONG_Z = jv.Camera((0.3, 0.2, -4.0), (0.3, 0.2, 0.0), (0, 1, 0), size=(40, 32),
 OBLIQUE = around(scaled_phantom("linear"), (40, 32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quadrature", "camera"),
     [pytest.param("left", ALONG_Z, marks=pytest.mark.slow), ("midpoint", OBLIQUE)],

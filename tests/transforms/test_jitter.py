@@ -123,6 +123,7 @@ def test_front_residual_of_an_empty_piece_is_empty():
     assert float(cut.width) == 0
 
 
+@pytest.mark.slow
 def test_empty_space_jitter_leaves_rays_without_empty_space_alone():
     for field in ("rgba", "samples"):
         np.testing.assert_array_equal(getattr(see((jv.EmptySpaceJitter(1),)), field), getattr(see(()), field))

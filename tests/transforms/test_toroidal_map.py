@@ -442,6 +442,7 @@ def test_a_sphere_acquired_by_a_probe_renders_as_a_sphere():
     assert errors[-1][0] < 0.025
 
 
+@pytest.mark.slow
 def test_the_silhouette_lies_within_half_a_sample():
     volume, spacing = acquired_sphere(2)
     impact = RADIUS + np.linspace(-1, 1, 160) * spacing
@@ -691,6 +692,7 @@ def test_speckle_is_rayleigh_and_correlated_along_the_beam_alone():
     assert abs(across) < 0.02
 
 
+@pytest.mark.slow
 def test_the_real_scan_renders(real_volume):
     data = np.asarray(jv.load(real_volume("us_aplio_convex_239x128x91_uint8.raw.gz")).data)
     volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
