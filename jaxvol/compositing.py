@@ -205,10 +205,12 @@ class RaySampler(NamedTuple):
         """The depth as a number to compute with, as in a fog: it changes with the step."""
         return depth * self.depth_scale
 
-    def color(self, depth: Scalar, measured: Measured, transmittance: Scalar) -> Vec3:
-        """The colour of these measured values, shaded where there is a lighting. `transmittance`: between
-        the place and the camera."""
-        color, extinction = self.classification.classify(measured)
+    def color(
+        self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
+    ) -> Vec3:
+        """The colour of what was measured and classified at this depth, or around it, shaded where there is a
+        lighting. `transmittance`: between the place and the camera."""
+        color, extinction = classified
         if self.classification.light is None:
             return color
         ray = self.ray
@@ -220,8 +222,8 @@ class RaySampler(NamedTuple):
     def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
         """Colour, shaded where there is a lighting, and extinction at this depth, which nothing hides."""
         measured = self.measured(depth)
-        _, extinction = self.classification.classify(measured)
-        return self.color(depth, measured, jnp.ones_like(depth)), extinction
+        classified = self.classification.classify(measured)
+        return self.color(depth, measured, classified, jnp.ones_like(depth)), classified[1]
 
 
 class Selection(Compositing[State]):

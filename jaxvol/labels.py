@@ -16,6 +16,7 @@ from ._util.piecewise_linear import (
     table_row,
     upper_bound_between,
 )
+from ._util.piecewise_means import mean_by_rows
 from ._util.vec3 import Scalar, Vec3
 from ._util.xla import gather
 from .occupancy import Blocks
@@ -57,9 +58,9 @@ class LabelTransferFunction(Transfer):
         each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
         self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
-    def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """Value and label at a grid coordinate."""
-        return volume.value(coordinate), volume.label(coordinate)
+    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+        """The label at a grid coordinate."""
+        return (volume.label(coordinate),)
 
     def classifier(self) -> Classify:
         """Look-up of colour and extinction, by label and value."""
@@ -75,6 +76,24 @@ class LabelTransferFunction(Transfer):
             return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return classify
+
+    def integrator(self) -> Classify:
+        """The means for the label in the middle of a cell: where it changes along one, `AlphaCorrection(
+        labels=True)` cuts it."""
+        stacked = jax.lax.stop_gradient(self.stacked.values)
+        tables = jax.vmap(TransferFunction.span_rows)(self.stacked)
+        unseen, spans = tables.shape[0] - 1, tables.shape[1]
+        rows = tables.reshape(-1, tables.shape[2])
+
+        def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
+            _, label, (front,), (back,) = measured
+            label = jnp.where((label < 0) | (label > unseen), unseen, label)
+            values = gather(stacked, label)
+            i, j = (points_below(values, end) for end in (front, back))
+            a, b = (table_row(rows, label * spans + span) for span in (i, j))
+            return mean_by_rows(a, b, front, back, i == j)
+
+        return integrate
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         bound = jnp.zeros_like(blocks.low)

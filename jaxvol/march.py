@@ -18,7 +18,7 @@ At each seam the answers of all transforms are combined, so that they compose.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -31,6 +31,9 @@ from .beams import Box
 from .occupancy import Occupancy
 from .space import Affine, Ray, Space
 from .volume import Volume
+
+
+Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
 
 
 class Cell(eqx.Module):
@@ -129,6 +132,11 @@ class Transform(eqx.Module):
         is fixed; a piece may have width 0."""
         return (cell,)
 
+    joins: ClassVar[bool] = False
+    """Of a transform that overrides `cut`: whether each piece begins where the one in front of it ends, also
+    from cell to cell, unless it lies past the exit. Pieces that are integrated (`quadrature="preintegrated"`)
+    then share what is measured where they meet."""
+
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
         """Whether the ray is finished, given the answer of the transforms before this one."""
         return stopped
@@ -141,8 +149,15 @@ class March(eqx.Module):
 
     - `step`: distance d between samples, world length, > 0.
     - `transforms`: applied in this order at every seam; none may be given twice.
-    - `quadrature`: where in its cell a sample is taken. `"left"`: at the front, as the papers do; the
-      error falls with d. `"midpoint"`: in the middle; the error falls with d².
+    - `quadrature`: what a cell's colour and extinction are. `"left"`: those at its front, as the papers do;
+      the error falls with d. `"midpoint"`: those in its middle; the error falls with d².
+      `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
+      along it, the colour weighted by the extinction. The error falls with d², too, but no peak of the
+      transfer function is missed between two samples. A mean does not know that what is in front in a cell
+      hides what is behind: for a cell of opacity α and optical depth τ, this errs by at most α τ / 8 times
+      the difference of its colours. It needs one fetch for each cell, and one more for each segment. Of a
+      labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take it
+      there, too, and light is computed there.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
       2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
       default 131 072, so that every march ends.
@@ -153,14 +168,14 @@ class March(eqx.Module):
 
     step: Float[Array, ""]
     transforms: tuple[Transform, ...]
-    quadrature: Literal["left", "midpoint"] = eqx.field(static=True)
+    quadrature: Quadrature = eqx.field(static=True)
     max_samples: int | None = eqx.field(static=True)
 
     def __init__(
         self,
         step: Any,
         transforms: tuple[Transform, ...] | Any = (),
-        quadrature: Literal["left", "midpoint"] | Any = "left",
+        quadrature: Quadrature | Any = "left",
         *,
         max_samples: int | Any | None = None,
     ):
@@ -180,8 +195,9 @@ class March(eqx.Module):
                     f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
                 )
             _check_stride(transform)
-        if quadrature not in ("left", "midpoint"):
-            raise ValueError(f'quadrature must be "left" or "midpoint"; got {quadrature!r}.')
+        if quadrature not in get_args(Quadrature):
+            names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
+            raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
         self.quadrature = quadrature
         self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**24)
 
@@ -270,9 +286,30 @@ class March(eqx.Module):
             stopped = _checked(transform, "stop", transform.stop(stopped, transmittance), stopped)
         return stopped
 
+    @property
+    def integrates(self) -> bool:
+        """Whether cells are integrated between their ends, rather than sampled."""
+        return self.quadrature == "preintegrated"
+
+    @property
+    def joins(self) -> bool:
+        """Whether each piece of a cell begins where the one in front of it ends."""
+        return all(transform.joins for transform in self._overriding("cut"))
+
     def sample(self, cell: Cell) -> Scalar:
-        """Depth at which a cell is sampled."""
+        """Depth at which a cell is sampled; of one that is integrated, its middle."""
         return cell.front if self.quadrature == "left" else cell.front + cell.width / 2
+
+    def ends(self, cell: Cell, ray: Ray) -> tuple[Scalar, Scalar]:
+        """Depths of a cell's front and back, neither before the entry nor past the exit."""
+        return within(ray, cell.front), within(ray, cell.front + cell.width)
+
+
+def within(ray: Ray, depth: Scalar) -> Scalar:
+    """The depth, or that of the entry or the exit where it lies beyond."""
+    # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
+    depth = jnp.where(depth > 0, depth, 0)
+    return jnp.where(depth < ray.length, depth, ray.length)
 
 
 def _overrides(transform: Transform, seam: str) -> bool:

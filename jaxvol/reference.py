@@ -17,6 +17,7 @@ from ._util.checks import Arrayable, all_finite, check_answer, finite_array, is_
 from ._util.sharding import varying
 from ._util.trees import PyTree
 from ._util.vec3 import Scalar, Vec3, apart
+from ._util.xla import in_memory
 from .arguments import check_arguments
 from .compositing import (
     Compositing,
@@ -98,9 +99,23 @@ def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] |
     return march.cut(cell, ray, pipeline.volume)
 
 
-def measure(pipeline: Pipeline, ray: Ray, piece: Cell) -> Measured:
-    """The measured values at a piece's sample, and what the transfer function's search finds for them."""
-    return RaySampler(ray, pipeline.classification).measured(pipeline.march.sample(piece))
+def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
+    """The measured values at a piece's sample, or over the piece where it is integrated, and what the
+    transfer function's search finds for them. `recorded`: fetches are recorded, and so not made in branches.
+    """
+    march, classification = pipeline.march, pipeline.classification
+    if not march.integrates:
+        return classification.at(ray.path(march.sample(piece)))
+
+    def measured(depth: Scalar) -> Measured:
+        return classification.measure(ray.path(depth))[:1]
+
+    # In branches of their own, which XLA does not fuse: a kernel that interpolates both values may take one
+    # of them from other voxels (jaxlib 0.10 on CPU; `test_render_agrees_with_the_reference`).
+    ends = march.ends(piece, ray)
+    front, back = (measured(s) if recorded else in_memory(march.step > 0, measured, s) for s in ends)
+    beside = classification.beside(ray.path(march.sample(piece)))
+    return classification.spanned(beside, *(classification.searched(end) for end in (front, back)))
 
 
 def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
@@ -111,7 +126,7 @@ def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
 
 def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     """Opacity of a piece; 0 past the exit, and in gaps."""
-    _, extinction = pipeline.classification.classify(measured)
+    _, extinction = pipeline.classification.of_cells(measured)
     inside = contained(ray, pipeline.march.sample(piece))
     optical_depth = jnp.where(inside, extinction, 0) * piece.width
     # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
@@ -180,7 +195,8 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
         alphas.append(opacity(pipeline, ray, piece, measured))
         if not isinstance(compositing, Selection):
             transmittance = compositing.transmittance(after.composite)
-            color = sampler.color(march.sample(piece), measured, transmittance)
+            classified = classification.of_cells(measured)
+            color = sampler.color(march.sample(piece), measured, classified, transmittance)
         after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1])
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     after = move(march, ray, stop(pipeline, after), transparent, stride)
@@ -271,7 +287,7 @@ def render_ray_reference(
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
-    lit = lit_classification(volume, transfer, space, lighting)
+    lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
     later = resolves(mode, lighting)
     pipeline = Pipeline(march, volume, lit._replace(light=None) if later else lit, mode)
 

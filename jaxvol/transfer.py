@@ -7,12 +7,13 @@ of the volume.
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import Arrayable, finite_array, number, require, unit_interval
 from ._util.piecewise_linear import (
@@ -24,14 +25,17 @@ from ._util.piecewise_linear import (
     table_row,
     upper_bound_between,
 )
+from ._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from ._util.vec3 import Scalar, Vec3
 from ._util.xla import gather
 from .occupancy import Blocks
 from .volume import Volume
 
 
-Measured: TypeAlias = tuple[Array, ...]
-"""What a transfer function reads at a place: the value first, then whatever else it depends on."""
+Measured: TypeAlias = tuple[Any, ...]
+"""What a transfer function reads at a place: the value first, then whatever else it depends on. Of a cell
+that is integrated (`Classification.spanned`): the mean of the values at its ends, then what else is read in
+its middle, and what is read at its two ends."""
 
 Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 """From `Measured` to colour (r, g, b) and extinction (1/length)."""
@@ -50,10 +54,26 @@ class Classification(NamedTuple):
     """Looks up what `classify` needs beside the measured values, once; it is appended to them."""
     light: Callable[[Any], Vec3] | None = None
     """From a `lighting.shading.Sample` to its shaded colour. None: colours are as classified."""
+    beside: Callable[[Vec3], Measured] = lambda _: ()
+    """What is measured beside the value."""
+    integrate: Classify | None = None
+    """From what is measured of a cell (`spanned`) to its mean colour and extinction, if the value is linear
+    along it. None: a cell is as its sample."""
 
     def at(self, coordinate: Vec3) -> Measured:
         """What `classify` needs at a grid coordinate."""
         return self.searched(self.measure(coordinate))
+
+    @staticmethod
+    def spanned(beside: Measured, front: Measured, back: Measured) -> Measured:
+        """What `integrate` needs of a cell: from what is measured at its ends, and beside the value in its
+        middle."""
+        return ((front[0] + back[0]) / 2, *beside, front, back)
+
+    @property
+    def of_cells(self) -> Classify:
+        """Classifies cells: `integrate`, or as their samples."""
+        return self.classify if self.integrate is None else self.integrate
 
     def searched(self, measured: Measured) -> Measured:
         """The measured values, followed by what `search` finds for them."""
@@ -64,23 +84,37 @@ class Transfer(eqx.Module):
     """The interface of all transfer functions."""
 
     def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """What is read from the volume at a grid coordinate, the value first. By default the value alone."""
-        return (volume.value(coordinate),)
+        """What is read from the volume at a grid coordinate: the value, then what is read `beside`."""
+        return (volume.value(coordinate), *self.beside(volume, coordinate))
+
+    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+        """What is read beside the value; by default nothing."""
+        return ()
 
     @abstractmethod
     def classifier(self) -> Classify:
         """The function from `Measured` to colour and extinction. Tables that it needs are computed here,
         once, outside the march's loop."""
 
+    def integrator(self) -> Classify | None:
+        """The function from what is measured over a cell (`Measured`) to its colour and extinction: the means
+        over all values between its ends, that of the colour weighted by the extinction. None, the default:
+        unknown, so that `quadrature="preintegrated"` is refused."""
+        return None
+
     def search(self) -> Callable[[Measured], Measured] | None:
         """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
-        classifier gets after it. By default there is none."""
+        classifier gets after it. By default there is none. With an `integrator` it depends on the value
+        alone."""
         return None
 
     def classification(self, volume: Volume) -> Classification:
         """The two stages for this volume."""
         return Classification(
-            lambda coordinate: self.measured(volume, coordinate), self.classifier(), self.search()
+            partial(self.measured, volume),
+            self.classifier(),
+            self.search(),
+            beside=partial(self.beside, volume),
         )
 
     def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
@@ -88,15 +122,13 @@ class Transfer(eqx.Module):
         transfer function and of the measured values, from those of colour and extinction. None where there
         is no derivative. `measured` includes what `search` found."""
 
-        def classified(given: tuple[Transfer, Measured]) -> tuple[Vec3, Scalar]:
-            transfer, measured = given
-            classify = transfer.classifier()
-            for _ in range(extinction.ndim):
-                classify = jax.vmap(classify)
-            return classify(measured)
+        return _pulled(self, lambda transfer: transfer.classifier(), measured, color, extinction)
 
-        _, pull = eqx.filter_vjp(classified, (self, measured))
-        return pull((color, extinction))[0]
+    def pull_integrated(
+        self, measured: Measured, color: Vec3, extinction: Scalar
+    ) -> tuple["Transfer", Measured]:
+        """The same of classifying cells by `integrator`; `measured` is what was measured over them."""
+        return _pulled(self, lambda transfer: transfer.integrator(), measured, color, extinction)
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
@@ -107,6 +139,43 @@ class Transfer(eqx.Module):
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """Where `majorant` is positive; to be overridden where that takes less time to find out."""
         return self.majorant(blocks) > 0
+
+
+def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool) -> Classification:
+    """A transfer function applied to a volume: to its points, and where cells are `integrated`
+    (`quadrature="preintegrated"`), also to these.
+
+    **Raises:** `ValueError` for that, where the transfer function has no `integrator`."""
+    classification = transfer.classification(volume)
+    if not integrated:
+        return classification
+    integrate = transfer.integrator()
+    if integrate is None:
+        raise ValueError(
+            'quadrature="preintegrated" needs a transfer function with an integral over the value; '
+            f'{type(transfer).__name__} has no integrator. Use "midpoint".'
+        )
+    return classification._replace(integrate=integrate)
+
+
+def _pulled(
+    transfer: Transfer,
+    classify_of: Callable[[Any], Any],
+    measured: Measured,
+    color: Vec3,
+    extinction: Scalar,
+) -> tuple[Any, Measured]:
+    """JAX's vector–Jacobian product of classifying many samples."""
+
+    def classified(given: tuple[Transfer, Measured]) -> tuple[Vec3, Scalar]:
+        transfer, measured = given
+        classify = classify_of(transfer)
+        for _ in range(extinction.ndim):
+            classify = jax.vmap(classify)
+        return classify(measured)
+
+    _, pull = eqx.filter_vjp(classified, (transfer, measured))
+    return pull((color, extinction))[0]
 
 
 class TransferFunction(Transfer):
@@ -221,9 +290,50 @@ class TransferFunction(Transfer):
 
         return chosen if values.shape[0] <= FEW else looked_up
 
-    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
+    @property
+    def _looks_up_rows(self) -> bool:
+        """Whether no subclass classifies in another way."""
         own = (TransferFunction.classifier, TransferFunction.rows)
-        if any(getattr(type(self), method.__name__) is not method for method in own):
+        return all(getattr(type(self), method.__name__) is method for method in own)
+
+    def integrator(self) -> Classify | None:
+        """The exact means, but for rounding."""
+        if not self._looks_up_rows:
+            return None
+        rows, few = self.span_rows(), self.values.shape[0] <= FEW
+
+        def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
+            _, front, back = measured
+            if few:
+                return mean_by_spans(rows, front[0], back[0])
+            (a, i), (b, j) = (_span_of(rows, end) for end in (front, back))
+            return mean_by_rows(a, b, front[0], back[0], i == j)
+
+        return integrate
+
+    def pull_integrated(
+        self, measured: Measured, color: Vec3, extinction: Scalar
+    ) -> tuple["Transfer", Measured]:
+        # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
+        _, front, back = measured
+        rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
+        (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
+        means = partial(mean_by_rows, same=i == j)
+        _, pull = jax.vjp(means, a, b, front[0], back[0])
+        of_a, of_b, of_front, of_back = pull((color, extinction))
+        sums = jnp.zeros(rows.shape, extinction.dtype)
+        for place, part in ((i, of_a), (j, of_b)):
+            sums = sums.at[place].add(jnp.stack(part, axis=-1), mode="promise_in_bounds")
+        (transfer,) = pull_rows(sums)
+        return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
+
+    def span_rows(self) -> Float[Array, "spans 18"]:
+        """The table of `piecewise_linear.span_rows`."""
+        at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        return span_rows(jax.lax.stop_gradient(self.values), at_points)
+
+    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
+        if not self._looks_up_rows:
             transfer, (of_value, *found) = super().pull(measured, color, extinction)
             if found:  # the distance past the point depends on the value
                 of_value = of_value + jnp.where(measured[0] < self.values[0], 0, found[1])
@@ -258,6 +368,16 @@ class TransferFunction(Transfer):
         at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         slopes = jnp.concatenate([(at_points[1:] - at_points[:-1]) * inverse, inverse], axis=1)
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
+
+
+def _span_of(
+    rows: Float[Array, "spans 18"], measured: Measured
+) -> tuple[tuple[Scalar, ...], Int[Array, "..."]]:
+    """The row of the span in which a value lies, and its index. `measured`: the value, and what
+    `TransferFunction.search` finds for it."""
+    value, *found = measured
+    index = jnp.where(value < rows[0, 0], 0, found[0] + 1) if found else span_index(rows, value)
+    return table_row(rows, index), index
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:

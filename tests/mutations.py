@@ -261,6 +261,41 @@ MUTATIONS = [
         ("test_march.py::test_midpoint_samples_only_inside",),
     ),
     Mutation(
+        "integrated: a cell begins with the value at its own end",
+        "engine/segment.py",
+        "fronts = [jax.tree.map(lambda leaf: leaf[:-1], joints), *inner]",
+        "fronts = [jax.tree.map(lambda leaf: leaf[1:], joints), *inner]",
+        ("test_preintegration.py::test_opacity_is_exact_where_the_value_is_linear_along_the_ray",),
+    ),
+    Mutation(
+        "integrated: pieces with gaps between them share ends",
+        "engine/segment.py",
+        "    if not march.joins:\n        fronts, backs = read[::2], read[1::2]",
+        "    if len(read) == 4:\n        fronts, backs = [read[0], read[0]], [read[1], read[3]]",
+        ("test_preintegration.py::test_pieces_that_need_not_be_joined_are_measured_at_both_ends",),
+    ),
+    Mutation(
+        "integrated: whole spans between falling values counted as between rising ones",
+        "_util/piecewise_means.py",
+        "jnp.where(up, to_start - to_end, to_end_there - to_start_here)",
+        "jnp.where(up, to_start - to_end, to_start_here - to_end_there)",
+        ("test_preintegration.py::test_means_are_integrals",),
+    ),
+    Mutation(
+        "integrated: the mean of colours is not weighted by the extinction",
+        "_util/piecewise_means.py",
+        "jnp.where(emits, part / jnp.where(emits, extinction, 1), color)",
+        "color + 0 * part",
+        ("test_preintegration.py::test_means_are_integrals",),
+    ),
+    Mutation(
+        "integrated: the value at a cell's end gets the gradient of the one at its front",
+        "transfer.py",
+        "return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))",
+        "return transfer, (jnp.zeros_like(of_front), (of_front,), (of_front,))",
+        ("test_preintegration.py::test_the_vjp_of_integrals_is_that_of_jax",),
+    ),
+    Mutation(
         "stop: rays end while their transmittance is high",
         "transforms/early_termination.py",
         "(transmittance <= self.opacity_left)",
@@ -432,8 +467,8 @@ MUTATIONS = [
     Mutation(
         "transfer function: a custom look-up gets the VJP of the standard one",
         "transfer.py",
-        "if any(getattr(type(self), method.__name__) is not method for method in own):",
-        "if False:",
+        "        if not self._looks_up_rows:\n            transfer, ",
+        "        if False:\n            transfer, ",
         ("test_transfer.py::test_vjp_of_a_custom_transfer_function_matches_its_look_up",),
     ),
     Mutation(

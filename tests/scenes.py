@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import equinox as eqx
 import jax
@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+import jaxvol.march
 
 
+QUADRATURES = get_args(jv.march.Quadrature)
 RESOLUTION = 24
 SIZE = (20, 16)
 

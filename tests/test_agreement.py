@@ -1,5 +1,7 @@
 """Do `render`, the reference engine and an independent float64 marcher give the same image?"""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import pytest
 import jaxvol as jv
 
 from . import oracle
-from .scenes import CAMERAS, FEW, TRANSFORMS, VOLUMES, in_float64, soft_transfer, to_float64
+from .scenes import CAMERAS, FEW, TRANSFORMS, VOLUMES, in_float64, slow, soft_transfer, to_float64
 
 
 STEP = 0.07
@@ -28,7 +30,7 @@ def oracle_image(volume, transfer, camera, march):
         origins,
         directions,
         float(march.step),
-        midpoint=march.quadrature == "midpoint",
+        quadrature=march.quadrature,
         align=jv.AlphaCorrection in kinds,
         opacity_left=None if ending is None else float(ending.opacity_left),
         start=0.0 if jitter is None else random_numbers(jitter, camera),
@@ -74,12 +76,16 @@ def reference_image(volume, transfer, camera, march):
 FAST = {
     *((name, "left") for name in ("plain", "aligned", "jittered")),
     *((name, "midpoint") for name in FEW[2:]),
+    (FEW[2], "preintegrated"),
 }
 """Cases of the fast run, which cover every transform; the slow run adds the others."""
 
 CASES = [
     pytest.param(*case, marks=[] if case in FAST else pytest.mark.slow)
-    for case in (*((name, "left") for name in TRANSFORMS), *((name, "midpoint") for name in FEW))
+    for case in (
+        *((name, "left") for name in TRANSFORMS),
+        *itertools.product(FEW, ("midpoint", "preintegrated")),
+    )
 ]
 
 
@@ -97,13 +103,19 @@ def test_render_agrees_with_the_independent_marcher(transforms, quadrature):
             compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5, left=left)
 
 
-ONE = [name if name == FEW[2] else pytest.param(name, marks=pytest.mark.slow) for name in FEW]
+SECOND_ORDER = pytest.mark.parametrize(
+    ("transforms", "quadrature"),
+    [
+        *((FEW[2], quadrature) for quadrature in ("midpoint", "preintegrated")),
+        *slow(*itertools.product([*FEW[:2], *FEW[3:]], ("midpoint", "preintegrated"))),
+    ],
+)
 
 
-@pytest.mark.parametrize("transforms", ONE)
-def test_render_agrees_with_the_reference(transforms):
-    march = jv.March(STEP, TRANSFORMS[transforms], "midpoint")
-    counted = jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80)
+@SECOND_ORDER
+def test_render_agrees_with_the_reference(transforms, quadrature):
+    march = jv.March(STEP, TRANSFORMS[transforms], quadrature)
+    counted = jv.March(STEP, TRANSFORMS[transforms], quadrature, max_samples=80)
     left = 0.05 if "terminated" in transforms else 0.0
     transfer = soft_transfer()
     for volume in (make() for make in VOLUMES.values()):
@@ -116,10 +128,10 @@ def test_render_agrees_with_the_reference(transforms):
             np.testing.assert_array_equal(rendering.aligned, reference.aligned)
 
 
-@pytest.mark.parametrize("transforms", ONE)
-def test_float64_reference_agrees_with_the_independent_marcher_to_rounding(transforms):
+@SECOND_ORDER
+def test_float64_reference_agrees_with_the_independent_marcher_to_rounding(transforms, quadrature):
     with in_float64():
-        march = to_float64(jv.March(STEP, TRANSFORMS[transforms], "midpoint", max_samples=80))
+        march = to_float64(jv.March(STEP, TRANSFORMS[transforms], quadrature, max_samples=80))
         transfer = to_float64(soft_transfer())
         for make in VOLUMES.values():
             volume = to_float64(make())

@@ -18,6 +18,7 @@ from . import oracle
 from .scenes import (
     CAMERAS,
     FEW,
+    QUADRATURES,
     TRANSFORMS,
     VOLUMES,
     around,
@@ -39,7 +40,7 @@ def whitened(transfer):
     [
         # shares its program with `test_agreement`
         pytest.param(*case, marks=[] if case == (FEW[2], "midpoint") else pytest.mark.slow)
-        for case in itertools.product(FEW, ("left", "midpoint"))
+        for case in itertools.product(FEW, QUADRATURES)
     ],
 )
 def test_weights_and_transmittance_sum_to_one(transforms, quadrature):
@@ -57,7 +58,7 @@ def test_weights_and_transmittance_sum_to_one(transforms, quadrature):
 @given(
     step=st.floats(0.004, 5),
     extinction=st.one_of(st.just(0.0), st.floats(1e-3, 100)),
-    quadrature=st.sampled_from(["left", "midpoint"]),
+    quadrature=st.sampled_from(QUADRATURES),
 )
 def test_a_constant_volume_is_exact_at_any_step_under_alpha_correction(step, extinction, quadrature):
     volume = scaled_phantom("constant")
@@ -88,7 +89,7 @@ def lengths_inside(volume, camera):
     return np.asarray(rounded_lengths(volume, camera), np.float64)
 
 
-@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_a_constant_volume_is_exact_to_rounding_in_float64(quadrature):
     with in_float64():
         volume = to_float64(scaled_phantom("constant"))
@@ -127,7 +128,7 @@ class Gaussian(jv.Field):
         return jnp.exp(-(x**2 + y**2 + z**2) / (2 * 0.3**2))
 
 
-@pytest.mark.parametrize(("quadrature", "order"), [("left", 1), ("midpoint", 2)])
+@pytest.mark.parametrize(("quadrature", "order"), [("left", 1), ("midpoint", 2), ("preintegrated", 2)])
 def test_the_error_falls_with_the_order_claimed_for_image_and_gradient(quadrature, order):
     steps = np.array([0.16, 0.08, 0.04, 0.02])
     with in_float64():

@@ -5,6 +5,8 @@ import pytest
 
 import jaxvol as jv
 
+from .scenes import slow
+
 
 def plain(color, extinction):
     """The same colour and extinction for every value."""
@@ -50,7 +52,7 @@ def test_functions_may_be_named_by_label_and_differ_in_points():
         np.testing.assert_allclose(along_x(data, named, fine).rgba[0], RED_THEN_BLUE, atol=1e-5)
 
 
-@pytest.mark.parametrize("quadrature", [pytest.param("left", marks=pytest.mark.slow), "midpoint"])
+@pytest.mark.parametrize("quadrature", ["midpoint", *slow("left", "preintegrated")])
 @pytest.mark.parametrize("step", [0.3, 0.77, 2.9])
 @pytest.mark.parametrize("jittered", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_cells_are_cut_at_labels_and_exact_at_any_step(step, quadrature, jittered):

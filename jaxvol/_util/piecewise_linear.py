@@ -59,7 +59,7 @@ def points_below(
     return jax.lax.cond(even, counted, searched, value)
 
 
-def table_row(rows: Float[Array, "points 10"], point: Int[Array, "..."]) -> Row:
+def table_row(rows: Float[Array, "points columns"], point: Int[Array, "..."]) -> Row:
     """One row. Each entry is looked up by itself, so that batched entries are whole arrays from the start."""
     point = jnp.clip(point, 0, rows.shape[0] - 1)
     return tuple(gather(rows[:, i], point) for i in range(rows.shape[1]))

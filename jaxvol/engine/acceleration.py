@@ -12,6 +12,7 @@ from ..compositing import FirstVisible, Selection
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
+from ..transfer import classification_of
 from ..volume import Volume
 from .batch import Beams
 from .packing import with_words, words_of
@@ -66,7 +67,9 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         tiles, only = RayTiles.of(own, tiling._replace(tile=columns.size)), jnp.zeros((), jnp.int32)
         rays = tiles.rays(own, space, only)
         beams = Beams(rays, tiles.beams, tiles.box(own, rays, only))
-        pipeline = Pipeline(plain, volume, transfer.classification(volume), FirstVisible())
+        pipeline = Pipeline(
+            plain, volume, classification_of(transfer, volume, integrated=march.integrates), FirstVisible()
+        )
         at, _ = march_rays(pipeline, index, beams, tiling, "depth")
         seen = vmap_rays(partial(end, pipeline))(rays, at)
         return tiles.assemble(seen.depth[None]).reshape(columns.shape)

@@ -70,7 +70,8 @@ def pipeline_of(scene: Scene) -> tuple[Space, Pipeline]:
     """The space in which rays meet the volume, and what turns them into pixels."""
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
-    return space, Pipeline(march, volume, lit_classification(volume, transfer, space, lighting), compositing)
+    lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
+    return space, Pipeline(march, volume, lit, compositing)
 
 
 def _over_tiles(

@@ -31,10 +31,10 @@ from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing import Weighting
 from ..march import March
-from ..reference import Pipeline, Progress, contained
+from ..reference import Pipeline, Progress, contained, measure
 from ..rendering import Rendering
 from ..space import Ray
-from ..transfer import Transfer
+from ..transfer import Transfer, classification_of
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
@@ -144,7 +144,7 @@ class Replay(SampleVisitor):
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
         red, green, blue = each.color
-        classify = vmap_cells(self.pipeline.classification.classify)
+        classify = vmap_cells(self.pipeline.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.pipeline.march.sample(cell) for cell in samples.cells]
         weights = weights_of(self.pipeline, at, samples.opacity)
@@ -171,7 +171,9 @@ class Replay(SampleVisitor):
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if lit is None else lit[i].of_extinction)
-            of_transfer, of_read = self.transfer.pull(measured, of_color[i], of_extinction)
+            transfer = self.transfer
+            pull = transfer.pull_integrated if self.pipeline.march.integrates else transfer.pull
+            of_transfer, of_read = pull(measured, of_color[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
             of_measured.append(of_read if lit is None else added(of_read, lit[i].of_measured))
         if not self.places:
@@ -210,10 +212,11 @@ class Replay(SampleVisitor):
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
             record = Recording(perturbations or [], [])
             here = with_fetch(placed, record) if voxels else with_words(placed, self.words)
-            found = []
-            for piece in pieces_ahead(self.pipeline._replace(march=march, volume=here), ray, at, ahead):
-                depth = march.sample(piece)
-                measured = self.transfer.measured(here, ray.path(depth))
+            found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
+            classification = classification._replace(search=None)  # it is constant here
+            pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
+            for piece in pieces_ahead(pipeline, ray, at, ahead):
+                depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, point))

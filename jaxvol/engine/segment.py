@@ -7,6 +7,7 @@ opacities a third. (Measured on CPU.)
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from ..compositing import Selection
 from ..march import Cell, March
 from ..reference import Pipeline, Progress, add, front, move, opacity, pieces, stop
 from ..space import Ray
-from ..transfer import Measured
+from ..transfer import Classification, Measured
 from .tiling import Tiling
 from .visible_samples import shaded_colors
 
@@ -133,7 +134,7 @@ def march_segment(
     if isinstance(pipeline.compositing, Selection):
         colors = [None] * len(samples.cells)
     elif classification.light is None:
-        colors = [vmap_cells(classification.classify)(read)[0] for read in samples.measured]
+        colors = _colors(pipeline, at, samples.measured)
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
@@ -181,18 +182,72 @@ def _sampled(pipeline: Pipeline, ahead: Ahead, ray: Ray, at: Progress) -> Sample
         each = vmap_cells(partial(opacity, pipeline), (False, True, True))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
-    # Always true, but opaque to XLA, so that the branches survive. In a pass there are at most some
-    # `march.most_samples` / cells segments, in each of which an index grows by at most cells *
-    # `longest_stride`, finished or not: with 2**24 samples and strides of 64 it stays below 2**31. Whether
-    # any ray is alive would take 1 % of a frame to find out.
-    live = at.index[0] >= 0
-    values = in_memory(live, measured, at, given)
-    if classification.search is not None:
-        search = vmap_cells(classification.search)
-        found = in_memory(live, lambda values: [search(each) for each in values], values)
-        values = [(*read, *more) for read, more in zip(values, found, strict=True)]
+    live = _live(at)
+    if march.integrates:
+        values = _measured_over(pipeline, ray, live, partial(cells, at, given))
+    else:
+        values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
     return Samples(ahead, list(cells(at, given)), values, alphas)
+
+
+def _live(at: Progress) -> Bool[Array, ""]:
+    """Always true, but opaque to XLA, so that branches survive."""
+    # In a pass there are at most some `march.most_samples` / cells segments, in each of which an index grows
+    # by at most cells * `longest_stride`, finished or not: with 2**24 samples and strides of 64 it stays
+    # below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
+    return at.index[0] >= 0
+
+
+def _searched(classification: Classification, live: Bool[Array, ""], read: list[Measured]) -> list[Measured]:
+    """What was measured, in memory, with what the transfer function's search finds for it."""
+    if classification.search is None:
+        return read
+    search = vmap_cells(classification.search)
+    found = in_memory(live, lambda read: [search(each) for each in read], read)
+    return [(*each, *more) for each, more in zip(read, found, strict=True)]
+
+
+def _colors(pipeline: Pipeline, at: Progress, measured: list[Measured]) -> list[Vec3]:
+    """The colours of cells, as classified."""
+    classify = vmap_cells(pipeline.classification.of_cells)
+
+    def all_(measured: list[Measured]) -> list[Vec3]:
+        return [classify(each)[0] for each in measured]
+
+    # Means would be computed again for each use if they were fused into the compositing of each cell.
+    return in_memory(_live(at), all_, measured) if pipeline.march.integrates else all_(measured)
+
+
+def _measured_over(
+    pipeline: Pipeline, ray: Ray, live: Bool[Array, ""], cells: Callable[[], tuple[Cell, ...]]
+) -> list[Measured]:
+    """What is measured over the pieces of cells, each end once where they are joined."""
+    march, classification = pipeline.march, pipeline.classification
+    at = vmap_cells(lambda ray, depth: classification.measure(ray.path(depth))[:1], (False, True))
+    between = vmap_cells(
+        lambda ray, piece: classification.beside(ray.path(march.sample(piece))), (False, True)
+    )
+    ends_of = vmap_cells(lambda ray, piece: march.ends(piece, ray), (False, True))
+
+    def measured(_: Any) -> list[Measured]:
+        """At the ends of all pieces; where they are joined, at the first front and at all backs."""
+        ends = [ends_of(ray, piece) for piece in cells()]
+        if not march.joins:
+            return [at(ray, depth) for pair in ends for depth in pair]
+        # where a cell begins, the last piece of the one in front of it ends
+        first = jnp.concatenate([ends[0][0][:1], ends[-1][1]])
+        return [at(ray, first), *(at(ray, back) for _, back in ends[:-1])]
+
+    beside = in_memory(live, lambda _: [between(ray, piece) for piece in cells()], live)
+    read = _searched(classification, live, in_memory(live, measured, live))
+    if not march.joins:
+        fronts, backs = read[::2], read[1::2]
+    else:
+        joints, *inner = read
+        backs = [*inner, jax.tree.map(lambda leaf: leaf[1:], joints)]
+        fronts = [jax.tree.map(lambda leaf: leaf[:-1], joints), *inner]
+    return [classification.spanned(*each) for each in zip(beside, fronts, backs, strict=True)]
 
 
 def pieces_ahead(pipeline: Pipeline, ray: Ray, at: Progress, ahead: Ahead) -> tuple[Cell, ...]:

@@ -67,7 +67,7 @@ def samples_of(
     )
     depths = [pipeline.march.sample(cell) for cell in cells]
     depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), places)
-    color, extinction = jax.vmap(pipeline.classification.classify)(read)
+    color, extinction = jax.vmap(pipeline.classification.of_cells)(read)
     transmittance = pipeline.compositing.transmittance(Composite(before))
     return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
 

@@ -19,7 +19,7 @@ from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
-from ..transfer import Classification, Measured, Transfer
+from ..transfer import Classification, Measured, Transfer, classification_of
 from ..volume import Volume, with_fetch
 
 
@@ -148,10 +148,11 @@ class Lighting(eqx.Module):
 
 
 def lit_classification(
-    volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None
+    volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None, *, integrated: bool = False
 ) -> Classification:
-    """Measuring, classifying and, where there is a lighting, shading the places of a volume."""
-    classification = transfer.classification(volume)
+    """Measuring, classifying and, where there is a lighting, shading the places of a volume, or also cells
+    that are `integrated`."""
+    classification = classification_of(transfer, volume, integrated=integrated)
     if lighting is None:
         return classification
     around = Surroundings(volume, transfer, space)

@@ -2,7 +2,7 @@
 exit; the same idea at faces of labels and gaps."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -58,6 +58,8 @@ class AlphaCorrection(Transform):
     of labels and gaps are not in the paper, which names the noise of jitter at the faces of a segmentation
     as future work.
     """
+
+    joins: ClassVar[bool] = True
 
     labels: bool = eqx.field(static=True, default=False)
 

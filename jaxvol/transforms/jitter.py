@@ -5,7 +5,7 @@ grain. Both transforms shift the samples of each pixel by a random fraction ξ o
 rings into noise. Neither makes the image more accurate: the energy of its error stays the same.
 """
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -72,6 +72,8 @@ class Jitter(Transform):
 
     Source: jittered sampling as in Kye 2013, section 2.2.
     """
+
+    joins: ClassVar[bool] = True
 
     noise: Noise
     front_residual: bool = eqx.field(static=True)

@@ -32,6 +32,10 @@ SETS = {
     "aligned": ("midpoint", (jv.AlphaCorrection(),)),
     "jittered": ("left", (jv.Jitter(3), jv.AlphaCorrection(), jv.EarlyTermination(0.05))),
     "moving": ("left", (jv.EmptySpaceJitter(4), jv.AlphaCorrection())),
+    "integrated": (
+        "preintegrated",
+        (jv.EmptySpaceJitter(4), jv.AlphaCorrection()),
+    ),
     "residual": ("midpoint", (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())),
 }
 
@@ -232,7 +236,7 @@ def test_no_leap_shows_in_a_gradient_whatever_is_rendered(method):
 FORWARD = [
     *(("jittered", method, "uint8") for method in METHODS),
     *(("moving", method, "uint8") for method in METHODS),
-    *((name, "hierarchy", "uint8") for name in ("plain", "aligned", "residual")),
+    *((name, "hierarchy", "uint8") for name in ("plain", "aligned", "integrated", "residual")),
     *(("moving", "hierarchy", dtype) for dtype in TYPES[1:]),
 ]
 
@@ -252,7 +256,10 @@ def test_forward_and_replay_gradients_agree(name, method, dtype):
     ("name", "method", "dtype"),
     [
         ("moving", "hierarchy", "float64"),
-        *(pytest.param(name, None, "float64", marks=slow) for name in ("aligned", "moving", "residual")),
+        *(
+            pytest.param(name, None, "float64", marks=slow)
+            for name in ("aligned", "moving", "integrated", "residual")
+        ),
         *(pytest.param("moving", method, "uint8", marks=slow) for method in EXACT),
     ],
 )

@@ -18,6 +18,7 @@ from jaxvol.render import _render
 
 from ..scenes import (
     CAMERAS,
+    QUADRATURES,
     around,
     counting,
     in_float64,
@@ -147,7 +148,7 @@ def test_leaping_does_not_show_in_parallel_views_of_floats(kind, seed, step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("quadrature", ["left", "midpoint"])
+@pytest.mark.parametrize("quadrature", QUADRATURES)
 @pytest.mark.parametrize("transforms", SETS)
 @pytest.mark.parametrize("view", CAMERAS)
 def test_leaping_does_not_show_whatever_the_transforms(view, transforms, quadrature):
