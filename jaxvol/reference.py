@@ -110,9 +110,9 @@ def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False
     def measured(depth: Scalar) -> Measured:
         return classification.measure(ray.path(depth))[:1]
 
-    # In branches of their own, which XLA does not fuse: where a kernel interpolates both values, it may round
-    # a coordinate in one way for the index and in another for the fraction, and a sample at a node takes the
-    # value of the next one (jaxlib 0.10 on CPU with FMA; `test_render_agrees_with_the_reference`).
+    # In branches of their own, which XLA does not fuse: where a kernel interpolates both values, one of them
+    # may come out as that of the next node (jaxlib 0.10 on CPU with FMA; seen by
+    # `test_render_agrees_with_the_reference`).
     ends = march.ends(piece, ray)
     front, back = (measured(s) if recorded else in_memory(march.step > 0, measured, s) for s in ends)
     beside = classification.beside(ray.path(march.sample(piece)))
