@@ -156,7 +156,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
         errors.set_title(f"{name}: narrow peak", fontsize=9)
     axes[0, 0].set_ylabel(f"time of a frame of {result['pixels']}² pixels, ms", fontsize=8)
     axes[1, 0].set_ylabel("RMSE", fontsize=8)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=min(6, 2 * len(scenes)),
+        fontsize=8,
+    )
     common.save(figure, path)
 
 

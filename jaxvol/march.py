@@ -152,12 +152,13 @@ class March(eqx.Module):
     - `quadrature`: what a cell's colour and extinction are. `"left"`: those at its front, as the papers do;
       the error falls with d. `"midpoint"`: those in its middle; the error falls with d².
       `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
-      along it, the colour weighted by the extinction. The error falls with d², too, but no peak of the
-      transfer function is missed between two samples. A mean does not know that what is in front in a cell
-      hides what is behind: for a cell of opacity α and optical depth τ, this errs by at most α τ / 8 times
-      the difference of its colours. It needs one fetch for each cell, and one more for each segment. Of a
-      labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take it
-      there, too, and light is computed there.
+      along it, the colour weighted by the extinction. The error falls with d², too, and a narrow peak of the
+      transfer function counts wherever the two values lie on either side of it. A mean does not know that
+      what is in front in a cell hides what is behind: for a cell of opacity α and optical depth τ, this errs
+      by at most α τ / 8 times the difference of its colours. It takes one fetch for each cell and one more
+      for each segment, or two for each piece where a transform's pieces are not joined (`Transform.joins`).
+      Of a labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take
+      it there, too, and light is computed there.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
       2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
       default 131 072, so that every march ends.

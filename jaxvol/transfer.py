@@ -328,7 +328,7 @@ class TransferFunction(Transfer):
         return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
 
     def span_rows(self) -> Float[Array, "spans 18"]:
-        """The table of `piecewise_linear.span_rows`."""
+        """The table of `piecewise_means.span_rows`."""
         at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         return span_rows(jax.lax.stop_gradient(self.values), at_points)
 
