@@ -171,6 +171,7 @@ def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> 
 
     XLA recomputes what it fuses for each use, fetches too, but the results of a branch lie in memory. `live`
     must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN."""
+    f = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
 
     def never(*arguments: Any) -> Any:
         def filled(leaf: Any) -> Array:
