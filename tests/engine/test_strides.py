@@ -7,7 +7,7 @@ import pytest
 
 import jaxvol as jv
 
-from ..scenes import in_float64
+from ..scenes import in_float64, slow
 from ..test_agreement import compare, reference_image
 from .test_gradient_matrix import assert_same, assert_slopes, central, gradient, scene_of, slopes
 
@@ -31,9 +31,7 @@ def with_strides(scene):
     return volume, transfer, camera, jv.March(march.step, (*march.transforms, Patchy()), march.quadrature)
 
 
-@pytest.mark.parametrize(
-    "name", ["moving", *(pytest.param(name, marks=pytest.mark.slow) for name in ("aligned", "jittered"))]
-)
+@pytest.mark.parametrize("name", ["moving", *slow("aligned", "jittered")])
 def test_strides_are_those_of_the_reference(name):
     scene = with_strides(scene_of(name, "distance"))  # which leaps nearest to what is visible
     volume, transfer, camera, march = scene
@@ -48,11 +46,10 @@ def test_strides_are_those_of_the_reference(name):
     np.testing.assert_allclose(rendering.rgba, unleapt.rgba, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "method", ["hierarchy", *(pytest.param(m, marks=pytest.mark.slow) for m in ("distance", "beam"))]
-)
-def test_leaping_does_not_change_gradients_under_strides(method):
-    leapt, plain = (with_strides(scene_of("moving", m, "float32")) for m in (method, None))
+@pytest.mark.parametrize("method", ["hierarchy", *slow("distance", "beam")])
+@pytest.mark.parametrize("name", ["aligned", *slow("moving")])
+def test_leaping_does_not_change_gradients_under_strides(name, method):
+    leapt, plain = (with_strides(scene_of(name, m, "float32")) for m in (method, None))
     assert_same(gradient(leapt), gradient(plain), 1e-4)
 
 
