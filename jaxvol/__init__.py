@@ -53,6 +53,7 @@ from .render import render as render, render_rays as render_rays
 from .rendering import Rendering as Rendering
 from .transfer import TransferFunction as TransferFunction
 from .transforms import (
+    AdaptiveSampling as AdaptiveSampling,
     AlphaCorrection as AlphaCorrection,
     EarlyTermination as EarlyTermination,
     EmptySpaceJitter as EmptySpaceJitter,

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from ._util.checks import described
 from ._util.vec3 import Scalar, Vec3, along
 from .lighting.shading import Sample
-from .occupancy import Blocks
+from .occupancy import Blocks, Windows
 from .space import Ray
 from .transfer import Classification, Measured, Transfer
 
@@ -75,6 +75,11 @@ class Compositing(eqx.Module, Generic[State]):
         """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap
         over the others, except those that hold NaN."""
         return transfer.visible(blocks)
+
+    def variation(self, transfer: Transfer, windows: Windows) -> Float[Array, "bx by bz"]:
+        """By how much what cells are composited from changes while the value runs through the range of each
+        window, 1/length. By default infinite: nothing is known, and cells are one step long."""
+        return jnp.full(windows.low.shape, jnp.inf)
 
 
 class Composite(eqx.Module):
@@ -185,6 +190,9 @@ class Over(Weighting):
 
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
+
+    def variation(self, transfer: Transfer, windows: Windows) -> Float[Array, "bx by bz"]:
+        return transfer.variation(windows)
 
 
 class RaySampler(NamedTuple):

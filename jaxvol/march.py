@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._util.checks import check_answer, described, integer, number
 from ._util.vec3 import Scalar, Vec3
 from .beams import Box
-from .occupancy import Occupancy
+from .occupancy import Occupancy, Windows
 from .space import Affine, Ray, Space
 from .volume import Volume
 
@@ -113,16 +113,26 @@ class Transform(eqx.Module):
         image; None for `render_rays`."""
         return None
 
+    def prepared(
+        self, march: "March", space: Space, windows: Windows, variation: Float[Array, "bx by bz"]
+    ) -> "Transform":
+        """This transform with what `stride` needs to know of the scene, found once for each image, and
+        without a gradient: in fields that hold None before, and arrays of integers afterwards.
+
+        `windows`: how the volume's values vary, block by block; `variation`: by how much what they are
+        composited from changes over each window (`Compositing.variation`)."""
+        return self
+
     @property
     def longest_stride(self) -> int:
         """The longest stride that `stride` may give: a static power of two, at most 64."""
         return 1
 
-    def stride(self, ray: Ray, depth: Scalar) -> Int[Array, ""]:
-        """How many steps long the cell at this depth may be.
+    def stride(self, ray: Ray, depth: Scalar, step: Scalar) -> Int[Array, ""]:
+        """How many steps, of this length, the cell at this depth may be long.
 
-        It depends on the ray and the depth alone. A march rounds it down to a power of two of at most
-        `longest_stride`, and so far that a cell of n steps begins a multiple of n steps after the first one.
+        It depends on the ray, the depth and the step alone. A march rounds it down to a power of two of at
+        most `longest_stride`, and so far that a cell of n steps begins a multiple of n steps after the first.
         Rays leap to multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the
         shortest stride counts. Gradients take strides as given; the image jumps where one changes."""
         return jnp.ones(jnp.shape(depth), jnp.int32)
@@ -228,6 +238,30 @@ class March(eqx.Module):
         return bool(self._overriding("shift"))
 
     @property
+    def looks_ahead(self) -> bool:
+        """Whether any transform must know the scene before it is marched."""
+        return bool(self._overriding("prepared"))
+
+    def prepared(
+        self, space: Space, windows: Windows | None, variation: Callable[[Windows], Float[Array, "bx by bz"]]
+    ) -> "March":
+        """The march, whose transforms know of the scene what they need. `windows`: of the volume, where it
+        `looks_ahead`."""
+        if windows is None:
+            return self
+        march, space, windows = jax.lax.stop_gradient((self, space, windows))
+        varies = jax.lax.stop_gradient(variation(windows))
+        known = []
+        for transform, constant in zip(self.transforms, march.transforms, strict=True):
+            if _overrides(transform, "prepared"):
+                prepared = constant.prepared(march, space, windows, varies)
+                _check_kind(transform, "prepared", prepared, type(transform))
+                # its parameters keep their gradients
+                transform = eqx.combine(eqx.filter(transform, eqx.is_inexact_array), prepared)
+            known.append(transform)
+        return eqx.tree_at(lambda march: march.transforms, self, tuple(known))
+
+    @property
     def longest_stride(self) -> int:
         """The longest stride of a cell, in steps."""
         return min((transform.longest_stride for transform in self._overriding("stride")), default=1)
@@ -260,10 +294,10 @@ class March(eqx.Module):
         longest = self.longest_stride
         if longest == 1:
             return 1
-        ray, depth = jax.lax.stop_gradient((ray, depth))
+        ray, depth, step = jax.lax.stop_gradient((ray, depth, self.step))
         power = jnp.full_like(index, longest)
         for transform in self._overriding("stride"):
-            stride, name = transform.stride(ray, depth), type(transform).__name__
+            stride, name = transform.stride(ray, depth, step), type(transform).__name__
             if jnp.shape(stride) != depth.shape or not jnp.issubdtype(jnp.result_type(stride), jnp.integer):
                 raise ValueError(f"{name}.stride must return an integer for each depth; got {stride!r}.")
             stride = jnp.asarray(stride)

@@ -6,6 +6,7 @@ extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` say
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,6 +31,7 @@ from .compositing import (
 )
 from .lighting.shading import Lighting, lit_classification
 from .march import Cell, March
+from .occupancy import Windows
 from .rendering import Details, Rendering
 from .space import Line, Ray, Space, enter, invalid
 from .transfer import Classification, Measured, Transfer
@@ -290,6 +292,8 @@ def render_ray_reference(
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
     later = resolves(mode, lighting)
+    windows = Windows.of(volume) if march.looks_ahead else None
+    march = march.prepared(space, windows, partial(mode.variation, transfer))
     pipeline = Pipeline(march, volume, lit._replace(light=None) if later else lit, mode)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:

@@ -52,13 +52,13 @@ class Long(jv.Transform):
     def longest_stride(self) -> int:
         return 4
 
-    def stride(self, ray, depth):
+    def stride(self, ray, depth, step):
         x, _, _ = ray.path(depth)
         return jnp.where(x >= self.beyond, self.steps, 1)
 
 
 class Unlimited(jv.Transform):
-    def stride(self, ray, depth):
+    def stride(self, ray, depth, step):
         return jnp.full(depth.shape, 2)
 
 

@@ -117,6 +117,25 @@ def upper_bound_between(
     return jnp.maximum(ends, inside) + ROUNDING * extinction.max()
 
 
+def total_variation(
+    values: Float[Array, " n"],
+    colors: Float[Array, "n 3"],
+    extinction: Float[Array, " n"],
+    low: Float[Array, "*blocks"],
+    high: Float[Array, "*blocks"],
+) -> Float[Array, "*blocks"]:
+    """An upper bound of the integral of |dσ/dv|, and of |d(σ c)/dv| for each colour channel c, from `low` to
+    `high`."""
+    brightness, shift = jnp.max(jnp.abs(colors), axis=1), jnp.max(jnp.abs(jnp.diff(colors, axis=0)), axis=1)
+    brightness = jnp.maximum(jnp.maximum(brightness[1:], brightness[:-1]), 1)
+    densest = jnp.maximum(extinction[1:], extinction[:-1])
+    # between two points
+    changes = jnp.abs(jnp.diff(extinction)) * brightness + densest * shift
+    until = jnp.concatenate([jnp.zeros_like(changes[:1]), jnp.cumsum(changes)])
+    first, last = (jnp.interp(end.astype(values.dtype), values, until) for end in (low, high))
+    return jnp.maximum(last - first, 0)
+
+
 def _maximum_of_range(
     entries: Float[Array, " n"], first: Int[Array, "*batch"], end: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:

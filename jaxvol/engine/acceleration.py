@@ -10,7 +10,7 @@ from jaxtyping import Array, Int, UInt32
 from .._util.checks import check_answer
 from ..compositing import FirstVisible, Selection
 from ..march import EmptySpaceIndex, March, View
-from ..occupancy import Blocks
+from ..occupancy import Blocks, Windows
 from ..reference import Pipeline, end
 from ..transfer import classification_of
 from ..volume import Volume
@@ -23,15 +23,21 @@ from .wavefront import march_rays
 
 
 class VolumeAcceleration(eqx.Module):
-    """What depends on the voxels alone: a packed copy for fetching, and the ranges of blocks. Made once for
-    an array of voxels, and anew for another one."""
+    """What depends on the voxels alone: a packed copy for fetching, the ranges of blocks, and how values vary
+    around them; None where the march has no use for it. Made once for an array of voxels, and anew for
+    another one."""
 
     words: UInt32[Array, " voxels"] | None
     blocks: Blocks | None
+    windows: Windows | None
 
     @classmethod
     def of(cls, volume: Volume, march: March) -> "VolumeAcceleration":
-        return cls(words_of(volume), Blocks.of(volume) if march.leaps else None)
+        return cls(
+            words_of(volume),
+            Blocks.of(volume) if march.leaps else None,
+            Windows.of(volume) if march.looks_ahead else None,
+        )
 
     def packed(self, scene: Scene) -> Scene:
         """The scene, with voxels fetched from their packed copy."""

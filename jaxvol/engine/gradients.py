@@ -136,7 +136,7 @@ def _vjp_by_tiles(
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
         index = index.within_ranges()
-    _, pipeline = pipeline_of(packed._replace(lighting=None))
+    _, pipeline = pipeline_of(packed._replace(lighting=None), acceleration)
     light, pull_light = None, None
     if lighting is not None:
         light, pull_light = _light(scene, packed.volume, voxels=of_voxels)

@@ -38,7 +38,7 @@ def march_image(
     tiles = RayTiles.of(scene.source, tiling)
     scene = acceleration.packed(scene)
     index = empty_space_of(scene, acceleration, tiling)
-    space, pipeline = pipeline_of(scene)
+    space, pipeline = pipeline_of(scene, acceleration)
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
         beams = Beams(rays, tiles.beams, tiles.box(scene.source, rays, tile))
@@ -55,7 +55,7 @@ def scan_image(
     """The image, by `length` steps of the reference engine along each ray, which JAX can differentiate."""
     tiles = RayTiles.of(scene.source, options.tiling, direct=True)
     scene = acceleration.packed(scene)
-    space, pipeline = pipeline_of(scene)
+    space, pipeline = pipeline_of(scene, acceleration)
 
     def scanned(_: Int[Array, ""], rays: Ray) -> Rendering:
         one = vmap_rays(partial(step, pipeline))
@@ -66,11 +66,12 @@ def scan_image(
     return _over_tiles(scene, space, tiles, lambda tile, rays: (scanned(tile, rays), None))[0]
 
 
-def pipeline_of(scene: Scene) -> tuple[Space, Pipeline]:
+def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, Pipeline]:
     """The space in which rays meet the volume, and what turns them into pixels."""
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
+    march = march.prepared(space, acceleration.windows, partial(compositing.variation, transfer))
     return space, Pipeline(march, volume, lit, compositing)
 
 

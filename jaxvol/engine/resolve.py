@@ -30,7 +30,7 @@ def resolve_image(
 ) -> Float[Array, "*rays 5"]:
     """Pixels and their depths, from what the march found."""
     scene = acceleration.packed(scene)
-    space, pipeline = pipeline_of(scene)
+    space, pipeline = pipeline_of(scene, acceleration)
 
     def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, "5"]:
         rgba, depth = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)

@@ -1,5 +1,6 @@
 """The transforms of a march: each is one idea from one paper."""
 
+from .adaptive_sampling import AdaptiveSampling as AdaptiveSampling
 from .alpha_correction import AlphaCorrection as AlphaCorrection
 from .early_termination import EarlyTermination as EarlyTermination
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter

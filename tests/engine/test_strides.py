@@ -21,7 +21,7 @@ class Patchy(jv.Transform):
     def longest_stride(self):
         return self.longest
 
-    def stride(self, ray, depth):
+    def stride(self, ray, depth, step):
         x, y, z = ray.path(depth)
         return 2 ** (jnp.floor(x / 3 + y / 2 + z / 5).astype(jnp.int32) % 5)
 

@@ -1,0 +1,241 @@
+"""Adaptive sampling: what is known of the voxels, what is predicted, what the image's error becomes, and
+whether both engines choose the same cells."""
+
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import jaxvol as jv
+from experiments import scenes as real_scenes
+from jaxvol.metrics import rmse
+from jaxvol.occupancy import BLOCK, MARGIN, Windows
+from jaxvol.space import Affine
+
+from ..engine.test_gradient_matrix import scene_of
+from ..scenes import counting, slow
+from ..test_agreement import compare, reference_image
+
+
+RAMP = jv.TransferFunction([0.0, 1.0], [[1.0, 1.0, 1.0]] * 2, [0.0, 2.0])
+"""Extinction and emission grow by 2 for each unit of the value."""
+
+
+def strides(volume, transfer, sampling, step=1.0, quadrature="preintegrated", mode="over"):
+    """By block, the most steps of a cell."""
+    march = jv.March(step, (sampling,), quadrature)
+    mode = jv.Over() if mode == "over" else mode
+    prepared = march.prepared(
+        Affine(volume), Windows.of(volume), lambda windows: mode.variation(transfer, windows)
+    )
+    return np.asarray(prepared.transforms[0].strides)
+
+
+# -- what is known of the voxels -------------------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    shape=st.tuples(*[st.sampled_from([2, 3, 5, 9, 11])] * 3),
+    dtype=st.sampled_from(["uint8", "int16", "float32"]),
+    seed=st.integers(0, 2**16),
+)
+def test_windows_hold_what_lies_in_and_around_each_block(shape, dtype, seed):
+    data = (np.random.default_rng(seed).random(shape) * 200).astype(dtype)
+    found, value = Windows.of(jv.Volume(data)), data.astype(float)
+    bend = np.zeros(shape)
+    for axis, other in ((0, 1), (1, 2), (2, 0)):
+        ahead, behind = (np.clip(np.arange(shape[axis]) + way, 0, shape[axis] - 1) for way in (1, -1))
+        pure = np.abs(np.take(value, ahead, axis) - 2 * value + np.take(value, behind, axis))
+        inner = np.zeros(shape[axis], bool)
+        inner[1:-1] = True
+        bend = np.maximum(bend, np.where(np.expand_dims(inner, [i for i in range(3) if i != axis]), pure, 0))
+        slope = np.diff(value, axis=axis)
+        mixed = np.abs(np.diff(slope, axis=other))
+        bend[tuple(slice(n) for n in mixed.shape)] = np.maximum(
+            bend[tuple(slice(n) for n in mixed.shape)], mixed
+        )
+    for block in itertools.product(*(range(n) for n in found.low.shape)):
+        part = tuple(slice(max(i * BLOCK - MARGIN, 0), (i + 1) * BLOCK + MARGIN + 1) for i in block)
+        assert found.low[block] == value[part].min()
+        assert found.high[block] == value[part].max()
+        np.testing.assert_allclose(found.bend[block], bend[part].max(), rtol=1e-5, atol=1e-4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**16), points=st.integers(2, 40))
+def test_the_variation_bounds_every_change_of_extinction_and_emission(seed, points):
+    random = np.random.default_rng(seed)
+    values = np.sort(random.random(points)).astype(np.float32)
+    transfer = jv.TransferFunction(values, random.random((points, 3)), random.random(points) * 5)
+    low, high = np.sort(random.uniform(-0.2, 1.2, (2, 30)), axis=0)
+    windows = Windows(*(jnp.asarray(a, jnp.float32).reshape(30, 1, 1) for a in (low, high, 0 * low)))
+    found = np.asarray(transfer.variation(windows)).ravel()
+    for bound, a, b in zip(found, low, high, strict=True):
+        at = np.linspace(a, b, 2001)
+        extinction = np.interp(at, values, np.asarray(transfer.extinction))
+        channels = [extinction * np.interp(at, values, c) for c in np.asarray(transfer.colors).T]
+        total = max(np.abs(np.diff(each)).sum() for each in (extinction, *channels))
+        assert total <= bound * (1 + 1e-4) + 1e-4
+
+
+# -- what is predicted -----------------------------------------------------------------------------------
+
+
+def parabola(n=33, axis=0, bend=1 / 512):
+    """Values in [0, 1] with this second difference along one axis."""
+    x = np.moveaxis(np.meshgrid(*[np.arange(n) - n // 2] * 3, indexing="ij"), 0, 0)[axis]
+    return jv.Volume((bend * x**2 / 2).astype(np.float32))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_cells_are_as_long_as_the_tolerance_lets_them_be(axis):
+    """The value bends by H = 1/512 everywhere, so that e / 20 = ℓ V δ / (20 R) = 4 · 2 · H w² / 160."""
+    for width in (1, 2, 4, 8):
+        error = 4 * 2 * (1 / 512) * width**2 / 160
+        found = strides(parabola(axis=axis), RAMP, jv.AdaptiveSampling(1.01 * error))
+        inner = np.delete(np.arange(8), [0, 7])  # at faces a window holds no more than the bend of its inside
+        assert (found[np.ix_(inner, inner, inner)] == width).all(), width
+
+
+def test_steps_and_spacing_have_the_same_unit():
+    """A volume, its extinction and its step may be scaled together."""
+    volume = parabola()
+    scaled = jv.Volume(volume.data, (3.0, 3.0, 3.0))
+    thinner = jv.TransferFunction(RAMP.values, RAMP.colors, RAMP.extinction / 3)
+    for tolerance in (1e-4, 1e-3, 1e-2):
+        sampling = jv.AdaptiveSampling(tolerance)
+        np.testing.assert_array_equal(
+            strides(scaled, thinner, sampling, 3.0), strides(volume, RAMP, sampling, 1.0)
+        )
+
+
+def test_a_value_that_bends_across_the_axes_alone_is_found():
+    x, y, _ = np.meshgrid(*[np.linspace(-1, 1, 33)] * 3, indexing="ij")
+    saddle = jv.Volume((0.5 + 0.5 * x * y).astype(np.float32))
+    assert strides(saddle, RAMP, jv.AdaptiveSampling(1e-5)).max() == 1
+
+
+def test_no_cell_is_longer_than_two_blocks():
+    """A window says nothing of what lies farther away."""
+    flat = jv.Volume(np.full((65, 65, 65), 0.5, np.float32))
+    assert strides(flat, RAMP, jv.AdaptiveSampling(1e-3, 64), 1.0).max() == 8
+    assert strides(flat, RAMP, jv.AdaptiveSampling(1e-3, 64), 0.25).max() == 32
+    assert strides(flat, RAMP, jv.AdaptiveSampling(1e-3, 64), 3.0).max() == 2
+
+
+@pytest.mark.parametrize("case", ["nan", "field", "selection", "midpoint", "unknown", "labels"])
+def test_cells_are_one_step_long_where_nothing_is_known(case):
+    volume, transfer, more = parabola(), RAMP, {}
+    if case == "nan":
+        volume = eqx.tree_at(lambda of: of.data, volume, volume.data.at[16, 16, 16].set(jnp.nan))
+        assert strides(volume, RAMP, jv.AdaptiveSampling(1.0))[4, 4, 4] == 1
+        assert strides(volume, RAMP, jv.AdaptiveSampling(1.0))[0, 0, 0] == 8
+        return
+    if case == "field":
+
+        class Constant(jv.Field):
+            def value(self, volume, coordinate):
+                return jnp.zeros_like(coordinate[0])
+
+        volume = jv.Volume(volume.data, field=Constant())
+    elif case == "selection":
+        more["mode"] = jv.FirstVisible()
+    elif case == "midpoint":
+        more["quadrature"] = "midpoint"
+    elif case == "unknown":
+
+        class Unknown(jv.TransferFunction):
+            def variation(self, windows):
+                return super(jv.TransferFunction, self).variation(windows)
+
+        transfer = Unknown(RAMP.values, RAMP.colors, RAMP.extinction)
+    else:
+        transfer = jv.LabelTransferFunction([RAMP, RAMP])
+        volume = jv.Volume(volume.data, labels=np.zeros(volume.data.shape, np.uint8))
+    # of a field and of samples it is known that they vary no more than the transfer function does
+    tolerance = 1e-3 if case in ("midpoint", "field") else 1e3
+    assert strides(volume, transfer, jv.AdaptiveSampling(tolerance), **more).max() == 1
+
+
+# -- what the image becomes ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, *slow(3e-2, 3e-3, 1e-3)])
+def test_a_real_volume_is_rendered_within_the_tolerance_by_fewer_samples(real_volume, tolerance):
+    folder = real_volume("engine_256x256x128_uint8.raw.gz").parent
+    volume, transfer, camera, step = real_scenes.engine(folder, 96)
+    base, step = (jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination()), step / 2
+    uniform = jv.render(volume, transfer, camera, jv.March(step, base, "preintegrated"))
+    truth = jv.render(volume, transfer, camera, jv.March(step / 8, base, "preintegrated"))
+    march = jv.March(step, (*base, jv.AdaptiveSampling(tolerance, 16)), "preintegrated")
+    found = jv.render(volume, transfer, camera, march)
+    assert rmse(found.image(), truth.image()) <= tolerance
+    share = {3e-2: 4, 1e-2: 3, 3e-3: 2, 1e-3: 1.5}[tolerance]
+    assert share * int(found.samples.sum()) < int(uniform.samples.sum())
+
+
+# -- both engines ----------------------------------------------------------------------------------------
+
+
+def adaptive(scene, tolerance=0.01, longest=8):
+    volume, transfer, camera, march = scene
+    transforms = (*march.transforms, jv.AdaptiveSampling(tolerance, longest))
+    return volume, transfer, camera, jv.March(march.step, transforms, march.quadrature)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", *slow("float32")])
+def test_both_engines_choose_the_same_cells(dtype):
+    volume, transfer, camera, march = adaptive(scene_of("integrated", "hierarchy", dtype))
+    leapt = jv.render(volume, transfer, camera, march)
+    plain = jv.render(*scene_of("integrated", "hierarchy", dtype))
+    assert int(leapt.samples.sum()) < 0.7 * int(plain.samples.sum())
+    without = tuple(t for t in march.transforms if not isinstance(t, jv.SpaceLeaping))
+    unleapt = jv.render(volume, transfer, camera, jv.March(march.step, without, march.quadrature))
+    np.testing.assert_allclose(leapt.rgba, unleapt.rgba, atol=1e-6)
+    counted = jv.March(march.step, without, march.quadrature, max_samples=128)
+    reference = reference_image(volume, transfer, camera, counted)
+    compare(unleapt, reference.rgba, np.asarray(reference.samples), tolerance=2e-5)
+
+
+def test_tolerances_and_transfer_functions_share_a_program():
+    volume, transfer, camera, march = adaptive(scene_of("integrated", "hierarchy"))
+    kind = counting()
+    samples = []
+    for tolerance, factor in ((0.1, 1.0), (0.01, 1.0), (0.001, 1.0), (0.01, 0.1)):
+        function = kind(transfer.values, transfer.colors, factor * transfer.extinction)
+        sampling = jv.AdaptiveSampling(tolerance)
+        now = jv.March(march.step, (*march.transforms[:-1], sampling), march.quadrature)
+        samples.append(int(jv.render(volume, function, camera, now).samples.sum()))
+    assert samples[0] < samples[1] < samples[2]
+    assert kind.traces == 1
+
+
+def test_it_follows_the_transfer_function_and_the_tolerance_inside_jit():
+    volume, transfer, camera, march = adaptive(scene_of("integrated", "hierarchy"))
+
+    @eqx.filter_jit
+    def samples(volume, transfer, tolerance):
+        sampling = jv.AdaptiveSampling(tolerance)
+        now = jv.March(march.step, (*march.transforms[:-1], sampling), march.quadrature)
+        return jv.render(volume, transfer, camera, now).samples
+
+    for tolerance in (0.1, 0.01):
+        march_ = adaptive(scene_of("integrated", "hierarchy"), tolerance)[3]
+        expected = jv.render(volume, transfer, camera, march_).samples
+        np.testing.assert_array_equal(samples(volume, transfer, tolerance), expected)
+
+
+@pytest.mark.parametrize("given", [0.0, -1.0, np.nan, "much", [0.1, 0.2]])
+def test_a_tolerance_that_is_none_is_refused(given):
+    with pytest.raises(ValueError, match="tolerance must "):
+        jv.AdaptiveSampling(given)
+
+
+@pytest.mark.parametrize("given", [0, 3, 128, 2.0, True])
+def test_a_longest_stride_that_is_none_is_refused(given):
+    with pytest.raises(ValueError, match="longest must be"):
+        jv.AdaptiveSampling(0.01, given)
