@@ -16,9 +16,10 @@ from jaxtyping import Array, Bool, Float
 from ._util.checks import described
 from ._util.vec3 import Scalar, Vec3, along
 from .lighting.shading import Sample
-from .occupancy import Blocks, Windows
+from .occupancy import Blocks
 from .space import Ray
 from .transfer import Classification, Measured, Transfer
+from .variation import Variation, Windows
 
 
 State = TypeVar("State")
@@ -76,10 +77,10 @@ class Compositing(eqx.Module, Generic[State]):
         over the others, except those that hold NaN."""
         return transfer.visible(blocks)
 
-    def variation(self, transfer: Transfer, windows: Windows) -> Float[Array, "bx by bz"]:
-        """By how much what cells are composited from changes while the value runs through the range of each
-        window, 1/length. By default infinite: nothing is known, and cells are one step long."""
-        return jnp.full(windows.low.shape, jnp.inf)
+    def variation(self, transfer: Transfer, windows: Windows) -> Variation:
+        """How much what cells are composited from changes within the range of each window. By default nothing
+        is known, and cells are one step long."""
+        return Variation.unknown(windows)
 
 
 class Composite(eqx.Module):
@@ -191,7 +192,7 @@ class Over(Weighting):
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
 
-    def variation(self, transfer: Transfer, windows: Windows) -> Float[Array, "bx by bz"]:
+    def variation(self, transfer: Transfer, windows: Windows) -> Variation:
         return transfer.variation(windows)
 
 

@@ -11,6 +11,7 @@ At each seam the answers of all transforms are combined, so that they compose.
 | `start` | how many steps past the entry is the first cell? | 0 |
 | `shift` | by what part of a step do samples after the first transparent one move? | 0 |
 | `empty_space` | where is nothing visible? | unknown |
+| `prepared` | what must be known of the scene? | nothing |
 | `stride` | how many steps long may this cell be? | 1 |
 | `cut` | which part of its cell does a sample stand for? | all of it |
 | `stop` | is this ray finished? | not before the exit |
@@ -28,8 +29,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ._util.checks import check_answer, described, integer, number
 from ._util.vec3 import Scalar, Vec3
 from .beams import Box
-from .occupancy import Occupancy, Windows
+from .occupancy import Occupancy
 from .space import Affine, Ray, Space
+from .variation import Variation, Windows
 from .volume import Volume
 
 
@@ -113,14 +115,12 @@ class Transform(eqx.Module):
         image; None for `render_rays`."""
         return None
 
-    def prepared(
-        self, march: "March", space: Space, windows: Windows, variation: Float[Array, "bx by bz"]
-    ) -> "Transform":
+    def prepared(self, march: "March", space: Space, windows: Windows, variation: Variation) -> "Transform":
         """This transform with what `stride` needs to know of the scene, found once for each image, and
         without a gradient: in fields that hold None before, and arrays of integers afterwards.
 
-        `windows`: how the volume's values vary, block by block; `variation`: by how much what they are
-        composited from changes over each window (`Compositing.variation`)."""
+        `windows`: how the volume's values vary, block by block; `variation`: how much what is
+        composited changes within their ranges."""
         return self
 
     @property
@@ -243,7 +243,7 @@ class March(eqx.Module):
         return bool(self._overriding("prepared"))
 
     def prepared(
-        self, space: Space, windows: Windows | None, variation: Callable[[Windows], Float[Array, "bx by bz"]]
+        self, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
     ) -> "March":
         """The march, whose transforms know of the scene what they need. `windows`: of the volume, where it
         `looks_ahead`."""

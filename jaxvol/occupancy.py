@@ -23,10 +23,6 @@ from .volume import Volume
 BLOCK = 4
 """Cells of the voxel grid along the side of a block."""
 
-MARGIN = 2
-"""Nodes by which a window exceeds its block: half a block, so that it holds all cells of BLOCK voxels whose
-middle lies in the block."""
-
 FARTHEST = 255
 """Stands for a grid without any occupied cell. Distances in others, in cells, are at most one less."""
 
@@ -63,29 +59,6 @@ class Blocks(eqx.Module):
         if self.labels is None:
             return jnp.ones(self.low.shape, bool)
         return (self.labels >> (label % 32)) & 1 == 1
-
-
-class Windows(eqx.Module):
-    """How values vary in and around each block of a volume: over its nodes, and those up to MARGIN beyond its
-    faces.
-
-    - `low`, `high`: least and greatest value.
-    - `bend`: greatest second difference of the value, between nodes along an axis or across two; NaN where a
-      value is.
-    """
-
-    low: Float[Array, "bx by bz"]
-    high: Float[Array, "bx by bz"]
-    bend: Float[Array, "bx by bz"]
-
-    @classmethod
-    def of(cls, volume: Volume) -> "Windows":
-        """The windows of a volume, computed once for each array of voxels."""
-        low, high, bend = memoized(volume.data, _windows)
-        if volume.field is not None:  # nothing is known about it
-            low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
-            bend = jnp.full_like(bend, jnp.inf)
-        return cls(low, high, bend)
 
 
 class Sums(eqx.Module):
@@ -168,7 +141,7 @@ def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array,
 
 @jax.jit
 def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-    low, high = _over_blocks(data, jnp.minimum), _over_blocks(data, jnp.maximum)
+    low, high = over_blocks(data, jnp.minimum), over_blocks(data, jnp.maximum)
     low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     slack = ROUNDING * jnp.maximum(abs(low), abs(high))
     return low - slack, high + slack
@@ -177,47 +150,10 @@ def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], 
 @jax.jit
 def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]:
     bits = jnp.uint32(1) << (labels.astype(jnp.int32) % 32).astype(jnp.uint32)
-    return _over_blocks(bits, jnp.bitwise_or)
+    return over_blocks(bits, jnp.bitwise_or)
 
 
-@jax.jit
-def _windows(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], ...]:
-    """Least and greatest value and greatest bend in each window, one layer of blocks after the other: all
-    differences of a volume would take several times its memory."""
-    last = data.shape[0] - 1
-
-    def layer(block: Int[Array, ""]) -> tuple[Float[Array, "by bz"], ...]:
-        # one node more at each end, for differences
-        row = BLOCK * block + jnp.arange(-MARGIN - 1, BLOCK + MARGIN + 2)
-        values = data[jnp.clip(row, 0, last)].astype(jnp.float32)
-        bend = _bend(values, ((row > 0) & (row < last))[:, None, None])
-        low, high, bend = jnp.min(values[1:-1], 0), jnp.max(values[1:-1], 0), jnp.max(bend[1:-1], 0)
-        each = (low, jnp.minimum), (high, jnp.maximum), (bend, jnp.maximum)
-        low, high, bend = (_over_blocks(part, of, MARGIN) for part, of in each)
-        # inside loops on CPU, XLA's minima and maxima lose NaN
-        lost = _over_blocks(jnp.any(jnp.isnan(values[1:-1]), 0), jnp.logical_or, MARGIN)
-        return low, high, jnp.where(lost, jnp.nan, bend)
-
-    return jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
-
-
-def _bend(values: Float[Array, "nx ny nz"], inner: Bool[Array, "nx 1 1"]) -> Float[Array, "nx ny nz"]:
-    """The greatest magnitude at each node of ∂²/∂x², ∂²/∂x∂y and their like, in nodes. At the faces of the
-    volume, beyond which values are constant, those across are 0; `inner` tells where that is along x."""
-    greatest = jnp.zeros_like(values)
-    for axis in range(3):
-        slope, other = jnp.diff(values, axis=axis), (axis + 1) % 3
-        for second, before in ((jnp.diff(slope, axis=axis), 1), (jnp.diff(slope, axis=other), 0)):
-            left = [whole - n for whole, n in zip(values.shape, second.shape, strict=True)]
-            found = jnp.pad(jnp.abs(second), [(min(before, n), n - min(before, n)) for n in left])
-            # rows beyond a face are copies of its own
-            greatest = jnp.maximum(
-                greatest, jnp.where(inner, found, 0) if (axis, before) == (0, 1) else found
-            )
-    return greatest
-
-
-def _over_blocks(
+def over_blocks(
     data: Shaped[Array, "*nodes"], combine: Callable[[Array, Array], Array], margin: int = 0
 ) -> Shaped[Array, "*blocks"]:
     """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""

@@ -31,10 +31,10 @@ from .compositing import (
 )
 from .lighting.shading import Lighting, lit_classification
 from .march import Cell, March
-from .occupancy import Windows
 from .rendering import Details, Rendering
 from .space import Line, Ray, Space, enter, invalid
 from .transfer import Classification, Measured, Transfer
+from .variation import Windows
 from .volume import Volume, without_voxels
 
 

@@ -23,13 +23,14 @@ from ._util.piecewise_linear import (
     points_below,
     positive_between,
     table_row,
-    total_variation,
     upper_bound_between,
+    variation_between,
 )
 from ._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from ._util.vec3 import Scalar, Vec3
 from ._util.xla import gather
-from .occupancy import Blocks, Windows
+from .occupancy import Blocks
+from .variation import Variation, Windows
 from .volume import Volume
 
 
@@ -137,11 +138,10 @@ class Transfer(eqx.Module):
         (`Blocks.unordered`). It carries no gradient. By default infinite: nothing is proven."""
         return jnp.full(blocks.low.shape, jnp.inf)
 
-    def variation(self, windows: Windows) -> Float[Array, "bx by bz"]:
-        """By how much extinction and emission (extinction × colour) change in total while the value runs once
-        through the range of each window, 1/length: that of the extinction or of one colour channel, whichever
-        is greatest. It carries no gradient. By default infinite: nothing is known."""
-        return jnp.full(windows.low.shape, jnp.inf)
+    def variation(self, windows: Windows) -> Variation:
+        """How much extinction and emission change within the range of each window. It carries no gradient. By
+        default nothing is known."""
+        return Variation.unknown(windows)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """Where `majorant` is positive; to be overridden where that takes less time to find out."""
@@ -265,9 +265,9 @@ class TransferFunction(Transfer):
         bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
 
-    def variation(self, windows: Windows) -> Float[Array, "bx by bz"]:
-        values, colors, extinction = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
-        return total_variation(values, colors, extinction, windows.low, windows.high)
+    def variation(self, windows: Windows) -> Variation:
+        points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
+        return Variation(*variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))

@@ -117,23 +117,33 @@ def upper_bound_between(
     return jnp.maximum(ends, inside) + ROUNDING * extinction.max()
 
 
-def total_variation(
+def variation_between(
     values: Float[Array, " n"],
     colors: Float[Array, "n 3"],
     extinction: Float[Array, " n"],
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
-) -> Float[Array, "*blocks"]:
-    """An upper bound of the integral of |dσ/dv|, and of |d(σ c)/dv| for each colour channel c, from `low` to
-    `high`."""
-    brightness, shift = jnp.max(jnp.abs(colors), axis=1), jnp.max(jnp.abs(jnp.diff(colors, axis=0)), axis=1)
-    brightness = jnp.maximum(jnp.maximum(brightness[1:], brightness[:-1]), 1)
+) -> tuple[Float[Array, "*blocks"], Float[Array, "*blocks"]]:
+    """Upper bounds of how much the extinction, and its product with any colour channel, change in total from
+    `low` to `high`; and of how much their slopes change at the control points between."""
+    gap, rise, shift = jnp.diff(values), jnp.diff(extinction), jnp.diff(colors, axis=0)
+    brightness = jnp.maximum(jnp.max(jnp.abs(colors), axis=1), 1)
+    brighter = jnp.maximum(brightness[1:], brightness[:-1])
     densest = jnp.maximum(extinction[1:], extinction[:-1])
-    # between two points
-    changes = jnp.abs(jnp.diff(extinction)) * brightness + densest * shift
-    until = jnp.concatenate([jnp.zeros_like(changes[:1]), jnp.cumsum(changes)])
-    first, last = (jnp.interp(end.astype(values.dtype), values, until) for end in (low, high))
-    return jnp.maximum(last - first, 0)
+    changes = jnp.abs(rise) * brighter + densest * jnp.max(jnp.abs(shift), axis=1)
+    # a step is a slope, too, but one whose sums are finite
+    gap = jnp.maximum(gap, 1e-6 * (values[-1] - values[0]))
+    slopes = jnp.pad(jnp.concatenate([rise[:, None], shift], axis=1) / gap[:, None], ((1, 1), (0, 0)))
+    turns = jnp.abs(jnp.diff(slopes, axis=0))
+    turns = turns[:, 0] * brightness + extinction * jnp.max(turns[:, 1:], axis=1)
+    total, turned = (
+        jnp.concatenate([jnp.zeros_like(each[:1]), jnp.cumsum(each)]) for each in (changes, turns)
+    )
+    low, high = low.astype(values.dtype), high.astype(values.dtype)
+    first, last = (jnp.interp(end, values, total) for end in (low, high))
+    passed, reached = points_below(values, low), points_below(values, high, strictly=True)
+    inside = gather(turned, reached) - gather(turned, passed)
+    return jnp.maximum(last - first, 0), jnp.maximum(inside, 0)
 
 
 def _maximum_of_range(

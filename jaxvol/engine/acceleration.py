@@ -10,9 +10,10 @@ from jaxtyping import Array, Int, UInt32
 from .._util.checks import check_answer
 from ..compositing import FirstVisible, Selection
 from ..march import EmptySpaceIndex, March, View
-from ..occupancy import Blocks, Windows
+from ..occupancy import Blocks
 from ..reference import Pipeline, end
 from ..transfer import classification_of
+from ..variation import Windows
 from ..volume import Volume
 from .batch import Beams
 from .packing import with_words, words_of

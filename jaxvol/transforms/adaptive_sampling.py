@@ -11,8 +11,9 @@ from .._util.checks import integer, number
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import gather
 from ..march import March, Transform
-from ..occupancy import BLOCK, Windows
+from ..occupancy import BLOCK
 from ..space import Ray, Space
+from ..variation import Variation, Windows
 
 
 SHARE = 1 / 20
@@ -24,25 +25,26 @@ class AdaptiveSampling(Transform):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
     Where the value bends little between nodes, or the transfer function changes little with it, a long cell
-    is as good as several short ones. In a block of 4³ voxels whose values, with those up to two nodes around
-    it, range over R and whose greatest second difference is H (per length²), the value in a cell of width w
-    leaves the straight line between its ends by at most δ = H w² / 8. While the value runs through R once,
-    extinction and emission change by V in total (`Transfer.variation`). So the optical depth of a stretch as
-    long as the block, ℓ, is wrong by about
+    is as good as several short ones. Take a block of 4³ voxels, of side ℓ, whose values, with those up to two
+    nodes around it, range over R, with second differences of at most H (per length²). Between the ends of a
+    cell of width w the value leaves the straight line by at most δ = H w² / 8. While it runs through R once,
+    extinction and emission change by V in total, and their slopes by K (`occupancy.Variation`). Then the
+    optical depth of a stretch as long as the block is wrong by about
 
-        e = ℓ V min(1, δ / R)
+        e = ℓ V min(1, δ / R) + q
 
-    A cell may have width w where e / 20 is at most `tolerance`, and where it is no longer than two blocks.
+    where q is what the quadrature errs by where the value is linear: 0 for `"preintegrated"`; V w / 2 for
+    `"left"`; and for `"midpoint"` K (R / ℓ) w² / 24, since it errs where a cell crosses a control point, or
+    V w / 2 where that is less. A cell may have width w where e / 20 is at most `tolerance`, and where it is
+    no longer than two blocks.
 
-    **It is an estimate, not a bound**: of the RMSE over the image's colour channels, calibrated on five
-    scenes (`experiments.accuracy`). It knows neither what is hidden by what lies in front nor how light
-    varies along a cell. Cells are never shorter than a step: choose the step for the finest detail, say half
-    a voxel, and let `longest` be as many steps as make four to eight voxels.
+    **It is an estimate, not a bound**: of the RMSE of the image's colours, calibrated on five scenes
+    (`experiments.accuracy`). It knows neither what is hidden by what lies in front nor how light varies along
+    a cell. Cells are never shorter than a step: choose the step for the finest detail, half or a quarter of a
+    voxel, and let `longest` be as many steps as make up to eight voxels.
 
-    It is made for `March(quadrature="preintegrated")`, which integrates exactly where the value is linear.
-    Other quadratures sample a cell once: then δ / R is taken as 1, and cells are long only where nothing
-    changes. For modes that do not composite "over", and for transfer functions that do not say how they
-    vary, all cells are one step long; around faces between labels, too.
+    For modes that do not composite "over", and for transfer functions that do not say how they vary, all
+    cells are one step long.
 
     **Arguments:**
 
@@ -75,16 +77,24 @@ class AdaptiveSampling(Transform):
     def longest_stride(self) -> int:
         return self.longest
 
-    def prepared(self, march: March, space: Space, windows: Windows, variation: Array) -> "AdaptiveSampling":
+    def prepared(
+        self, march: March, space: Space, windows: Windows, variation: Variation
+    ) -> "AdaptiveSampling":
         distance = _node_distance(space, windows.low.shape)
-        spread = windows.high - windows.low
+        spread, length = windows.high - windows.low, BLOCK * distance
         strides = jnp.ones(windows.low.shape, jnp.uint8)
         for stride in (2**k for k in range(1, self.longest.bit_length())):
-            width = stride * march.step / distance  # in nodes
-            bent = windows.bend * width**2 / 8 if march.integrates else spread
+            width = stride * march.step
+            bent = windows.bend * (width / distance) ** 2 / 8
             # where the bend is NaN, so is the error, and no cell fits
-            error = SHARE * BLOCK * distance * variation * jnp.where(bent >= spread, 1, bent / spread)
-            fits = (error <= self.tolerance) & (width <= 2 * BLOCK)
+            error = length * variation.total * jnp.where(bent >= spread, 1, bent / spread)
+            if not march.integrates:
+                sampled = width * variation.total / 2
+                if march.quadrature == "midpoint":
+                    turned = variation.turns * (spread / length) * width**2 / 24
+                    sampled = jnp.minimum(turned, sampled)
+                error = error + sampled
+            fits = (SHARE * error <= self.tolerance) & (width <= 2 * length)
             strides = jnp.where(fits & (strides == stride // 2), stride, strides).astype(jnp.uint8)
         return eqx.tree_at(lambda of: of.strides, self, strides, is_leaf=lambda leaf: leaf is None)
 

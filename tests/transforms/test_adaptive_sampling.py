@@ -2,6 +2,8 @@
 whether both engines choose the same cells."""
 
 import itertools
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,8 +14,9 @@ from hypothesis import given, settings, strategies as st
 import jaxvol as jv
 from experiments import scenes as real_scenes
 from jaxvol.metrics import rmse
-from jaxvol.occupancy import BLOCK, MARGIN, Windows
+from jaxvol.occupancy import BLOCK
 from jaxvol.space import Affine
+from jaxvol.variation import MARGIN, Windows
 
 from ..engine.test_gradient_matrix import scene_of
 from ..scenes import counting, slow
@@ -24,14 +27,13 @@ RAMP = jv.TransferFunction([0.0, 1.0], [[1.0, 1.0, 1.0]] * 2, [0.0, 2.0])
 """Extinction and emission grow by 2 for each unit of the value."""
 
 
-def strides(volume, transfer, sampling, step=1.0, quadrature="preintegrated", mode="over"):
+def strides(volume, transfer, sampling, step=1.0, quadrature="preintegrated", mode: Any = None):
     """By block, the most steps of a cell."""
-    march = jv.March(step, (sampling,), quadrature)
-    mode = jv.Over() if mode == "over" else mode
-    prepared = march.prepared(
-        Affine(volume), Windows.of(volume), lambda windows: mode.variation(transfer, windows)
-    )
-    return np.asarray(prepared.transforms[0].strides)
+    variation = partial((mode or jv.Over()).variation, transfer)
+    march = jv.March(step, (sampling,), quadrature).prepared(Affine(volume), Windows.of(volume), variation)
+    (prepared,) = march.transforms
+    assert isinstance(prepared, jv.AdaptiveSampling)
+    return np.asarray(prepared.strides)
 
 
 # -- what is known of the voxels -------------------------------------------------------------------------
@@ -73,13 +75,16 @@ def test_the_variation_bounds_every_change_of_extinction_and_emission(seed, poin
     transfer = jv.TransferFunction(values, random.random((points, 3)), random.random(points) * 5)
     low, high = np.sort(random.uniform(-0.2, 1.2, (2, 30)), axis=0)
     windows = Windows(*(jnp.asarray(a, jnp.float32).reshape(30, 1, 1) for a in (low, high, 0 * low)))
-    found = np.asarray(transfer.variation(windows)).ravel()
-    for bound, a, b in zip(found, low, high, strict=True):
+    found = transfer.variation(windows)
+    for bound, turns, a, b in zip(*(np.ravel(part) for part in found), low, high, strict=True):
         at = np.linspace(a, b, 2001)
         extinction = np.interp(at, values, np.asarray(transfer.extinction))
         channels = [extinction * np.interp(at, values, c) for c in np.asarray(transfer.colors).T]
         total = max(np.abs(np.diff(each)).sum() for each in (extinction, *channels))
         assert total <= bound * (1 + 1e-4) + 1e-4
+        inside = (a < values) & (values < b)
+        slopes = np.diff(np.asarray(transfer.extinction, float)) / np.diff(np.asarray(values, float))
+        assert np.abs(np.diff([0, *slopes, 0]))[inside].sum() <= turns * (1 + 1e-3) + 1e-3
 
 
 # -- what is predicted -----------------------------------------------------------------------------------
@@ -87,7 +92,7 @@ def test_the_variation_bounds_every_change_of_extinction_and_emission(seed, poin
 
 def parabola(n=33, axis=0, bend=1 / 512):
     """Values in [0, 1] with this second difference along one axis."""
-    x = np.moveaxis(np.meshgrid(*[np.arange(n) - n // 2] * 3, indexing="ij"), 0, 0)[axis]
+    x = np.meshgrid(*[np.arange(n) - n // 2] * 3, indexing="ij")[axis]
     return jv.Volume((bend * x**2 / 2).astype(np.float32))
 
 
@@ -127,7 +132,28 @@ def test_no_cell_is_longer_than_two_blocks():
     assert strides(flat, RAMP, jv.AdaptiveSampling(1e-3, 64), 3.0).max() == 2
 
 
-@pytest.mark.parametrize("case", ["nan", "field", "selection", "midpoint", "unknown", "labels"])
+def test_samples_must_find_what_integrals_hold():
+    """The value is linear. A ramp of the extinction suits the midpoint rule; a peak does not; the rule of the
+    front errs by half of what changes."""
+    x = np.broadcast_to(np.linspace(0, 1, 65, dtype=np.float32)[:, None, None], (65, 9, 9))
+    volume, sampling = jv.Volume(x), jv.AdaptiveSampling(1e-3)
+    points = [0.0, 0.49, 0.5, 0.51, 1.0]
+    peak = jv.TransferFunction(points, [[1.0, 1.0, 1.0]] * 5, [0.0, 0.0, 2.0, 0.0, 0.0])
+    longest = {
+        (name, quadrature): strides(volume, transfer, sampling, 1.0, quadrature)[:, 0, 0]
+        for name, transfer in (("ramp", RAMP), ("peak", peak))
+        for quadrature in ("preintegrated", "midpoint", "left")
+    }
+    for quadrature in ("preintegrated", "midpoint"):
+        assert (longest["ramp", quadrature][1:-1] == 8).all()
+    assert (longest["ramp", "left"][1:-1] == 1).all()
+    assert (longest["peak", "preintegrated"] == 8).all()
+    for quadrature in ("midpoint", "left"):
+        assert (longest["peak", quadrature][7:9] == 1).all()  # around the peak
+        assert (longest["peak", quadrature][[3, 12]] == 8).all()  # far from it
+
+
+@pytest.mark.parametrize("case", ["nan", "field", "selection", "unknown", "labels"])
 def test_cells_are_one_step_long_where_nothing_is_known(case):
     volume, transfer, more = parabola(), RAMP, {}
     if case == "nan":
@@ -144,8 +170,6 @@ def test_cells_are_one_step_long_where_nothing_is_known(case):
         volume = jv.Volume(volume.data, field=Constant())
     elif case == "selection":
         more["mode"] = jv.FirstVisible()
-    elif case == "midpoint":
-        more["quadrature"] = "midpoint"
     elif case == "unknown":
 
         class Unknown(jv.TransferFunction):
@@ -156,8 +180,8 @@ def test_cells_are_one_step_long_where_nothing_is_known(case):
     else:
         transfer = jv.LabelTransferFunction([RAMP, RAMP])
         volume = jv.Volume(volume.data, labels=np.zeros(volume.data.shape, np.uint8))
-    # of a field and of samples it is known that they vary no more than the transfer function does
-    tolerance = 1e-3 if case in ("midpoint", "field") else 1e3
+    # of a field it is known that it varies no more than the transfer function does
+    tolerance = 1e-3 if case == "field" else 1e3
     assert strides(volume, transfer, jv.AdaptiveSampling(tolerance), **more).max() == 1
 
 
