@@ -20,6 +20,7 @@ ORDER = [
     "_util",
     "volume",
     "occupancy",
+    "variation",
     "space",
     "transfer",
     "labels",

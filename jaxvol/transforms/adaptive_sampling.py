@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from .._util.checks import integer, number
 from .._util.vec3 import Scalar, Vec3
-from .._util.xla import gather
+from .._util.xla import gather, in_memory
 from ..march import March, Transform
 from ..occupancy import BLOCK
 from ..space import Ray, Space
@@ -80,22 +80,9 @@ class AdaptiveSampling(Transform):
     def prepared(
         self, march: March, space: Space, windows: Windows, variation: Variation
     ) -> "AdaptiveSampling":
-        distance = _node_distance(space, windows.low.shape)
-        spread, length = windows.high - windows.low, BLOCK * distance
-        strides = jnp.ones(windows.low.shape, jnp.uint8)
-        for stride in (2**k for k in range(1, self.longest.bit_length())):
-            width = stride * march.step
-            bent = windows.bend * (width / distance) ** 2 / 8
-            # where the bend is NaN, so is the error, and no cell fits
-            error = length * variation.total * jnp.where(bent >= spread, 1, bent / spread)
-            if not march.integrates:
-                sampled = width * variation.total / 2
-                if march.quadrature == "midpoint":
-                    turned = variation.turns * (spread / length) * width**2 / 24
-                    sampled = jnp.minimum(turned, sampled)
-                error = error + sampled
-            fits = (SHARE * error <= self.tolerance) & (width <= 2 * length)
-            strides = jnp.where(fits & (strides == stride // 2), stride, strides).astype(jnp.uint8)
+        # In a branch of its own, so that it is rounded alike in every program: an error that nearly equals
+        # the tolerance must not make different cells where an image is made in `jax.jit`, or differentiated.
+        strides = in_memory(march.step > 0, _strides, self, march, space, windows, variation)
         return eqx.tree_at(lambda of: of.strides, self, strides, is_leaf=lambda leaf: leaf is None)
 
     def stride(self, ray: Ray, depth: Scalar, step: Scalar) -> Int[Array, ""]:
@@ -113,6 +100,29 @@ class AdaptiveSampling(Transform):
             for c, n in zip(coordinate, shape, strict=True)
         )
         return gather(self.strides.reshape(-1), (i * ny + j) * nz + k).astype(jnp.int32)
+
+
+def _strides(
+    sampling: AdaptiveSampling, march: March, space: Space, windows: Windows, variation: Variation
+) -> UInt8[Array, "bx by bz"]:
+    """By block, the most steps of a cell whose error is tolerated."""
+    distance = _node_distance(space, windows.low.shape)
+    spread, length = windows.high - windows.low, BLOCK * distance
+    strides = jnp.ones(windows.low.shape, jnp.uint8)
+    for stride in (2**k for k in range(1, sampling.longest.bit_length())):
+        width = stride * march.step
+        bent = windows.bend * (width / distance) ** 2 / 8
+        # where the bend is NaN, so is the error, and no cell fits
+        error = length * variation.total * jnp.where(bent >= spread, 1, bent / spread)
+        if not march.integrates:
+            sampled = width * variation.total / 2
+            if march.quadrature == "midpoint":
+                turned = variation.turns * (spread / length) * width**2 / 24
+                sampled = jnp.minimum(turned, sampled)
+            error = error + sampled
+        fits = (SHARE * error <= sampling.tolerance) & (width <= 2 * length)
+        strides = jnp.where(fits & (strides == stride // 2), stride, strides).astype(jnp.uint8)
+    return strides
 
 
 def _node_distance(space: Space, shape: tuple[int, ...]) -> Float[Array, "bx by bz"]:

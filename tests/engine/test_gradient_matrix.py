@@ -32,10 +32,8 @@ SETS = {
     "aligned": ("midpoint", (jv.AlphaCorrection(),)),
     "jittered": ("left", (jv.Jitter(3), jv.AlphaCorrection(), jv.EarlyTermination(0.05))),
     "moving": ("left", (jv.EmptySpaceJitter(4), jv.AlphaCorrection())),
-    "integrated": (
-        "preintegrated",
-        (jv.EmptySpaceJitter(4), jv.AlphaCorrection()),
-    ),
+    "integrated": ("preintegrated", (jv.EmptySpaceJitter(4), jv.AlphaCorrection())),
+    "adaptive": ("midpoint", (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.AdaptiveSampling(0.03))),
     "residual": ("midpoint", (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())),
 }
 

@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from experiments import scenes as real_scenes
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import BLOCK
 from jaxvol.space import Affine
+from jaxvol.transforms.adaptive_sampling import _node_distance
 from jaxvol.variation import MARGIN, Windows
 
-from ..engine.test_gradient_matrix import scene_of
+from ..engine.test_gradient_matrix import CAMERAS, TOPS, assert_same, gradient
 from ..scenes import counting, slow
 from ..test_agreement import compare, reference_image
 
@@ -205,52 +207,118 @@ def test_a_real_volume_is_rendered_within_the_tolerance_by_fewer_samples(real_vo
 # -- both engines ----------------------------------------------------------------------------------------
 
 
-def adaptive(scene, tolerance=0.01, longest=8):
+SIZE = (37, 21)
+"""More than one beam along each axis."""
+
+
+def scene_of(dtype="uint8", camera="outside"):
+    """Two smooth blobs, one inside and one cut by a face, in empty space."""
+    x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in (41, 33, 49)), indexing="ij")
+    centers = ((-0.5, 0.1, -0.3), 0.06), ((0.9, -0.2, 0.5), 0.1)
+    value = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / s) for (a, b, c), s in centers)
+    volume = jv.Volume(
+        (np.clip(value, 0, 1) * TOPS[dtype]).astype(dtype), (0.045, 0.055, 0.04), (0.2, -0.4, 0.1)
+    )
+    values, extinction = np.array([0.0, 0.15, 0.4, 1.0]), [0.0, 0.0, 6.0, 20.0]
+    transfer = jv.TransferFunction(values * TOPS[dtype], np.random.default_rng(2).random((4, 3)), extinction)
+    position, target, angle = CAMERAS[camera]
+    view = jv.Camera(position, target, (0.1, 0.2, 1), angle, size=SIZE)
+    transforms = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping("distance")
+    return volume, transfer, view, jv.March(0.02, (*transforms, jv.AdaptiveSampling(0.03)), "midpoint")
+
+
+def changed(scene, tolerance=0.03, without=(), max_samples=None):
+    """The scene with another tolerance, without transforms of some types."""
     volume, transfer, camera, march = scene
-    transforms = (*march.transforms, jv.AdaptiveSampling(tolerance, longest))
-    return volume, transfer, camera, jv.March(march.step, transforms, march.quadrature)
+    kept = [t for t in march.transforms if not isinstance(t, (jv.AdaptiveSampling, *without))]
+    if jv.AdaptiveSampling not in without:
+        kept.append(jv.AdaptiveSampling(tolerance))
+    return volume, transfer, camera, jv.March(march.step, kept, march.quadrature, max_samples=max_samples)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", *slow("float32")])
-def test_both_engines_choose_the_same_cells(dtype):
-    volume, transfer, camera, march = adaptive(scene_of("integrated", "hierarchy", dtype))
-    leapt = jv.render(volume, transfer, camera, march)
-    plain = jv.render(*scene_of("integrated", "hierarchy", dtype))
-    assert int(leapt.samples.sum()) < 0.7 * int(plain.samples.sum())
-    without = tuple(t for t in march.transforms if not isinstance(t, jv.SpaceLeaping))
-    unleapt = jv.render(volume, transfer, camera, jv.March(march.step, without, march.quadrature))
+@pytest.mark.parametrize("camera", ["outside", "inside"])
+@pytest.mark.parametrize("dtype", ["uint8", *slow("uint16", "int16", "float32")])
+def test_both_engines_choose_the_same_cells(dtype, camera):
+    scene = scene_of(dtype, camera)
+    leapt, plain = (jv.render(*changed(scene, without=[t])) for t in (jv.ToroidalMap, jv.AdaptiveSampling))
+    assert int(leapt.samples.sum()) < 0.8 * int(plain.samples.sum())
+    unleapt = jv.render(*changed(scene, without=[jv.SpaceLeaping]))
     np.testing.assert_allclose(leapt.rgba, unleapt.rgba, atol=1e-6)
-    counted = jv.March(march.step, without, march.quadrature, max_samples=128)
-    reference = reference_image(volume, transfer, camera, counted)
+    counted = changed(scene, without=[jv.SpaceLeaping], max_samples=256)
+    reference = reference_image(*counted)
     compare(unleapt, reference.rgba, np.asarray(reference.samples), tolerance=2e-5)
 
 
-def test_tolerances_and_transfer_functions_share_a_program():
-    volume, transfer, camera, march = adaptive(scene_of("integrated", "hierarchy"))
-    kind = counting()
-    samples = []
-    for tolerance, factor in ((0.1, 1.0), (0.01, 1.0), (0.001, 1.0), (0.01, 0.1)):
-        function = kind(transfer.values, transfer.colors, factor * transfer.extinction)
-        sampling = jv.AdaptiveSampling(tolerance)
-        now = jv.March(march.step, (*march.transforms[:-1], sampling), march.quadrature)
-        samples.append(int(jv.render(volume, function, camera, now).samples.sum()))
-    assert samples[0] < samples[1] < samples[2]
-    assert kind.traces == 1
+@pytest.mark.slow
+def test_leaping_does_not_change_its_gradients():
+    scene = scene_of()
+    found, expected = (gradient(changed(scene, without=[t])) for t in (jv.ToroidalMap, jv.SpaceLeaping))
+    assert_same(found, expected, 1e-4)
 
 
-def test_it_follows_the_transfer_function_and_the_tolerance_inside_jit():
-    volume, transfer, camera, march = adaptive(scene_of("integrated", "hierarchy"))
+def test_it_follows_tolerance_and_transfer_function_in_one_program():
+    volume, transfer, camera, march = scene_of()
+    kind, samples = counting(), []
 
     @eqx.filter_jit
-    def samples(volume, transfer, tolerance):
-        sampling = jv.AdaptiveSampling(tolerance)
-        now = jv.March(march.step, (*march.transforms[:-1], sampling), march.quadrature)
-        return jv.render(volume, transfer, camera, now).samples
+    def inside(volume, transfer, tolerance):
+        return jv.render(*changed((volume, transfer, camera, march), tolerance)).rgba
 
-    for tolerance in (0.1, 0.01):
-        march_ = adaptive(scene_of("integrated", "hierarchy"), tolerance)[3]
-        expected = jv.render(volume, transfer, camera, march_).samples
-        np.testing.assert_array_equal(samples(volume, transfer, tolerance), expected)
+    for tolerance, factor in ((0.1, 1.0), (0.03, 1.0), (0.01, 1.0), (0.03, 0.1)):
+        function = kind(transfer.values, transfer.colors, factor * transfer.extinction)
+        found = jv.render(*changed((volume, function, camera, march), tolerance))
+        samples.append(int(found.samples.sum()))
+        np.testing.assert_allclose(inside(volume, function, tolerance), found.rgba, atol=1e-5)
+    assert samples[3] < samples[1]
+    assert samples[0] < samples[1] < samples[2]
+    assert kind.traces == 2  # one outside `jax.jit`, one inside
+
+
+def test_tolerances_may_be_vmapped_over():
+    scene = changed(scene_of())
+    tolerances = jnp.asarray([0.1, 0.01])
+    found = jax.vmap(lambda tolerance: jv.render(*changed(scene, tolerance)).samples)(tolerances)
+    expected = [jv.render(*changed(scene, tolerance)).samples for tolerance in (0.1, 0.01)]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_distance_of_nodes_in_a_fan_grows_with_that_from_the_probe():
+    volume, probe = jv.toroidal_phantom("shells", (17, 25, 33), speckle=False)
+    space = probe.locate(Affine(volume), volume)
+    found = np.asarray(_node_distance(space, (4, 6, 8)))
+    assert (np.diff(found, axis=2) > 0).any()
+    for block in ((0, 0, 0), (2, 3, 4), (3, 5, 7)):
+        middle = BLOCK * (np.array(block) + 0.5)
+        ends = [
+            [np.array(space.point(tuple(jnp.asarray(middle + way * axis)))) for way in (0.5, -0.5)]
+            for axis in np.eye(3)
+        ]
+        expected = min(np.linalg.norm(ahead - behind) for ahead, behind in ends)
+        np.testing.assert_allclose(found[block], expected, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_fans_are_rendered_within_the_tolerance_by_fewer_samples():
+    volume, probe = jv.toroidal_phantom("shells", speckle=False)
+    transfer = jv.TransferFunction.from_points(
+        [(40, (0.2, 0.1, 0.1), 0.0), (120, (0.8, 0.5, 0.4), 0.3), (255, (1.0, 0.9, 0.8), 0.8)], 3.0
+    )
+    low, high = (np.asarray(corner) for corner in probe.corners)
+    camera = jv.Camera(
+        (low + high) / 2 + 2 * (high - low).max() * np.array([0.5, -0.8, 0.3]),
+        (low + high) / 2,
+        (0, 0, 1),
+        30.0,
+        size=(48, 48),
+    )
+    base = (probe, jv.AlphaCorrection(), jv.SpaceLeaping())
+    truth, uniform, adaptive = (
+        jv.render(volume, transfer, camera, jv.March(step, (*base, *more), "midpoint"))
+        for step, more in ((0.1, ()), (0.25, ()), (0.25, (jv.AdaptiveSampling(0.003, 16),)))
+    )
+    assert np.mean(truth.rgba[..., 3] > 0.1) > 0.1
+    assert rmse(adaptive.image(), truth.image()) <= 0.003
+    assert 3 * int(adaptive.samples.sum()) < int(uniform.samples.sum())
 
 
 @pytest.mark.parametrize("given", [0.0, -1.0, np.nan, "much", [0.1, 0.2]])
