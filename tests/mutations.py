@@ -71,6 +71,45 @@ PACKED = "transforms/test_space_leaping.py::test_packed_voxels_are_the_same_valu
 RENDERED = "test_agreement.py::test_render_agrees_with_the_independent_marcher"
 
 MUTATIONS = [
+    # adaptive sampling
+    Mutation(
+        "adaptive sampling: differences across two axes left out",
+        "variation.py",
+        "(jnp.diff(slope, axis=axis), 1), (jnp.diff(slope, axis=other), 0)",
+        "(jnp.diff(slope, axis=axis), 1), (0 * jnp.diff(slope, axis=other), 0)",
+        (
+            "transforms/test_adaptive_sampling.py::test_a_value_that_bends_across_the_axes_alone_is_found",
+            "transforms/test_adaptive_sampling.py::test_windows_hold_what_lies_in_and_around_each_block",
+        ),
+    ),
+    Mutation(
+        "adaptive sampling: NaN in a voxel is not seen",
+        "variation.py",
+        "return low, high, jnp.where(lost, jnp.nan, bend)",
+        "return low, high, bend",
+        ("transforms/test_adaptive_sampling.py::test_cells_are_one_step_long_where_nothing_is_known[nan]",),
+    ),
+    Mutation(
+        "adaptive sampling: the far half of a cell is not looked at",
+        "transforms/adaptive_sampling.py",
+        "return jnp.where(far < self.longest, jnp.minimum(near, self.longest // 2), near)",
+        "return near",
+        ("transforms/test_adaptive_sampling.py::test_a_cell_lies_within_windows_that_allow_its_length",),
+    ),
+    Mutation(
+        "adaptive sampling: cells longer than what is known of their surroundings",
+        "transforms/adaptive_sampling.py",
+        "(SHARE * error <= sampling.tolerance) & (width <= 2 * length)",
+        "SHARE * error <= sampling.tolerance",
+        ("transforms/test_adaptive_sampling.py::test_no_cell_is_longer_than_two_blocks",),
+    ),
+    Mutation(
+        "adaptive sampling: samples are taken to integrate",
+        "transforms/adaptive_sampling.py",
+        "if not march.integrates:",
+        "if False:",
+        ("transforms/test_adaptive_sampling.py::test_samples_must_find_what_integrals_hold",),
+    ),
     # rays: positions, first samples, volumes
     Mutation(
         "toroidal map: wrong sign of an angle",

@@ -16,7 +16,7 @@ import jaxvol as jv
 from experiments import scenes as real_scenes
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import BLOCK
-from jaxvol.space import Affine
+from jaxvol.space import Affine, enter
 from jaxvol.transforms.adaptive_sampling import _node_distance
 from jaxvol.variation import MARGIN, Windows
 
@@ -153,6 +153,27 @@ def test_samples_must_find_what_integrals_hold():
     for quadrature in ("midpoint", "left"):
         assert (longest["peak", quadrature][7:9] == 1).all()  # around the peak
         assert (longest["peak", quadrature][[3, 12]] == 8).all()  # far from it
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**16), step=st.sampled_from([0.25, 0.5, 1.0]))
+def test_a_cell_lies_within_windows_that_allow_its_length(seed, step):
+    allowed = 2 ** np.random.default_rng(seed).integers(0, 4, 16)
+    volume = jv.Volume(np.zeros((65, 3, 3), np.float32))
+    table = jnp.asarray(allowed, jnp.uint8)[:, None, None]
+    sampling = eqx.tree_at(
+        lambda of: of.strides, jv.AdaptiveSampling(1.0), table, is_leaf=lambda leaf: leaf is None
+    )
+    zero, one = jnp.float32(0), jnp.float32(1)
+    ray = enter(Affine(volume), (zero - 1, one, one), (one, zero, zero), (jnp.int32(0), jnp.int32(0)))
+    depths = jnp.arange(0, 56, 0.5, dtype=jnp.float32)
+    found = jax.vmap(lambda depth: sampling.stride(ray, depth, jnp.float32(step)))(depths)
+    assert len(np.unique(found)) > 2
+    start = BLOCK * np.arange(16)
+    for depth, stride in zip(np.asarray(depths), np.asarray(found), strict=True):
+        for point in np.linspace(depth, depth + stride * step, 9):
+            holds = (start - MARGIN <= point) & (point <= start + BLOCK + MARGIN)
+            assert (allowed[holds] >= stride).any(), (depth, stride, point)
 
 
 @pytest.mark.parametrize("case", ["nan", "field", "selection", "unknown", "labels"])
