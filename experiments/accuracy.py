@@ -1,12 +1,16 @@
 """What does accuracy cost? Time against error, for steps and quadratures, compared with VTK and Dr.Jit.
 
 Five scenes, steps of half a voxel to four, and three quadratures: at the front of a cell ("left"), in its
-middle ("midpoint"), and integrated between the values at its ends ("preintegrated"). Ours skips empty space,
-cuts the last cell at the exit, and ends rays early. The peers are those of `speed`, at the same steps; Dr.Jit
-takes samples at the front of cells, or in the middle. Error is the RMSE over white against one converged
-image of ours, by the midpoint rule; VTK's image is compared with that image as VTK's display would show it.
+middle ("midpoint"), and integrated between the values at its ends ("preintegrated"). Adaptive sampling, at
+tolerances of 0.03 to 0.001: cells of a quarter of a voxel to eight, sampled in their middle. Ours skips empty
+space, cuts the last cell at the exit, and ends rays early. The peers are those of `speed`, at the same steps;
+Dr.Jit takes samples at the front of cells, or in the middle. Error is the RMSE over white against one
+converged image of ours, by the midpoint rule; VTK's image is compared with that image as VTK's display would
+show it.
 
-Programs are run in turn. Times are those of one machine; ratios are what counts.
+Programs are run in turn. Times are those of one machine; ratios are what counts. Adaptive sampling is
+compared with uniform steps at its own error, which lies between those of two steps: number of samples and
+time are interpolated between them, as powers of the error.
 
 A second part looks at a transfer function whose peak is 1 % as wide as the range of values, which lies at the
 middle of what each scene shows: the error of both second-order quadratures, by step.
@@ -31,14 +35,34 @@ from .speed import LEFT, THREADS, peer_drjit, peers
 
 QUADRATURES = ("left", "midpoint", "preintegrated")
 STEPS = (0.5, 1.0, 2.0, 4.0)
+FINEST, LONGEST = 0.25, 32
+TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)
+ADAPTIVE = "adaptive"
 FINER = 16
 VTK, DRJIT = "VTK", "Dr.Jit"
-STYLES = {"left": "C0o-", "midpoint": "C2s-", "preintegrated": "C3D-", VTK: "C7^--", DRJIT: "C1v--"}
+STYLES = {
+    ADAPTIVE: "C4*-",
+    "left": "C0o-",
+    "midpoint": "C2s-",
+    "preintegrated": "C3D-",
+    VTK: "C7^--",
+    DRJIT: "C1v--",
+}
 
 
 def march(scene: Scene, quadrature: str, step: float) -> jv.March:
     transforms = jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
     return jv.March(step * scene.step, transforms, quadrature)
+
+
+def adaptive(scene: Scene, tolerance: float) -> jv.March:
+    fine = march(scene, "midpoint", FINEST)
+    return jv.March(fine.step, (*fine.transforms, jv.AdaptiveSampling(tolerance, LONGEST)), fine.quadrature)
+
+
+def samples(scene: Scene, under: jv.March) -> float:
+    """Mean number of samples of a ray."""
+    return float(np.mean(jv.render(*scene[:3], under, outputs="all").samples))
 
 
 def converged(scene: Scene) -> np.ndarray:
@@ -58,11 +82,12 @@ def drjit(scene: Scene, quadrature: Literal["left", "midpoint"], step: float) ->
 def measure(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, dict[str, dict[str, Any]]]:
     """By program and step, in voxels: time and error."""
     truth, programs, errors = converged(scene), {}, {}
+    marches = {(ADAPTIVE, tolerance): adaptive(scene, tolerance) for tolerance in TOLERANCES}
+    marches |= {(q, step): march(scene, q, step) for step in (FINEST, *STEPS) for q in QUADRATURES}
+    for key, under in marches.items():
+        programs[key] = lambda m=under: common.image(scene, m)
+        errors[key] = rmse(common.image(scene, under).image(), truth)
     for step in STEPS:
-        for quadrature in QUADRATURES:
-            under = march(scene, quadrature, step)
-            programs[quadrature, step] = lambda m=under: common.image(scene, m)
-            errors[quadrature, step] = rmse(common.image(scene, under).image(), truth)
         if there[VTK][0].isdigit():
             size = step * scene.step
             drawn = peer_vtk.prepare(scene.volume, scene.transfer, scene.camera, size, THREADS)
@@ -78,7 +103,30 @@ def measure(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, 
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for (name, step), error in errors.items():
         times = seconds[f"{name} {step}"]
-        found.setdefault(name, {})[str(step)] = common.row(times, seconds["midpoint 1.0"], error)
+        row = found.setdefault(name, {})[str(step)] = common.row(times, seconds["midpoint 1.0"], error)
+        if (name, step) in marches:
+            row["samples"] = round(samples(scene, marches[name, step]), 2)
+    return found
+
+
+def at_error(rows: dict[str, dict[str, Any]], error: float, what: str) -> float | None:
+    """What uniform steps take for this error, as a power of it between two steps; None beyond all."""
+    known = sorted((row["rmse"], row[what]) for row in rows.values())
+    errors, taken = np.log(np.array(known)).T
+    inside = errors[0] <= np.log(error) <= errors[-1]
+    return float(np.exp(np.interp(np.log(error), errors, taken))) if inside else None
+
+
+def against_uniform(rows: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dict[str, float | None]]:
+    """By tolerance: error over tolerance; and how many times more samples and time uniform steps take for the
+    same error, by the quadrature that is best at it."""
+    found: dict[str, dict[str, float | None]] = {}
+    for tolerance, row in rows[ADAPTIVE].items():
+        found[tolerance] = {"error over tolerance": row["rmse"] / float(tolerance)}
+        for what in ("samples", "seconds"):
+            taken = [at_error(rows[q], row["rmse"], what) for q in QUADRATURES]
+            least = min((t for t in taken if t is not None), default=None)
+            found[tolerance][what] = None if least is None else round(least / row[what], 3)
     return found
 
 
@@ -113,7 +161,14 @@ def summary(scenes: dict[str, Any], peaks: dict[str, Any]) -> dict[str, Any]:
     """What the record says in short: ratios of errors at one step, and of a peak's at four and one."""
     at = {s: {n: rows[n]["1.0"]["rmse"] for n in QUADRATURES} for s, rows in scenes.items()}
     ratios = {s: e["preintegrated"] / e["midpoint"] for s, e in at.items()}
+    uniform = {s: against_uniform(rows) for s, rows in scenes.items()}
+    gains = {
+        what: [gain for of in uniform.values() for row in of.values() if (gain := row[what]) is not None]
+        for what in ("samples", "seconds")
+    }
     return {
+        "uniform steps over adaptive sampling, at its error": uniform,
+        "geometric means": {what: common.geometric_mean(each) for what, each in gains.items() if each},
         "preintegrated over midpoint, one voxel": ratios,
         "mean": float(np.mean(list(ratios.values()))),
         "peak: preintegrated at 4 over midpoint at 1": {
