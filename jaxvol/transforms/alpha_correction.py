@@ -112,7 +112,8 @@ def _divided(cell: Cell, region: Region) -> tuple[Cell, Cell, Cell]:
     last, _ = face(regions[-1], backward)
     end = cell.front + cell.width
     first = jnp.where(changes, first, end)
-    last = jnp.maximum(first, jnp.where(changes, last, end))
+    last = jnp.where(changes, last, end)
+    last = jnp.where(last < first, first, last)
     return (
         Cell(cell.front, first - cell.front, cell.cut & (first >= end)),
         Cell(first, last - first, cell.cut & (first < end) & (last >= end)),

@@ -91,9 +91,10 @@ class Jitter(Transform):
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         if not self.front_residual:
             return (cell,)
-        front = jnp.maximum(cell.front, 0)
-        width = jnp.maximum(cell.width - (front - cell.front), 0)  # of a piece that ends before the entry
-        return (Cell(front, width, cell.cut),)
+        # Not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10).
+        front = jnp.where(cell.front > 0, cell.front, 0)
+        left = cell.width - (front - cell.front)
+        return (Cell(front, jnp.where(left > 0, left, 0), cell.cut),)  # a piece may end before the entry
 
 
 class EmptySpaceJitter(Transform):
