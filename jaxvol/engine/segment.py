@@ -41,11 +41,14 @@ class Ahead(NamedTuple):
         if march.longest_stride == 1:
             return cls(jnp.arange(cells, dtype=at.index.dtype), None)
         stride = jax.vmap(lambda ray, at, steps: march.stride(ray, front(march, at, steps), at.index + steps))
-        ends = [jnp.zeros_like(at.index)]
-        for _ in range(cells):
-            ends.append(ends[-1] + stride(ray, at, ends[-1]))
-        whole = jnp.stack(ends)
-        return cls(whole[:-1], whole[1:] - whole[:-1])
+
+        def further(begin: Int[Array, " rays"], _: None) -> tuple[Int[Array, " rays"], Any]:
+            length = stride(ray, at, begin)
+            return begin + length, (begin, length)
+
+        # a loop, whose results lie in memory: otherwise each cell would find out anew where all before it end
+        _, (begin, strides) = jax.lax.scan(further, jnp.zeros_like(at.index), None, length=cells)
+        return cls(begin, strides)
 
     @property
     def axis_of_rays(self) -> int | None:
