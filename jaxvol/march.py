@@ -129,12 +129,13 @@ class Transform(eqx.Module):
         return 1
 
     def stride(self, ray: Ray, depth: Scalar, step: Scalar) -> Int[Array, ""]:
-        """How many steps, of this length, the cell at this depth may be long.
+        """How many steps long the cells may be in the stretch of `longest_stride` steps that begins at this
+        depth. `step`: their length.
 
         It depends on the ray, the depth and the step alone. A march rounds it down to a power of two of at
-        most `longest_stride`, and so far that a cell of n steps begins a multiple of n steps after the first.
-        Rays leap to multiples of `longest_stride`, so that leaps do not move cells. Of several transforms the
-        shortest stride counts. Gradients take strides as given; the image jumps where one changes."""
+        most `longest_stride`. Stretches follow each other from the first cell on, and rays leap to where one
+        begins, so that leaps do not move cells. (What `shift` adds is not in `depth`.) Of several transforms
+        the shortest stride counts. Gradients take strides as given; the image jumps where one changes."""
         return jnp.ones(jnp.shape(depth), jnp.int32)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -289,23 +290,23 @@ class March(eqx.Module):
         # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
-    def stride(self, ray: Ray, depth: Scalar, index: Int[Array, ""]) -> Int[Array, ""] | int:
-        """How many steps long the cell is that begins at this depth, `index` steps after the first one."""
+    def stride(self, ray: Ray, index: Int[Array, ""]) -> Int[Array, ""] | int:
+        """How many steps long the cells are in the stretch that holds the cell at this index."""
         longest = self.longest_stride
         if longest == 1:
             return 1
-        ray, depth, step = jax.lax.stop_gradient((ray, depth, self.step))
-        power = jnp.full_like(index, longest)
-        for transform in self._overriding("stride"):
-            stride, name = transform.stride(ray, depth, step), type(transform).__name__
+        march, ray = jax.lax.stop_gradient((self, ray))
+        begin = (index & -longest).astype(ray.length.dtype)
+        depth = (march.start(ray) + begin) * march.step
+        shortest = jnp.full_like(index, longest)
+        for transform in march._overriding("stride"):
+            stride, name = transform.stride(ray, depth, march.step), type(transform).__name__
             if jnp.shape(stride) != depth.shape or not jnp.issubdtype(jnp.result_type(stride), jnp.integer):
                 raise ValueError(f"{name}.stride must return an integer for each depth; got {stride!r}.")
             stride = jnp.asarray(stride)
             for shorter in (2**k for k in reversed(range(longest.bit_length() - 1))):
-                power = jnp.where(stride < 2 * shorter, jnp.minimum(power, shorter), power)
-        # the largest power of two that divides the index
-        aligned = jnp.where(index == 0, longest, index & -index)
-        return jnp.minimum(power, aligned)
+                shortest = jnp.where(stride < 2 * shorter, jnp.minimum(shortest, shorter), shortest)
+        return shortest
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""

@@ -191,7 +191,7 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
 def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, _, classification, compositing = pipeline
-    stride, sampler = march.stride(ray, front(march, at), at.index), RaySampler(ray, classification)
+    stride, sampler = march.stride(ray, at.index), RaySampler(ray, classification)
     after, alphas, color = at, [], None
     for piece in pieces(pipeline, ray, front(march, at), stride):
         measured = measure(pipeline, ray, piece)

@@ -90,18 +90,18 @@ MUTATIONS = [
         ("transforms/test_adaptive_sampling.py::test_cells_are_one_step_long_where_nothing_is_known[nan]",),
     ),
     Mutation(
-        "adaptive sampling: the far half of a cell is not looked at",
+        "adaptive sampling: looked up where a stretch begins, not in its middle",
         "transforms/adaptive_sampling.py",
-        "return jnp.where(far < self.longest, jnp.minimum(near, self.longest // 2), near)",
-        "return near",
-        ("transforms/test_adaptive_sampling.py::test_a_cell_lies_within_windows_that_allow_its_length",),
+        "ray.path(depth + self.longest / 2 * step)",
+        "ray.path(depth)",
+        ("transforms/test_adaptive_sampling.py::test_a_stretch_lies_within_a_window_that_allows_its_stride",),
     ),
     Mutation(
-        "adaptive sampling: cells longer than what is known of their surroundings",
+        "adaptive sampling: stretches longer than what is known of their surroundings",
         "transforms/adaptive_sampling.py",
-        "(SHARE * error <= sampling.tolerance) & (width <= 2 * length)",
-        "SHARE * error <= sampling.tolerance",
-        ("transforms/test_adaptive_sampling.py::test_no_cell_is_longer_than_two_blocks",),
+        "rounds = jnp.ceil((reach - 1) / 2)",
+        "rounds = jnp.zeros_like(reach)",
+        ("transforms/test_adaptive_sampling.py::test_long_stretches_heed_what_lies_farther_away",),
     ),
     Mutation(
         "adaptive sampling: samples are taken to integrate",
@@ -245,8 +245,8 @@ MUTATIONS = [
     Mutation(
         "empty space: blocks without the nodes of their upper faces",
         "occupancy.py",
-        "BLOCK, axis) for i in range(BLOCK + 1)",
-        "BLOCK, axis) for i in range(BLOCK)",
+        "for i in range(BLOCK + 1 + 2 * margin)",
+        "for i in range(BLOCK + 2 * margin)",
         ("test_occupancy.py::test_blocks_hold_every_value_between_their_nodes",),
     ),
     Mutation(
@@ -398,11 +398,11 @@ MUTATIONS = [
         ("test_selections.py::test_a_settled_ray_takes_no_more_samples",),
     ),
     Mutation(
-        "stride: a long cell begins anywhere",
+        "stride: asked where a cell begins, not its stretch",
         "march.py",
-        "return jnp.minimum(power, aligned)",
-        "return power",
-        ("test_march.py::test_stride_lengthens_cells",),
+        "begin = (index & -longest).astype(ray.length.dtype)",
+        "begin = index.astype(ray.length.dtype)",
+        ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
     ),
     Mutation(
         "stride: a leap ends where no cell begins",

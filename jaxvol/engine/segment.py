@@ -37,18 +37,16 @@ class Ahead(NamedTuple):
 
     @classmethod
     def of(cls, march: March, cells: int, ray: Ray, at: Progress) -> "Ahead":
-        """The next cells of many rays. All strides are known before any sample is."""
-        if march.longest_stride == 1:
+        """The next cells of many rays. All strides are known before any sample is: those of as many stretches
+        as there are cells, though most rays need fewer, since none waits for what another one is."""
+        longest = march.longest_stride
+        if longest == 1:
             return cls(jnp.arange(cells, dtype=at.index.dtype), None)
-        stride = jax.vmap(lambda ray, at, steps: march.stride(ray, front(march, at, steps), at.index + steps))
-
-        def further(begin: Int[Array, " rays"], _: None) -> tuple[Int[Array, " rays"], Any]:
-            length = stride(ray, at, begin)
-            return begin + length, (begin, length)
-
-        # a loop, whose results lie in memory: otherwise each cell would find out anew where all before it end
-        _, (begin, strides) = jax.lax.scan(further, jnp.zeros_like(at.index), None, length=cells)
-        return cls(begin, strides)
+        stretch = jax.vmap(jax.vmap(march.stride, in_axes=(None, 0)), in_axes=(0, 1), out_axes=1)
+        begun = at.index & (longest - 1)  # steps since the first stretch began
+        ahead = longest * jnp.arange(cells, dtype=at.index.dtype)[:, None]
+        strides = in_memory(_live(at), stretch, ray, at.index[None] + ahead)
+        return cls(*in_memory(_live(at), partial(_divided, longest), begun, strides))
 
     @property
     def axis_of_rays(self) -> int | None:
@@ -74,6 +72,25 @@ class Ahead(NamedTuple):
         if self.stride is None:
             return steps
         return jnp.sum(self.begin < steps[None], axis=0, dtype=steps.dtype)
+
+
+def _divided(
+    longest: int, begun: Int[Array, " rays"], strides: Int[Array, "stretches rays"]
+) -> tuple[Int[Array, "cells rays"], Int[Array, "cells rays"]]:
+    """Where cells begin in stretches of these strides, in steps from here, and their lengths."""
+    number = jnp.arange(strides.shape[0], dtype=begun.dtype)[:, None]
+    # the logarithm of a stride; a division by it takes ten times as long as a shift
+    power = sum((strides >= 2**k).astype(begun.dtype) for k in range(1, longest.bit_length()))
+    first = jnp.zeros_like(begun)  # cell of a stretch
+    begin, length = number * strides[0][None], jnp.broadcast_to(strides[0][None], strides.shape)
+    left = longest - begun
+    for place, stride in enumerate(strides[1:], 1):
+        first = first + (left >> power[place - 1])
+        left = jnp.full_like(begun, longest)
+        reached = number >= first[None]
+        here = (place * longest - begun)[None] + (number - first[None]) * stride[None]
+        begin, length = jnp.where(reached, here, begin), jnp.where(reached, stride[None], length)
+    return begin, length
 
 
 class Samples(NamedTuple):

@@ -103,7 +103,7 @@ def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     march = pipeline.march
 
     def one(ray: Ray, at: Progress) -> Progress:
-        stride = march.stride(ray, front(march, at), at.index)
+        stride = march.stride(ray, at.index)
         cut = pieces(pipeline, ray, front(march, at), stride)
         alphas = [opacity(pipeline, ray, piece, measure(pipeline, ray, piece)) for piece in cut]
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
