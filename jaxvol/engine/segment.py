@@ -80,7 +80,9 @@ def _divided(
     """Where cells begin in stretches of these strides, in steps from here, and their lengths."""
     number = jnp.arange(strides.shape[0], dtype=begun.dtype)[:, None]
     # the logarithm of a stride; a division by it takes ten times as long as a shift
-    power = sum((strides >= 2**k).astype(begun.dtype) for k in range(1, longest.bit_length()))
+    power = jnp.zeros_like(strides)
+    for k in range(1, longest.bit_length()):
+        power = power + (strides >= 2**k).astype(strides.dtype)
     first = jnp.zeros_like(begun)  # cell of a stretch
     begin, length = number * strides[0][None], jnp.broadcast_to(strides[0][None], strides.shape)
     left = longest - begun
