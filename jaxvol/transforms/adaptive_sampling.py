@@ -20,7 +20,6 @@ SHARE = 1 / 20
 """What a block's predicted error is worth in the image: errors of a ray's cells have either sign, most are
 much smaller than predicted, and what lies in front hides them. Measured: `experiments.accuracy`."""
 
-
 FARTHEST = 8
 """Blocks around its own that a stretch may touch: it is at most 17 blocks long."""
 
@@ -32,7 +31,7 @@ class AdaptiveSampling(Transform):
     is as good as several short ones. Take a block of 4³ voxels, of side ℓ, whose values, with those up to two
     nodes around it, range over R, with second differences of at most H (per length²). Between the ends of a
     cell of width w the value leaves the straight line by at most δ = H w² / 8. While it runs through R once,
-    extinction and emission change by V in total, and their slopes by K (`occupancy.Variation`). Then the
+    extinction and emission change by V in total, and their slopes by K (`variation.Variation`). Then the
     optical depth of a stretch as long as the block is wrong by about
 
         e = ℓ V min(1, δ / R) + q
@@ -47,8 +46,8 @@ class AdaptiveSampling(Transform):
     a cell. Cells are never shorter than a step: choose the step for the finest detail, half or a quarter of a
     voxel, and `longest` so that a stretch is about four voxels long: of longer ones less is known.
 
-    **It saves samples, and not always time**: a sample takes about twice as long, since where it lies must be
-    looked up first. Where most of what rays meet is smooth, or the step is fine, the image is made sooner.
+    **It saves samples, and as yet no time**: on CPU a sample takes about twice as long, since where it lies
+    must be looked up first, so that uniform steps of the same error are somewhat faster in all five scenes.
 
     For modes that do not composite "over", and for transfer functions that do not say how they vary, all
     cells are one step long.
