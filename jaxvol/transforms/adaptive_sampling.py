@@ -110,7 +110,9 @@ def _strides(
     sampling: AdaptiveSampling, march: March, space: Space, windows: Windows, variation: Variation
 ) -> UInt8[Array, "bx by bz"]:
     """By block, the most steps of a cell whose error is tolerated."""
-    distance = _node_distance(space, windows.low.shape)
+    dtype = march.step.dtype
+    windows, variation = jax.tree.map(lambda leaf: leaf.astype(dtype), (windows, variation))
+    distance = _node_distance(space, windows.low.shape).astype(dtype)
     spread, length = windows.high - windows.low, BLOCK * distance
     strides = jnp.ones(windows.low.shape, jnp.uint8)
     for stride in (2**k for k in range(1, sampling.longest.bit_length())):
@@ -145,7 +147,7 @@ def _eroded(_: Any, strides: UInt8[Array, "bx by bz"]) -> UInt8[Array, "bx by bz
 
 def _node_distance(space: Space, shape: tuple[int, ...]) -> Float[Array, "bx by bz"]:
     """By block, the least world distance between neighbouring nodes, in its middle."""
-    middle = [BLOCK * (jnp.arange(n, dtype=jnp.float32) + 0.5) for n in shape]
+    middle = [BLOCK * (jnp.arange(n, dtype=space.middle[0].dtype) + 0.5) for n in shape]
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
