@@ -12,13 +12,14 @@ At each seam the answers of all transforms are combined, so that they compose.
 | `shift` | by what part of a step do samples after the first transparent one move? | 0 |
 | `empty_space` | where is nothing visible? | unknown |
 | `prepared` | what must be known of the scene? | nothing |
-| `stride` | how many steps long may this cell be? | 1 |
+| `stride_error` | how wrong is the image if cells are so many steps long here? | unknown: 1 step |
 | `cut` | which part of its cell does a sample stand for? | all of it |
 | `stop` | is this ray finished? | not before the exit |
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial, reduce
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import equinox as eqx
@@ -47,6 +48,40 @@ class Cell(eqx.Module):
     front: Scalar
     width: Scalar
     cut: Bool[Array, ""]
+
+
+RUN = 8
+"""Cells in a row that are equally long. Where strides are not all 1, the cells of a ray come in such runs."""
+
+
+class Run(NamedTuple):
+    """RUN cells of a ray, in a row, each `stride` steps long.
+
+    - `front`: depth at which the first one begins. (What `Transform.shift` adds is not in it.)
+    - `stride`: a power of two, static. `step`: its unit, world length.
+    """
+
+    front: Scalar
+    stride: int
+    step: Scalar
+
+    @property
+    def middle(self) -> Scalar:
+        """Depth of the middle of the run."""
+        return self.front + RUN * self.stride / 2 * self.step
+
+
+class Strides(NamedTuple):
+    """The cells of a ray from an index on.
+
+    - `begin`: index at which one begins.
+    - `stride`: their length, in steps, up to the end of the run.
+    - `error`: what is predicted of the run, 0 if it was begun before.
+    """
+
+    begin: Int[Array, ""]
+    stride: Int[Array, ""]
+    error: Scalar
 
 
 class View(NamedTuple):
@@ -116,7 +151,7 @@ class Transform(eqx.Module):
         return None
 
     def prepared(self, march: "March", space: Space, windows: Windows, variation: Variation) -> "Transform":
-        """This transform with what `stride` needs to know of the scene, found once for each image, and
+        """This transform with what `stride_error` needs to know of the scene, found once for each image, and
         without a gradient: in fields that hold None before, and arrays of integers afterwards.
 
         `windows`: how the volume's values vary, block by block; `variation`: how much what is
@@ -125,18 +160,26 @@ class Transform(eqx.Module):
 
     @property
     def longest_stride(self) -> int:
-        """The longest stride that `stride` may give: a static power of two, at most 64."""
+        """The longest stride that `stride_error` is asked about: a static power of two, at most 64."""
         return 1
 
-    def stride(self, ray: Ray, depth: Scalar, step: Scalar) -> Int[Array, ""]:
-        """How many steps long the cells may be in the stretch of `longest_stride` steps that begins at this
-        depth. `step`: their length.
+    @property
+    def subdivision(self) -> int:
+        """Into how many parts each step of the march is divided before all else; a static integer."""
+        return 1
 
-        It depends on the ray, the depth and the step alone. A march rounds it down to a power of two of at
-        most `longest_stride`. Stretches follow each other from the first cell on, and rays leap to where one
-        begins, so that leaps do not move cells. (What `shift` adds is not in `depth`.) Of several transforms
-        the shortest stride counts. Gradients take strides as given; the image jumps where one changes."""
-        return jnp.ones(jnp.shape(depth), jnp.int32)
+    def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
+        """By how much the image is wrong because of these cells, if nothing lies in front of them, as far as
+        can be predicted; and how much is tolerated.
+
+        Both depend on the ray and the run alone. A run is allowed if its error, times the transmittance in
+        front of it, is at most what is tolerated (if several transforms override this, by each), and always
+        if its stride is 1. A run of stride s begins at a multiple of RUN s steps. Of those that hold a cell
+        and are allowed, a march takes the longest one, none of whose cells it has taken in another one
+        already. So leaps, which only cross what is transparent, do not change it. Gradients take strides as
+        given; the image jumps where one changes."""
+        unknown = jnp.full(jnp.shape(run.front), jnp.inf, ray.length.dtype)
+        return unknown, jnp.zeros_like(unknown)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
@@ -265,7 +308,7 @@ class March(eqx.Module):
     @property
     def longest_stride(self) -> int:
         """The longest stride of a cell, in steps."""
-        return min((transform.longest_stride for transform in self._overriding("stride")), default=1)
+        return min((transform.longest_stride for transform in self._overriding("stride_error")), default=1)
 
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""
@@ -290,23 +333,41 @@ class March(eqx.Module):
         # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
-    def stride(self, ray: Ray, index: Int[Array, ""]) -> Int[Array, ""] | int:
-        """How many steps long the cells are in the stretch that holds the cell at this index."""
-        longest = self.longest_stride
-        if longest == 1:
-            return 1
-        march, ray = jax.lax.stop_gradient((self, ray))
-        begin = (index & -longest).astype(ray.length.dtype)
-        depth = (march.start(ray) + begin) * march.step
-        shortest = jnp.full_like(index, longest)
-        for transform in march._overriding("stride"):
-            stride, name = transform.stride(ray, depth, march.step), type(transform).__name__
-            if jnp.shape(stride) != depth.shape or not jnp.issubdtype(jnp.result_type(stride), jnp.integer):
-                raise ValueError(f"{name}.stride must return an integer for each depth; got {stride!r}.")
-            stride = jnp.asarray(stride)
-            for shorter in (2**k for k in reversed(range(longest.bit_length() - 1))):
-                shortest = jnp.where(stride < 2 * shorter, jnp.minimum(shortest, shorter), shortest)
-        return shortest
+    def divided(self) -> "March":
+        """This march with its steps as short as its transforms want them."""
+        parts = max((transform.subdivision for transform in self.transforms), default=1)
+        return self if parts == 1 else eqx.tree_at(lambda march: march.step, self, self.step / parts)
+
+    def strides(
+        self,
+        ray: Ray,
+        index: Int[Array, ""],
+        stride: Int[Array, ""],
+        target: Int[Array, ""],
+        transmittance: Scalar,
+    ) -> Strides:
+        """The cells of a ray from `target` on, or from where the cell begins that holds it. The ray has come
+        to `index`, in a run of this `stride`, unless that ends there; from there to `target` all is
+        transparent."""
+        march, ray, transmittance = jax.lax.stop_gradient((self, ray, transmittance))
+        length = RUN * stride
+        end = jnp.where(index & (length - 1) == 0, index, (index | (length - 1)) + 1)
+        start, chosen = march.start(ray), None
+        for level in range(self.longest_stride.bit_length()):
+            first = target & -(RUN << level)
+            run = Run((start + first.astype(start.dtype)) * march.step, 1 << level, march.step)
+            predicted = [_predicted(transform, ray, run) for transform in march._overriding("stride_error")]
+            error = transmittance * reduce(jnp.maximum, [error for error, _ in predicted])
+            found = Strides(first, jnp.full_like(index, run.stride), error)
+            if chosen is None:
+                chosen = found
+                continue
+            fits = first >= end
+            for error, tolerated in predicted:
+                fits &= transmittance * error <= tolerated
+            chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)
+        going = Strides(target & -stride, stride, jnp.zeros_like(ray.length))
+        return jax.tree.map(partial(jnp.where, target < end), going, chosen)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""
@@ -376,10 +437,19 @@ def _cut(transform: Transform, cell: Cell, ray: Ray, volume: Volume) -> tuple[Ce
     return pieces
 
 
+def _predicted(transform: Transform, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
+    """A transform's `stride_error`, if it is two numbers like a depth."""
+    answer = transform.stride_error(ray, run)
+    check_answer(transform, "stride_error", answer, (run.front, run.front))
+    return answer
+
+
 def _check_stride(transform: Transform) -> None:
     name, longest = type(transform).__name__, transform.longest_stride
-    if _overrides(transform, "stride") != _overrides(transform, "longest_stride"):
-        raise ValueError(f"transforms: {name} must override both stride and longest_stride, or neither.")
+    if _overrides(transform, "stride_error") != _overrides(transform, "longest_stride"):
+        raise ValueError(
+            f"transforms: {name} must override both stride_error and longest_stride, or neither."
+        )
     longest = integer(f"{name}.longest_stride", longest, 1, 64)
     if longest & (longest - 1):
         raise ValueError(f"transforms: {name}.longest_stride must be a power of two; got {longest}.")

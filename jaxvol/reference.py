@@ -54,7 +54,8 @@ class Progress(eqx.Module):
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
     the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
-    first transparent cell, and is 0 from then on. What is not asked for is None.
+    first transparent cell, and is 0 from then on. `stride`: steps of each cell of the current run, which ends
+    at a multiple of RUN of them. What is not asked for is None.
     """
 
     index: Int[Array, ""]
@@ -63,13 +64,15 @@ class Progress(eqx.Module):
     stats: "SampleStats | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
+    stride: Int[Array, ""] | None = None
 
 
 class SampleStats(eqx.Module):
-    """What `Rendering.samples` and `Rendering.aligned` report."""
+    """What `Rendering.samples` and `Rendering.aligned` report, and the square of `Rendering.error`."""
 
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
+    error: Scalar | None
 
 
 def has_fault(volume: Volume, march: March, *others: Any) -> Bool[Array, ""]:
@@ -83,15 +86,35 @@ def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Prog
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
     march, _, _, compositing = pipeline
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
-    count = jnp.zeros(ray.length.shape, jnp.int32)
+    count, strides = jnp.zeros(ray.length.shape, jnp.int32), march.longest_stride > 1
     return Progress(
         index=count,
         offset=march.start(ray),
         composite=compositing.begin(zero, outputs),
-        stats=SampleStats(count, no) if outputs == "all" else None,
+        stats=SampleStats(count, no, zero if strides else None) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
+        stride=count + 1 if strides else None,
     )
+
+
+def with_stride(
+    pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Array, ""] | int = 0
+) -> tuple[Progress, Int[Array, ""] | int]:
+    """The ray, with the stride of the cells that begin so many steps ahead of it, up to which all is
+    transparent; and the steps to where the first of them begins."""
+    if at.stride is None:
+        return at, steps
+    transmittance = pipeline.compositing.transmittance(at.composite)
+    ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance)
+    stats = at.stats
+    if stats is not None:
+        assert stats.error is not None
+        stats = replace(stats, error=stats.error + jnp.where(at.finished, 0, ahead.error) ** 2)
+    # a ray that leaves goes all the way
+    inside = front(pipeline.march, at, steps) < ray.length
+    begin, stride = jnp.where(inside, ahead.begin - at.index, steps), jnp.where(inside, ahead.stride, 1)
+    return replace(at, stride=stride, stats=stats), begin
 
 
 def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] | int) -> tuple[Cell, ...]:
@@ -154,7 +177,7 @@ def add(
     if stats is not None:
         shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
         samples = stats.samples + taken.astype(stats.samples.dtype)
-        stats = SampleStats(samples, stats.aligned | (piece.cut & shows))
+        stats = replace(stats, samples=samples, aligned=stats.aligned | (piece.cut & shows))
     composite = compositing.add(at.composite, fragment)
     check_answer(compositing, "add", composite, at.composite)
     return replace(at, composite=composite, stats=stats)
@@ -191,7 +214,8 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
 def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, _, classification, compositing = pipeline
-    stride, sampler = march.stride(ray, at.index), RaySampler(ray, classification)
+    at, _ = with_stride(pipeline, ray, at)
+    stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, classification)
     after, alphas, color = at, [], None
     for piece in pieces(pipeline, ray, front(march, at), stride):
         measured = measure(pipeline, ray, piece)
@@ -219,6 +243,8 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
     if at.stats is not None:
         details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
+        if at.stats.error is not None:
+            details = details._replace(error=jnp.where(valid, jnp.sqrt(at.stats.error), jnp.nan))
     if isinstance(pipeline.compositing, Selection):
         details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)
@@ -287,6 +313,7 @@ def render_ray_reference(
     origin, direction = _vector("origin", origin), _vector("direction", direction)
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
+    march = march.divided()
     space = march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))

@@ -138,7 +138,7 @@ def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = No
     for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
-    scene = strong(scene)
+    scene = strong(scene._replace(march=scene.march.divided()))
     volume, transfer, _, march, _, lighting = scene
     how = adjoint_of(adjoint, volume, march)
     if lighting is not None:

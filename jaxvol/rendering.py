@@ -20,6 +20,7 @@ class Details(NamedTuple):
 
     depth: Float[Array, "*rays"] | None = None
     samples: Int[Array, "*rays"] | None = None
+    error: Float[Array, "*rays"] | None = None
     aligned: Bool[Array, "*rays"] | None = None
     selected: PyTree = None
 
@@ -37,7 +38,12 @@ class Rendering(eqx.Module):
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
 
-    The last three raise `AttributeError` where they were not asked for (`outputs="rgba"`).
+    - `error`: under `AdaptiveSampling`, an estimate of the error of a pixel's colour that comes from its
+      samples: the root of the summed squares of what was predicted of its runs of cells. Infinite where
+      nothing can be predicted.
+
+    The last four raise `AttributeError` where they were not asked for (`outputs="rgba"`), and `error` without
+    `AdaptiveSampling`.
     """
 
     rgba: Float[Array, "*rays 4"]
@@ -56,9 +62,14 @@ class Rendering(eqx.Module):
     def aligned(self) -> Bool[Array, "*rays"]:
         return self._detail("aligned", self.details.aligned)
 
-    def _detail(self, name: str, value: Array | None) -> Array:
+    @property
+    def error(self) -> Float[Array, "*rays"]:
+        return self._detail("error", self.details.error, "give the march AdaptiveSampling, and ")
+
+    def _detail(self, name: str, value: Array | None, more: str = "") -> Array:
         if value is None:
-            raise AttributeError(f'{name} is not part of this rendering: pass outputs="all" to compute it.')
+            how = f'{more}pass outputs="all" to compute it'
+            raise AttributeError(f"{name} is not part of this rendering: {how}.")
         return value
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:

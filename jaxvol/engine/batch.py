@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.sharding import varying
 from .._util.trees import PyTree
-from .._util.xla import gather
+from .._util.xla import gather, in_memory
 from ..beams import Box
 from ..march import EmptySpaceIndex, March
 from ..occupancy import Occupancy
-from ..reference import Pipeline, Progress, front, move
+from ..reference import Pipeline, Progress, front, move, with_stride
 from ..space import Ray
-from .segment import Samples, SampleVisitor, march_segment, regular_from_here
+from .segment import Samples, SampleVisitor, always, begins, march_segment, regular_from_here
 from .tiling import Tiling
 
 
@@ -47,7 +47,7 @@ class VisibleRangeRecorder(SampleVisitor):
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
     ) -> tuple[CellRange, None, None]:
-        begin = samples.ahead.indices(at.index)
+        begin = at.index[None] + begins(at, samples.number).reshape(samples.number, -1)
         visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
         first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
         until = jnp.max(jnp.where(visible, begin + 1, carry.until[None]), axis=0)
@@ -138,8 +138,7 @@ def march_batch(
 
     def advance(state: State) -> State:
         here, (mine, more, total) = state
-        if job.empty_space is not None:
-            here = _leap(job, job.empty_space, beam, rays, here)
+        here = _to_next_cell(job, beam, rays, here)
         after, samples = march_segment(job.pipeline, tiling, rays, here, regular=regular)
         if visitor is not None:
             mine, found, total = visitor.visit(rays, here, samples, given, mine, total)
@@ -159,10 +158,27 @@ def with_fields(at: Progress, **changes: Array) -> Progress:
     return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
 
 
-def over_transparent(march: March, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
-    """Moves a ray on by so many steps, over which all cells are transparent."""
+def over_transparent(pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
+    """Moves a ray on by so many steps, over which all cells are transparent, or to where the cell begins
+    that lies there."""
+    return _moved(pipeline.march, ray, *with_stride(pipeline, ray, at, steps))
+
+
+def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""] | int) -> Progress:
     moved = move(march, ray, at, jnp.ones((), bool), steps)
-    return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
+    return jax.tree.map(lambda a, b: jnp.where(~at.finished & (steps > 0), a, b), moved, at)
+
+
+def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
+    """Moves rays to their next cell that is not proven empty, and decides its stride."""
+    pipeline = job.pipeline
+    steps = None if job.empty_space is None else _leap(job, job.empty_space, beam, rays, at)
+    if at.stride is not None:
+        ahead = jnp.zeros_like(at.index) if steps is None else steps
+        # in memory, since all that computes with cells would decide it again
+        at, found = in_memory(always(at), jax.vmap(partial(with_stride, pipeline)), rays, at, ahead)
+        steps = None if steps is None else found
+    return at if steps is None else jax.vmap(partial(_moved, pipeline.march))(rays, at, steps)
 
 
 def finished_after(range_: CellRange | None, at: Progress) -> Progress:
@@ -172,18 +188,12 @@ def finished_after(range_: CellRange | None, at: Progress) -> Progress:
 
 def _leap(
     job: Job, empty_space: EmptySpaceIndex, beam: Int[Array, " rays"], rays: Ray, at: Progress
-) -> Progress:
-    """Moves rays on to the first cell that is not proven empty. A ray with nothing ahead of it is
-    finished."""
+) -> Int[Array, " rays"]:
+    """Steps to the first cell that is not proven empty. Where there is none, they end past the exit."""
     march = job.pipeline.march
     here = front(march, at)
     there = empty_space.skip_to(job.prepared, beam, rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
     # clipped before it becomes an integer, whose range it may exceed
     steps = jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype)
-    longest = march.longest_stride
-    if longest > 1:  # to where a cell begins also without the leap
-        rounded = jnp.maximum((at.index + steps) // longest * longest - at.index, 0)
-        steps = jnp.where(there < rays.length, rounded, steps)
-    steps = jnp.minimum(steps, march.most_samples - at.index)
-    return jax.vmap(partial(over_transparent, march))(rays, at, steps)
+    return jnp.minimum(steps, march.most_samples - at.index)

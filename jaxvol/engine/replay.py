@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 from .._util.fetching import Recording, scatter_add
 from .._util.trees import PyTree, added, floats
@@ -38,7 +38,7 @@ from ..transfer import Transfer, classification_of
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
-from .segment import Ahead, Samples, SampleVisitor, pieces_ahead, vmap_cells
+from .segment import Samples, SampleVisitor, pieces_ahead, vmap_cells
 from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
 from .tiling import Tiling
 from .visible_samples import Weights, weights_of
@@ -182,14 +182,14 @@ class Replay(SampleVisitor):
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
         of_march, of_volume, of_rays, indices, of_voxels = self._placed(
-            ray, at, samples.ahead, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
+            ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
         voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return carry, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
     def _placed(
-        self, ray: Ray, at: Progress, ahead: Ahead, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
+        self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
     ) -> tuple[PyTree, PyTree, PyTree, list[Array], list[Array]]:
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
         its depth where the loss depends on that, and of its point where it is shaded; then the voxels that
@@ -206,7 +206,7 @@ class Replay(SampleVisitor):
             perturbations: Any,
             ray_rest: PyTree,
             at: Progress,
-            ahead: Ahead,
+            number: Int[Array, ""],
         ) -> tuple[list[Any], list[Array]]:
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
             placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
@@ -215,18 +215,19 @@ class Replay(SampleVisitor):
             found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
-            for piece in pieces_ahead(pipeline, ray, at, ahead):
+            for piece in pieces_ahead(pipeline, ray, at, number):
                 depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
                 point = None if self.light is None else along(ray.entry, ray.direction, depth)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, point))
             return found, record.indices
 
-        rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, ahead.axis_of_rays))
+        rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))
         cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
 
         def all_(march: PyTree, volume: PyTree, ray: PyTree, perturbations: list[Array] | None) -> PyTree:
-            return cells(march, volume, ray, perturbations, ray_rest, at, ahead)
+            each = jnp.arange(number, dtype=at.index.dtype)
+            return cells(march, volume, ray, perturbations, ray_rest, at, each)
 
         perturbations = []
         if voxels:

@@ -20,7 +20,7 @@ from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..compositing import Selection
-from ..march import Cell, March
+from ..march import RUN, Cell, March
 from ..reference import Pipeline, Progress, add, front, move, opacity, pieces, stop
 from ..space import Ray
 from ..transfer import Classification, Measured
@@ -28,78 +28,16 @@ from .tiling import Tiling
 from .visible_samples import shaded_colors
 
 
-class Ahead(NamedTuple):
-    """Where the next cells of rays begin, in steps from here, and how many steps long they are: arrays
-    (cells,), or (cells, rays) where strides differ. `stride` is None where each cell is one step long."""
-
-    begin: Int[Array, "cells *rays"]
-    stride: Int[Array, "cells *rays"] | None
-
-    @classmethod
-    def of(cls, march: March, cells: int, ray: Ray, at: Progress) -> "Ahead":
-        """The next cells of many rays. All strides are known before any sample is: those of as many stretches
-        as there are cells, though most rays need fewer, since none waits for what another one is."""
-        longest = march.longest_stride
-        if longest == 1:
-            return cls(jnp.arange(cells, dtype=at.index.dtype), None)
-        stretch = jax.vmap(jax.vmap(march.stride, in_axes=(None, 0)), in_axes=(0, 1), out_axes=1)
-        begun = at.index & (longest - 1)  # steps since the first stretch began
-        ahead = longest * jnp.arange(cells, dtype=at.index.dtype)[:, None]
-        strides = in_memory(_live(at), stretch, ray, at.index[None] + ahead)
-        return cls(*in_memory(_live(at), partial(_divided, longest), begun, strides))
-
-    @property
-    def axis_of_rays(self) -> int | None:
-        """For `jax.vmap` over rays, once it is mapped over cells."""
-        return None if self.stride is None else 0
-
-    def indices(self, index: Int[Array, " rays"]) -> Int[Array, "cells rays"]:
-        """At which index of their ray the cells begin, for rays at these indices."""
-        return index[None] + (self.begin[:, None] if self.stride is None else self.begin)
-
-    def steps(self, cells: Int[Array, " rays"] | int) -> Int[Array, " rays"] | int:
-        """Total length, in steps, of each ray's first `cells` cells."""
-        if self.stride is None:
-            return cells
-        dtype = self.stride.dtype
-        number, cells = jnp.arange(self.stride.shape[0], dtype=dtype)[:, None], jnp.asarray(cells, dtype)
-        cells = jnp.broadcast_to(cells, self.stride.shape[1:])[None]
-        return jnp.sum(jnp.where(number < cells, self.stride, 0), axis=0, dtype=dtype)
-
-    def before(self, steps: Int[Array, " rays"]) -> Int[Array, " rays"]:
-        """How many of the cells begin before so many steps; where each is one step long, this may exceed
-        their number."""
-        if self.stride is None:
-            return steps
-        return jnp.sum(self.begin < steps[None], axis=0, dtype=steps.dtype)
-
-
-def _divided(
-    longest: int, begun: Int[Array, " rays"], strides: Int[Array, "stretches rays"]
-) -> tuple[Int[Array, "cells rays"], Int[Array, "cells rays"]]:
-    """Where cells begin in stretches of these strides, in steps from here, and their lengths."""
-    number = jnp.arange(strides.shape[0], dtype=begun.dtype)[:, None]
-    # the logarithm of a stride; a division by it takes ten times as long as a shift
-    power = jnp.zeros_like(strides)
-    for k in range(1, longest.bit_length()):
-        power = power + (strides >= 2**k).astype(strides.dtype)
-    first = jnp.zeros_like(begun)  # cell of a stretch
-    begin, length = number * strides[0][None], jnp.broadcast_to(strides[0][None], strides.shape)
-    left = longest - begun
-    for place, stride in enumerate(strides[1:], 1):
-        first = first + (left >> power[place - 1])
-        left = jnp.full_like(begun, longest)
-        reached = number >= first[None]
-        here = (place * longest - begun)[None] + (number - first[None]) * stride[None]
-        begin, length = jnp.where(reached, here, begin), jnp.where(reached, stride[None], length)
-    return begin, length
+def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
+    """Steps to where the next cells of rays begin: (cells,), or (cells, rays) where strides differ."""
+    number = jnp.arange(cells, dtype=at.index.dtype)
+    return number if at.stride is None else number[:, None] * at.stride[None]
 
 
 class Samples(NamedTuple):
-    """The next cells of many rays, `ahead`. The other fields are lists with one entry for each piece of a
-    cell, arrays (cells, rays). Cells that a ray does not take are placed beyond its exit."""
+    """The next cells of many rays: lists with one entry for each piece of a cell, arrays (cells, rays). Cells
+    that a ray does not take are placed beyond its exit."""
 
-    ahead: Ahead
     cells: list[Cell]
     measured: list[Measured]
     opacity: list[Scalar]
@@ -143,13 +81,14 @@ def regular_from_here(at: Progress) -> Bool[Array, "*rays"]:
 def march_segment(
     pipeline: Pipeline, tiling: Tiling, ray: Ray, at: Progress, *, regular: bool
 ) -> tuple[Progress, Samples]:
-    """Marches rays by a segment, or to where they are finished or shifted off the cells that were sampled.
-    `regular`: no ray has a shift ahead of it, so that each takes all the cells."""
+    """Marches rays by a segment, or to where they are finished, shifted off the cells that were sampled, or
+    at the end of a run. `regular`: no ray has a shift ahead of it."""
     march, classification = pipeline.march, pipeline.classification
-    samples = _sampled(pipeline, Ahead.of(march, tiling.cells, ray, at), ray, at)
+    samples = _sampled(pipeline, tiling.cells, ray, at)
     taken: Int[Array, " rays"] | int
     taken, shifted = tiling.cells, None
-    if not regular:
+    # without shifts, runs begin with segments, and end with them
+    if not regular or (at.stride is not None and (march.may_shift or RUN % tiling.cells > 0)):
         taken, shifted = _taken(march, at, samples)
         samples = _without(samples, taken, ray)
     colors: list[Vec3] | list[None]
@@ -172,17 +111,18 @@ def march_segment(
     each = jax.vmap(composited)
     # unrolled, so that nothing between two cells is put in memory
     after, _ = jax.lax.scan(lambda at, cell: (each(ray, at, cell), None), at, cells, unroll=tiling.cells)
-    steps = jnp.broadcast_to(jnp.asarray(samples.ahead.steps(taken), at.index.dtype), at.index.shape)
+    steps = jnp.broadcast_to(jnp.asarray(taken, at.index.dtype), at.index.shape)
+    steps = steps if at.stride is None else steps * at.stride
     return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples
 
 
-def _sampled(pipeline: Pipeline, ahead: Ahead, ray: Ray, at: Progress) -> Samples:
-    """The samples of these cells ahead of each ray."""
+def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples:
+    """The samples of so many cells ahead of each ray."""
     march, classification = pipeline.march, pipeline.classification
 
     def pieces_of(at: Progress) -> tuple[Cell, ...]:
-        rays = jax.vmap(partial(pieces_ahead, pipeline), in_axes=(0, 0, ahead.axis_of_rays))
-        return jax.vmap(rays, in_axes=(None, None, 0))(ray, at, ahead)
+        rays = jax.vmap(partial(pieces_ahead, pipeline), in_axes=(0, 0, None))
+        return jax.vmap(rays, in_axes=(None, None, 0))(ray, at, jnp.arange(number, dtype=at.index.dtype))
 
     cut = pieces_of(at)
     divided = len(cut) > 1
@@ -204,16 +144,16 @@ def _sampled(pipeline: Pipeline, ahead: Ahead, ray: Ray, at: Progress) -> Sample
         each = vmap_cells(partial(opacity, pipeline), (False, True, True))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
-    live = _live(at)
+    live = always(at)
     if march.integrates:
         values = _measured_over(pipeline, ray, live, partial(cells, at, given))
     else:
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
-    return Samples(ahead, list(cells(at, given)), values, alphas)
+    return Samples(list(cells(at, given)), values, alphas)
 
 
-def _live(at: Progress) -> Bool[Array, ""]:
+def always(at: Progress) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
     # In a pass there are at most some `march.most_samples` / cells segments, in each of which an index grows
     # by at most cells * `longest_stride`, finished or not: with 2**24 samples and strides of 64 it stays
@@ -238,7 +178,7 @@ def _colors(pipeline: Pipeline, at: Progress, measured: list[Measured]) -> list[
         return [classify(each)[0] for each in measured]
 
     # Means would be computed again for each use if they were fused into the compositing of each cell.
-    return in_memory(_live(at), all_, measured) if pipeline.march.integrates else all_(measured)
+    return in_memory(always(at), all_, measured) if pipeline.march.integrates else all_(measured)
 
 
 def _measured_over(
@@ -272,17 +212,21 @@ def _measured_over(
     return [classification.spanned(*each) for each in zip(beside, fronts, backs, strict=True)]
 
 
-def pieces_ahead(pipeline: Pipeline, ray: Ray, at: Progress, ahead: Ahead) -> tuple[Cell, ...]:
+def pieces_ahead(pipeline: Pipeline, ray: Ray, at: Progress, number: Int[Array, ""]) -> tuple[Cell, ...]:
     """The pieces of one of the next cells of a ray."""
-    depth = front(pipeline.march, at, ahead.begin)
-    return pieces(pipeline, ray, depth, 1 if ahead.stride is None else ahead.stride)
+    stride = 1 if at.stride is None else at.stride
+    return pieces(pipeline, ray, front(pipeline.march, at, number * stride), stride)
 
 
 def _taken(march: March, at: Progress, samples: Samples) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
     """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
     shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
-    left = samples.ahead.before(march.most_samples - at.index)
+    left = march.most_samples - at.index
     number = jnp.arange(samples.number, dtype=at.index.dtype)
+    if at.stride is not None:
+        run = RUN * at.stride
+        steps = jnp.minimum(left, run - (at.index & (run - 1)))
+        left = jnp.sum(begins(at, samples.number) < steps[None], axis=0, dtype=left.dtype)
     transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=0)
     cells = number.size
     # a minimum, since XLA computes argmax by comparing pairs
@@ -298,6 +242,5 @@ def _without(samples: Samples, taken: Int[Array, " rays"], ray: Ray) -> Samples:
         eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
         for cell in samples.cells
     ]
-    return Samples(
-        samples.ahead, cells, samples.measured, [jnp.where(takes, alpha, 0) for alpha in samples.opacity]
-    )
+    opacity = [jnp.where(takes, alpha, 0) for alpha in samples.opacity]
+    return Samples(cells, samples.measured, opacity)

@@ -23,7 +23,18 @@ from .._util.compaction import in_front
 from .._util.sharding import varying
 from ..compositing import Outputs, Weighting
 from ..march import EmptySpaceIndex
-from ..reference import Pipeline, Progress, begin, front, is_sample, measure, move, opacity, pieces
+from ..reference import (
+    Pipeline,
+    Progress,
+    begin,
+    front,
+    is_sample,
+    measure,
+    move,
+    opacity,
+    pieces,
+    with_stride,
+)
 from ..space import Ray
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
 from .rays import vmap_rays
@@ -56,7 +67,7 @@ def march_rays(
         alive = job.alive(at)
         job = job._replace(any_order=_mostly(alive & ~regular_from_here(at), of=alive))
     if beams.range is not None:
-        over = vmap_rays(partial(over_transparent, march))
+        over = vmap_rays(partial(over_transparent, pipeline))
         # Rays that see nothing are finished first, and so stay where they are: their `first` is no index.
         at = over(rays, finished_after(beams.range, at), beams.range.first)
     visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
@@ -103,7 +114,8 @@ def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     march = pipeline.march
 
     def one(ray: Ray, at: Progress) -> Progress:
-        stride = march.stride(ray, at.index)
+        at, _ = with_stride(pipeline, ray, at)
+        stride = 1 if at.stride is None else at.stride
         cut = pieces(pipeline, ray, front(march, at), stride)
         alphas = [opacity(pipeline, ray, piece, measure(pipeline, ray, piece)) for piece in cut]
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished

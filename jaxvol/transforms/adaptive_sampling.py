@@ -1,19 +1,20 @@
 """How many steps long may a cell be? As many as the scene lets it be, for a tolerated error of the image."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float, Int8
 
 from .._util.checks import integer, number
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import gather, in_memory
-from ..march import March, Transform
+from ..march import RUN, March, Run, Transform
 from ..occupancy import BLOCK
 from ..space import Ray, Space
-from ..variation import Variation, Windows
+from ..variation import MARGIN, Variation, Windows
 
 
 SHARE = 1 / 20
@@ -69,56 +70,86 @@ class AdaptiveSampling(Transform):
 
     tolerance: Float[Array, ""]
     longest: int = eqx.field(static=True)
-    strides: UInt8[Array, "bx by bz"] | None
-    """By block, the most steps of a cell; None before the scene is known."""
+    finest: int = eqx.field(static=True)
+    errors: Int8[Array, "levels bx by bz"] | None
+    """By stride and block, the predicted error as `_coded`; None before the scene is known."""
 
-    def __init__(self, tolerance: Any, longest: int | Any = 8):
+    def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
         self.tolerance = number("tolerance", tolerance, above=0)
-        self.longest = integer("longest", longest, 1, 64)
-        if self.longest & (self.longest - 1):
-            raise ValueError(f"longest must be a power of two; got {longest!r}.")
-        self.strides = None
+        self.longest = _power_of_two("longest", longest)
+        self.finest = _power_of_two("finest", finest)
+        if self.longest * self.finest > 64:
+            raise ValueError(f"longest * finest must be at most 64; got {longest!r} * {finest!r}.")
+        self.errors = None
 
     @property
     def longest_stride(self) -> int:
-        return self.longest
+        return self.longest * self.finest
+
+    @property
+    def subdivision(self) -> int:
+        return self.finest
 
     def prepared(
         self, march: March, space: Space, windows: Windows, variation: Variation
     ) -> "AdaptiveSampling":
         # In a branch of its own, so that it is rounded alike in every program: an error that nearly equals
         # the tolerance must not make different cells where an image is made in `jax.jit`, or differentiated.
-        strides = in_memory(march.step > 0, _strides, self, march, space, windows, variation)
-        return eqx.tree_at(lambda of: of.strides, self, strides, is_leaf=lambda leaf: leaf is None)
+        predict = partial(_errors, self.longest_stride)
+        errors = in_memory(march.step > 0, predict, march, space, windows, variation)
+        return eqx.tree_at(lambda of: of.errors, self, errors, is_leaf=lambda leaf: leaf is None)
 
-    def stride(self, ray: Ray, depth: Scalar, step: Scalar) -> Int[Array, ""]:
-        # the window around the middle of the stretch holds all of it
-        return self._at(ray.path(depth + self.longest / 2 * step))
+    def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
+        # the windows around the middle hold all of the run
+        code = self._at(ray.path(run.middle), run.stride.bit_length() - 1)
+        return _decoded(code, ray.length.dtype), self.tolerance.astype(ray.length.dtype)
 
-    def _at(self, coordinate: Vec3) -> Int[Array, ""]:
-        """The most steps of a cell in the block of a grid coordinate."""
-        assert self.strides is not None
-        _, ny, nz = shape = self.strides.shape
+    def _at(self, coordinate: Vec3, level: int) -> Int8[Array, ""]:
+        """The coded error of a stride in the block of a grid coordinate."""
+        assert self.errors is not None
+        _, nx, ny, nz = self.errors.shape
         i, j, k = (
             jnp.clip(jnp.floor(c / BLOCK), 0, n - 1).astype(jnp.int32)
-            for c, n in zip(coordinate, shape, strict=True)
+            for c, n in zip(coordinate, (nx, ny, nz), strict=True)
         )
-        return gather(self.strides.reshape(-1), (i * ny + j) * nz + k).astype(jnp.int32)
+        return gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
 
 
-def _strides(
-    sampling: AdaptiveSampling, march: March, space: Space, windows: Windows, variation: Variation
-) -> UInt8[Array, "bx by bz"]:
-    """By block, the most steps of a cell whose error is tolerated."""
+def _power_of_two(name: str, given: int | Any) -> int:
+    found = integer(name, given, 1, 64)
+    if found & (found - 1):
+        raise ValueError(f"{name} must be a power of two; got {given!r}.")
+    return found
+
+
+UNKNOWN = 127
+"""The code of an infinite error."""
+
+
+def _coded(error: Float[Array, "*blocks"]) -> Int8[Array, "*blocks"]:
+    """An error as a small integer, rounded up to a multiple of 2^(1/8), between 2⁻²⁴ and 2⁷·⁷⁵."""
+    code = jnp.ceil(8 * (jnp.log2(error) + 8))
+    # not below: a NaN is unknown, too
+    return jnp.where(code < UNKNOWN, jnp.maximum(code, -128), UNKNOWN).astype(jnp.int8)
+
+
+def _decoded(code: Int8[Array, ""], dtype: Any) -> Scalar:
+    """The error of a code."""
+    return jnp.where(code == UNKNOWN, jnp.inf, jnp.exp2(code.astype(dtype) / 8 - 8))
+
+
+def _errors(
+    longest: int, march: March, space: Space, windows: Windows, variation: Variation
+) -> Int8[Array, "levels bx by bz"]:
+    """By stride and block, the coded error of a run with its middle there."""
     dtype = march.step.dtype
     windows, variation = jax.tree.map(lambda leaf: leaf.astype(dtype), (windows, variation))
     distance = _node_distance(space, windows.low.shape).astype(dtype)
     spread, length = windows.high - windows.low, BLOCK * distance
-    strides = jnp.ones(windows.low.shape, jnp.uint8)
-    for stride in (2**k for k in range(1, sampling.longest.bit_length())):
+    levels = []
+    for stride in (2**k for k in range(longest.bit_length())):
         width = stride * march.step
         bent = windows.bend * (width / distance) ** 2 / 8
-        # where the bend is NaN, so is the error, and no cell fits
         error = length * variation.total * jnp.where(bent >= spread, 1, bent / spread)
         if not march.integrates:
             sampled = width * variation.total / 2
@@ -126,23 +157,23 @@ def _strides(
                 turned = variation.turns * (spread / length) * width**2 / 24
                 sampled = jnp.minimum(turned, sampled)
             error = error + sampled
-        fits = (SHARE * error <= sampling.tolerance) & (strides == stride // 2)
-        strides = jnp.where(fits, stride, strides).astype(jnp.uint8)
-    # a window holds a stretch as long as a block, and each block around it two more
-    reach = jnp.max(sampling.longest * march.step / length)
-    rounds = jnp.ceil((reach - 1) / 2)
-    strides = jax.lax.fori_loop(0, jnp.clip(rounds, 0, FARTHEST).astype(jnp.int32), _eroded, strides)
-    return jnp.where(rounds <= FARTHEST, strides, 1).astype(jnp.uint8)
+        # a window exceeds its block by half of one, and each block around it by one more
+        reach = jnp.max(RUN * width / 2 / length)
+        rounds = jnp.maximum(jnp.ceil(reach - MARGIN / BLOCK), 0)
+        code = _coded(SHARE * error)
+        code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
+        levels.append(jnp.where(rounds <= FARTHEST, code, UNKNOWN).astype(jnp.int8))
+    return jnp.stack(levels)
 
 
-def _eroded(_: Any, strides: UInt8[Array, "bx by bz"]) -> UInt8[Array, "bx by bz"]:
-    """The least of each block and all around it."""
+def _dilated(_: Any, codes: Int8[Array, "bx by bz"]) -> Int8[Array, "bx by bz"]:
+    """The largest of each block and all around it."""
     for axis in range(3):
         ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
-        padded, n = jnp.pad(strides, ends, mode="edge"), strides.shape[axis]
+        padded, n = jnp.pad(codes, ends, mode="edge"), codes.shape[axis]
         for first in (0, 2):
-            strides = jnp.minimum(strides, jax.lax.slice_in_dim(padded, first, first + n, axis=axis))
-    return strides
+            codes = jnp.maximum(codes, jax.lax.slice_in_dim(padded, first, first + n, axis=axis))
+    return codes
 
 
 def _node_distance(space: Space, shape: tuple[int, ...]) -> Float[Array, "bx by bz"]:
