@@ -50,7 +50,7 @@ class Cell(eqx.Module):
     cut: Bool[Array, ""]
 
 
-RUN = 8
+RUN = 4
 """Cells in a row that are equally long. Where strides are not all 1, the cells of a ray come in such runs."""
 
 

@@ -84,11 +84,12 @@ def march_segment(
     """Marches rays by a segment, or to where they are finished, shifted off the cells that were sampled, or
     at the end of a run. `regular`: no ray has a shift ahead of it."""
     march, classification = pipeline.march, pipeline.classification
-    samples = _sampled(pipeline, tiling.cells, ray, at)
+    number = tiling.cells if at.stride is None else min(tiling.cells, RUN)
+    samples = _sampled(pipeline, number, ray, at)
     taken: Int[Array, " rays"] | int
-    taken, shifted = tiling.cells, None
+    taken, shifted = number, None
     # without shifts, runs begin with segments, and end with them
-    if not regular or (at.stride is not None and (march.may_shift or RUN % tiling.cells > 0)):
+    if not regular or (at.stride is not None and (march.may_shift or RUN % number > 0)):
         taken, shifted = _taken(march, at, samples)
         samples = _without(samples, taken, ray)
     colors: list[Vec3] | list[None]
@@ -110,7 +111,7 @@ def march_segment(
 
     each = jax.vmap(composited)
     # unrolled, so that nothing between two cells is put in memory
-    after, _ = jax.lax.scan(lambda at, cell: (each(ray, at, cell), None), at, cells, unroll=tiling.cells)
+    after, _ = jax.lax.scan(lambda at, cell: (each(ray, at, cell), None), at, cells, unroll=number)
     steps = jnp.broadcast_to(jnp.asarray(taken, at.index.dtype), at.index.shape)
     steps = steps if at.stride is None else steps * at.stride
     return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples

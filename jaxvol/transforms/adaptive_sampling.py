@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int8
+from jaxtyping import Array, Float, Int32
 
 from .._util.checks import integer, number
 from .._util.vec3 import Scalar, Vec3
@@ -71,7 +71,7 @@ class AdaptiveSampling(Transform):
     tolerance: Float[Array, ""]
     longest: int = eqx.field(static=True)
     finest: int = eqx.field(static=True)
-    errors: Int8[Array, "levels bx by bz"] | None
+    errors: Int32[Array, "levels bx by bz"] | None
     """By stride and block, the predicted error as `_coded`; None before the scene is known."""
 
     def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
@@ -104,7 +104,7 @@ class AdaptiveSampling(Transform):
         code = self._at(ray.path(run.middle), run.stride.bit_length() - 1)
         return _decoded(code, ray.length.dtype), self.tolerance.astype(ray.length.dtype)
 
-    def _at(self, coordinate: Vec3, level: int) -> Int8[Array, ""]:
+    def _at(self, coordinate: Vec3, level: int) -> Int32[Array, ""]:
         """The coded error of a stride in the block of a grid coordinate."""
         assert self.errors is not None
         _, nx, ny, nz = self.errors.shape
@@ -122,25 +122,20 @@ def _power_of_two(name: str, given: int | Any) -> int:
     return found
 
 
-UNKNOWN = 127
-"""The code of an infinite error."""
+def _coded(error: Float[Array, "*blocks"]) -> Int32[Array, "*blocks"]:
+    """An error as the bits of a float32, which are in the same order. NaN is infinite."""
+    known = jnp.where(error >= 0, error, jnp.inf).astype(jnp.float32)
+    return jax.lax.bitcast_convert_type(known, jnp.int32)
 
 
-def _coded(error: Float[Array, "*blocks"]) -> Int8[Array, "*blocks"]:
-    """An error as a small integer, rounded up to a multiple of 2^(1/8), between 2⁻²⁴ and 2⁷·⁷⁵."""
-    code = jnp.ceil(8 * (jnp.log2(error) + 8))
-    # not below: a NaN is unknown, too
-    return jnp.where(code < UNKNOWN, jnp.maximum(code, -128), UNKNOWN).astype(jnp.int8)
-
-
-def _decoded(code: Int8[Array, ""], dtype: Any) -> Scalar:
+def _decoded(code: Int32[Array, ""], dtype: Any) -> Scalar:
     """The error of a code."""
-    return jnp.where(code == UNKNOWN, jnp.inf, jnp.exp2(code.astype(dtype) / 8 - 8))
+    return jax.lax.bitcast_convert_type(code, jnp.float32).astype(dtype)
 
 
 def _errors(
     longest: int, march: March, space: Space, windows: Windows, variation: Variation
-) -> Int8[Array, "levels bx by bz"]:
+) -> Int32[Array, "levels bx by bz"]:
     """By stride and block, the coded error of a run with its middle there."""
     dtype = march.step.dtype
     windows, variation = jax.tree.map(lambda leaf: leaf.astype(dtype), (windows, variation))
@@ -162,11 +157,11 @@ def _errors(
         rounds = jnp.maximum(jnp.ceil(reach - MARGIN / BLOCK), 0)
         code = _coded(SHARE * error)
         code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
-        levels.append(jnp.where(rounds <= FARTHEST, code, UNKNOWN).astype(jnp.int8))
+        levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
     return jnp.stack(levels)
 
 
-def _dilated(_: Any, codes: Int8[Array, "bx by bz"]) -> Int8[Array, "bx by bz"]:
+def _dilated(_: Any, codes: Int32[Array, "bx by bz"]) -> Int32[Array, "bx by bz"]:
     """The largest of each block and all around it."""
     for axis in range(3):
         ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
