@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, require
-from ._util.fetching import Fetch, OneByOne, fetched, split
 from ._util.vec3 import Scalar, Vec3
+from ._util.voxel_fetch import Fetch, OneByOne, fetched, split
 from ._util.voxels import label_array, voxel_array
 
 

@@ -435,7 +435,7 @@ MUTATIONS = [
     # fetching, transfer functions, lighting, path tracing
     Mutation(
         "packing: sign of int16 and int8 lost",
-        "_util/fetching.py",
+        "_util/voxel_fetch.py",
         "if signed:  #",
         "if not signed:  #",
         (PACKED,),
@@ -586,7 +586,7 @@ MUTATIONS = [
     ),
     Mutation(
         "replay: one of the eight voxels of a sample gets no gradient",
-        "_util/fetching.py",
+        "_util/voxel_fetch.py",
         "for place, part in zip(indices, parts, strict=True):",
         "for place, part in list(zip(indices, parts, strict=True))[1:]:",
         (DIFFERENCES,),

@@ -26,9 +26,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt32
 
-from .._util.fetching import Recording, scatter_add
 from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3, along
+from .._util.voxel_fetch import Recording, scatter_add
 from ..compositing import Weighting
 from ..march import March
 from ..reference import Pipeline, Progress, contained, measure

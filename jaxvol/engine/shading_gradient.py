@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.fetching import scatter_add
 from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3
+from .._util.voxel_fetch import scatter_add
 from ..lighting.shading import Shading, Surroundings, lit
 from ..reference import Pipeline
 from ..space import Ray

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.fetching import Recording
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
+from .._util.voxel_fetch import Recording
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
