@@ -333,8 +333,8 @@ class TransferFunction(Transfer):
         _, pull = jax.vjp(means, a, b, front[0], back[0])
         of_a, of_b, of_front, of_back = pull((color, extinction))
         sums = jnp.zeros(rows.shape, extinction.dtype)
-        for place, part in ((i, of_a), (j, of_b)):
-            sums = sums.at[place].add(jnp.stack(part, axis=-1), mode="promise_in_bounds")
+        for index, part in ((i, of_a), (j, of_b)):
+            sums = sums.at[index].add(jnp.stack(part, axis=-1), mode="promise_in_bounds")
         (transfer,) = pull_rows(sums)
         return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
 

@@ -45,10 +45,10 @@ class Packed(Fetch):
         bits = 8 * data.dtype.itemsize
         signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
 
-        def voxel(word: Int[Array, ""], place: int) -> Scalar:
+        def voxel(word: Int[Array, ""], number: int) -> Scalar:
             if signed:  # shifting down from the top bits extends the sign
-                return (word << (32 - bits * (place + 1)) >> (32 - bits)).astype(dtype)
-            return (word >> (bits * place) & (2**bits - 1)).astype(dtype)
+                return (word << (32 - bits * (number + 1)) >> (32 - bits)).astype(dtype)
+            return (word >> (bits * number) & (2**bits - 1)).astype(dtype)
 
         def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
             if bits == 8:
@@ -90,8 +90,8 @@ def scatter_add(
     voxels: Float[Array, " voxels"], indices: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
 ) -> Float[Array, " voxels"]:
     """Add the cotangents `parts` of fetches to the voxels `indices` that they read."""
-    for place, part in zip(indices, parts, strict=True):
-        voxels = voxels.at[place].add(
+    for index, part in zip(indices, parts, strict=True):
+        voxels = voxels.at[index].add(
             part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
         )
     return voxels

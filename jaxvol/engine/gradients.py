@@ -70,7 +70,7 @@ class _Image(NamedTuple):
     """What the tiles of an image share.
 
     - `pipeline`: without lighting, since samples are shaded by `light`.
-    - `places`: whether volume, camera, rays or march have a gradient.
+    - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """
 
     scene: Scene
@@ -81,7 +81,7 @@ class _Image(NamedTuple):
     fault: Bool[Array, ""]
     tiles: RayTiles
     tiling: Tiling
-    places: bool
+    geometric: bool
 
     def pull_tile(
         self,
@@ -103,11 +103,11 @@ class _Image(NamedTuple):
         replay = Replay(
             *(self.pipeline, self.scene, self.words, rays, Cotangents.of(rays, rendering, cotangent)),
             *(sums.total, self.light, self.tiling),
-            places=self.places,
+            geometric=self.geometric,
         )
         beams = Beams(rays, self.tiles.beams, self.tiles.box(source, rays, number), range_)
         _, (_, of_rays, total) = march_rays(self.pipeline, self.empty_space, beams, self.tiling, None, replay)
-        if not self.places:
+        if not self.geometric:
             return _Sums(total, sums.source)
         if cotangent.details.depth is not None:
             # depth is measured from the ray's origin, and a sample's from the entry
@@ -131,7 +131,7 @@ def _vjp_by_tiles(
     """The cotangents of a scene's parts, tile by tile."""
     volume, transfer, source, march, _, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed.volume.data
-    places = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
+    geometric = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
     packed, tiling = acceleration.packed(scene), options.tiling
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
@@ -141,7 +141,7 @@ def _vjp_by_tiles(
     if lighting is not None:
         light, pull_light = _light(scene, packed.volume, voxels=of_voxels)
     image = _Image(
-        *(scene, pipeline, acceleration.words, index, light, fault_of(scene), tiles, tiling, places)
+        *(scene, pipeline, acceleration.words, index, light, fault_of(scene), tiles, tiling, geometric)
     )
     sums = _Sums(
         Total.zeros(volume, transfer, march, light, voxels=of_voxels),

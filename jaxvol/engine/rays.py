@@ -39,13 +39,13 @@ class OwnRays(eqx.Module):
     pixels: Int[Array, "*rays 2"] | None = None
     first: Int[Array, ""] | int = 0
 
-    def pixel(self, place: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
+    def pixel(self, index: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
         """The pixels of the rays at these indices."""
         if self.pixels is None:
-            place = place.astype(jnp.int32)  # from 64 bits under x64
-            return self.first + place, jnp.zeros_like(place)
+            index = index.astype(jnp.int32)  # from 64 bits under x64
+            return self.first + index, jnp.zeros_like(index)
         flat = self.pixels.reshape(-1, 2)
-        return flat[place, 0], flat[place, 1]
+        return flat[index, 0], flat[index, 1]
 
 
 class RayTiles(eqx.Module):
@@ -112,7 +112,7 @@ class _PixelTiles(RayTiles):
         return lambda occupancy: Box.within(occupancy, *vmap_rays(source.ray)(column, row))
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
-        """Columns and rows of these places in each of a tile's beams."""
+        """Columns and rows of the pixels (x, y) of each of a tile's beams."""
         beam, side = (tile * self.beams + jnp.arange(self.beams))[:, None], self.tiling.beam
         return (beam % self.across) * side + x[None], (beam // self.across) * side + y[None]
 
@@ -149,11 +149,11 @@ class _OwnRayTiles(RayTiles):
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
             source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
-        place = tile * self._rays_per_tile + jnp.arange(self._rays_per_tile).reshape(-1, self.tiling.group)
-        known = jnp.minimum(place, max(count - 1, 0))
+        number = tile * self._rays_per_tile + jnp.arange(self._rays_per_tile).reshape(-1, self.tiling.group)
+        known = jnp.minimum(number, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
-        return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), place < count)
+        return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), number < count)
 
     def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beams, -1), rays)
@@ -172,9 +172,9 @@ class _OwnRayTiles(RayTiles):
         return padded.reshape(self.number, groups, self.tiling.group, *rest)
 
 
-def _own_line(source: OwnRays, place: Int[Array, ""]) -> Line:
-    (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[place] for rays in (source.origins, source.directions))
-    return Line((x, y, z), (dx, dy, dz), source.pixel(place))
+def _own_line(source: OwnRays, index: Int[Array, ""]) -> Line:
+    (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[index] for rays in (source.origins, source.directions))
+    return Line((x, y, z), (dx, dy, dz), source.pixel(index))
 
 
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
@@ -182,11 +182,11 @@ def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Li
     return Line(*source.ray(column, row), (column + left, row + top))
 
 
-def lines_at(source: Camera | OwnRays, places: Int[Array, " rays"]) -> Line:
+def lines_at(source: Camera | OwnRays, indices: Int[Array, " rays"]) -> Line:
     """The rays of indices into the flattened image, as the march rounds them."""
     if not isinstance(source, Camera):
-        return jax.vmap(partial(_own_line, source))(places)
-    rows, columns = jnp.divmod(places, source.size[0])
+        return jax.vmap(partial(_own_line, source))(indices)
+    rows, columns = jnp.divmod(indices, source.size[0])
     return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None]))
 
 

@@ -105,14 +105,14 @@ class Replay(SampleVisitor):
     - `given`: cotangents of the rays.
     - `total`: to be added to.
     - `light`: what shades the samples.
-    - `places`: whether volume, camera, rays or march have a gradient.
+    - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """
 
     volume: Volume
     words: UInt32[Array, " voxels"] | None
     transfer: Transfer
     pipeline: Pipeline
-    places: bool
+    geometric: bool
     light: Lit | None
     tiling: Tiling
     given: Cotangents
@@ -131,13 +131,13 @@ class Replay(SampleVisitor):
         light: Lit | None,
         tiling: Tiling,
         *,
-        places: bool,
+        geometric: bool,
     ):
         self.volume, self.words, self.transfer = scene.volume, words, scene.transfer
-        self.pipeline, self.places, self.light = pipeline, places, light
+        self.pipeline, self.geometric, self.light = pipeline, geometric, light
         self.given, self.total, self.tiling = given, total, tiling
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
-        self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if places else None
+        self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if geometric else None
 
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, carry: Scalar, total: Total
@@ -176,19 +176,19 @@ class Replay(SampleVisitor):
             of_transfer, of_read = pull(measured, of_color[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
             of_measured.append(of_read if lit is None else added(of_read, lit[i].of_measured))
-        if not self.places:
+        if not self.geometric:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
-        of_march, of_volume, of_rays, indices, of_voxels = self._placed(
+        of_march, of_volume, of_rays, indices, of_voxels = self._geometric_vjp(
             ray, at, samples.ahead, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
         voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return carry, of_rays, Total(total.transfer, march, volume, voxels, total.light)
 
-    def _placed(
+    def _geometric_vjp(
         self, ray: Ray, at: Progress, ahead: Ahead, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
     ) -> tuple[PyTree, PyTree, PyTree, list[Array], list[Array]]:
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
@@ -209,9 +209,9 @@ class Replay(SampleVisitor):
             ahead: Ahead,
         ) -> tuple[list[Any], list[Array]]:
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
-            placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
+            whole = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
             record = Recording(perturbations or [], [])
-            here = with_fetch(placed, record) if voxels else with_words(placed, self.words)
+            here = with_fetch(whole, record) if voxels else with_words(whole, self.words)
             found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
@@ -238,7 +238,7 @@ class Replay(SampleVisitor):
                     ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
                     " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
-            perturbations = [jnp.zeros(place.shape, self.volume.data.dtype) for place in indices]
+            perturbations = [jnp.zeros(index.shape, self.volume.data.dtype) for index in indices]
         _, pull, indices = jax.vjp(all_, march, volume, ray_floats, perturbations, has_aux=True)
         of_march, of_volume, of_ray, of_perturbations = pull(cotangents)
         return of_march, of_volume, of_ray, indices, of_perturbations

@@ -68,10 +68,10 @@ def shading_vjp(
     moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
 
     def one(
-        places: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
+        indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
     ) -> tuple[ShadingVjp, LightTotal]:
         found, total = carry
-        some = samples_of(chosen, places, pipeline, ray, samples.cells, samples.measured, weights)
+        some = samples_of(chosen, indices, pipeline, ray, samples.cells, samples.measured, weights)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
         def colors(moving: PyTree, moving_sample: PyTree, perturbations: Any) -> tuple[Vec3, Any]:
@@ -84,16 +84,16 @@ def shading_vjp(
 
         perturbations = None
         if total.voxels is not None:
-            _, indices = jax.eval_shape(lambda: colors(moving, moving_sample, []))
-            perturbations = [jnp.zeros(each.shape, around.volume.data.dtype) for each in indices]
-        color, pull, indices = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
-        real = places < size
-        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, places))
+            _, fetches = jax.eval_shape(lambda: colors(moving, moving_sample, []))
+            perturbations = [jnp.zeros(each.shape, around.volume.data.dtype) for each in fetches]
+        color, pull, fetches = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
+        real = indices < size
+        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
         (of_light, of_transfer), of_sample, of_perturbations = pull(cotangent)
-        voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_perturbations)
+        voxels = None if total.voxels is None else scatter_add(total.voxels, fetches, of_perturbations)
         total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
-        return chosen.put(found, places, part), total
+        return chosen.put(found, indices, part), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))

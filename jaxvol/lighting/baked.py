@@ -77,9 +77,9 @@ class BakedShading(Shading):
             weight = jnp.ones_like(x)
             for side, fraction in zip(corner, fractions, strict=True):
                 weight = weight * (fraction if side else 1 - fraction)
-            place = ((i + corner[0]) * ny + j + corner[1]) * nz + k + corner[2]
+            index = ((i + corner[0]) * ny + j + corner[1]) * nz + k + corner[2]
             # int32, since signed integers are converted to float in one instruction
-            word = gather(self.light.words, place).astype(jnp.int32)
+            word = gather(self.light.words, index).astype(jnp.int32)
             r, g, b = (
                 total + weight * (word >> shift & LEVELS).astype(x.dtype)
                 for total, shift in zip((r, g, b), (0, 10, 20), strict=True)
@@ -112,10 +112,10 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     classification = around.transfer.classification(around.volume)
 
     def node(number: Int[Array, ""]) -> Sample:
-        places = jnp.unravel_index(number, (nx, ny, nz))
+        indices = jnp.unravel_index(number, (nx, ny, nz))
         x, y, z = (
             i.astype(around.volume.spacing.dtype) * ((n - 1) / (m - 1))
-            for i, n, m in zip(places, around.volume.shape, (nx, ny, nz), strict=True)
+            for i, n, m in zip(indices, around.volume.shape, (nx, ny, nz), strict=True)
         )
         measured = classification.at((x, y, z))
         color, extinction = classification.classify(measured)
@@ -137,8 +137,8 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     chosen = Chosen.of([visible.reshape(1, -1)])
     zeros = jnp.zeros(count, around.volume.spacing.dtype)
 
-    def chunk(places: Int[Array, " chunk"], channels: Vec3) -> Vec3:
-        return chosen.put(channels, places, jax.vmap(ratio)(jnp.minimum(places, count - 1)))
+    def chunk(indices: Int[Array, " chunk"], channels: Vec3) -> Vec3:
+        return chosen.put(channels, indices, jax.vmap(ratio)(jnp.minimum(indices, count - 1)))
 
     ratios = jnp.stack(chosen.fold(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
     ratios = _dilate(ratios, visible.reshape(nx, ny, nz))

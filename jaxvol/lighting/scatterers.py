@@ -339,25 +339,25 @@ class TemplateShading(Shading):
         if self.cutoff is not None:
             unblended = intensity * (self.how.templates if self.how.blend else 1)
             intensity = jnp.where(sample.transmittance * unblended < self.cutoff, 0, intensity)
-        place = around.at(_beside(sample, offset))
-        place_shares = self._shares(around, place.coordinate, place.value)
-        place_shares = tuple(place.inside * share for share in place_shares)
-        optics, scale = _blend(self.optics, place_shares, notes.optics), intensity
+        at_photon = around.at(_beside(sample, offset))
+        shares = self._shares(around, at_photon.coordinate, at_photon.value)
+        shares = tuple(at_photon.inside * share for share in shares)
+        optics, scale = _blend(self.optics, shares, notes.optics), intensity
         if len(self.how.materials) > 1:
             # refraction into another material stretches the template by the ratio of the speeds of light
             speed_ratio = notes.optics.refractive_index / optics.refractive_index
             x, y, z = offset
             offset = x * speed_ratio, y * speed_ratio, z * speed_ratio
-            place = around.at(_beside(sample, offset))
+            at_photon = around.at(_beside(sample, offset))
             own = notes.optics.opacity
             scale = intensity * jnp.where(own == 0, 0, optics.opacity / jnp.where(own == 0, 1, own))
         if self._soft:  # the opacity of one mean free path there
-            matter = -jnp.expm1(-place.extinction * optics.mean_free_path)
+            matter = -jnp.expm1(-at_photon.extinction * optics.mean_free_path)
         else:
-            matter = step(place.extinction, 0.0)
-        r, g, b = (scale * sum(place_shares) * matter * c for c in place.color)
+            matter = step(at_photon.extinction, 0.0)
+        r, g, b = (scale * sum(shares) * matter * c for c in at_photon.color)
 
-        seen = intensity * self._visible(around, sample, offset, place.extinction)
+        seen = intensity * self._visible(around, sample, offset, at_photon.extinction)
         brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in notes.lights)
         return brightness, (r, g, b)
 
@@ -387,12 +387,12 @@ class TemplateShading(Shading):
     def _visible(self, around: Surroundings, sample: Sample, offset: Vec3, first: Scalar) -> Scalar:
         """Visibility of a photon from the sample; `first` is the extinction at the photon itself."""
         further = [around.extinction(_beside(sample, offset, k)) for k in self.how.reach]
-        places = [first, *further]
+        extinctions = [first, *further]
         if not self._soft:
-            clear = (1 - step(extinction, 0.0) for extinction in places)
+            clear = (1 - step(extinction, 0.0) for extinction in extinctions)
             return functools.reduce(jnp.multiply, clear)
         pieces = np.diff([0.0, 1.0, *self.how.reach])
-        depth = sum(piece * extinction for piece, extinction in zip(pieces, places, strict=True))
+        depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
         return jnp.exp(-depth * _norm(offset))
 
     def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:

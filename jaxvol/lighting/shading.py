@@ -41,7 +41,7 @@ class Sample(NamedTuple):
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
 
 
-class Place(NamedTuple):
+class ClassifiedPoint(NamedTuple):
     """What is at a point of the world.
 
     - `inside`: 1 in the volume, falling to 0 at one voxel outside, so that light does not jump at the
@@ -65,7 +65,7 @@ class Surroundings(eqx.Module):
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
 
-    def at(self, point: Vec3) -> Place:
+    def at(self, point: Vec3) -> ClassifiedPoint:
         """What is at a world point."""
         inside, coordinate, measured = self._measured(point)
 
@@ -73,7 +73,7 @@ class Surroundings(eqx.Module):
             return self.transfer.classification(self.volume).classify(measured)
 
         color, extinction = self._in_memory(found, measured)
-        return Place(inside, coordinate, measured[0], color, inside * extinction)
+        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
 
     def extinction(self, point: Vec3) -> Scalar:
         """The extinction at a world point."""

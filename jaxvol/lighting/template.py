@@ -409,8 +409,8 @@ def _sorted(photons: ScattererTemplate) -> ScattererTemplate:
 
 def _merged(photons: ScattererTemplate, distance: float) -> ScattererTemplate:
     """Add each photon's intensity to the brightest photon within this distance."""
-    place = jax.lax.stop_gradient(photons.offset)
-    near = sum((place[:, None, i] - place[None, :, i]) ** 2 for i in range(3)) <= distance**2
+    offset = jax.lax.stop_gradient(photons.offset)
+    near = sum((offset[:, None, i] - offset[None, :, i]) ** 2 for i in range(3)) <= distance**2
     # Photons are sorted, so argmax finds the brightest: the photon itself if none near is brighter. A host
     # may have a host in turn; doubling follows the chain to its end.
     host = jnp.argmax(near, axis=-1)

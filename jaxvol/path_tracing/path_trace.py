@@ -242,13 +242,13 @@ def _trace(
     count = pixels * how.paths
 
     def wave(number: Int[Array, ""]) -> tuple[Array, ...]:
-        def begin(place: Int[Array, " lanes"]) -> Walk:
-            pixel, path = number * pixels + place // how.paths, place % how.paths
-            alive = valid & (place < count) & (pixel < width * height)
+        def begin(index: Int[Array, " lanes"]) -> Walk:
+            pixel, path = number * pixels + index // how.paths, index % how.paths
+            alive = valid & (index < count) & (pixel < width * height)
             words = (
                 pixel.astype(jnp.uint32),
                 first + path.astype(jnp.uint32),
-                jnp.broadcast_to(seed, place.shape),
+                jnp.broadcast_to(seed, index.shape),
             )
             return jax.vmap(lambda *of_one: _begin(scene, camera, how, *of_one))(words, alive)
 

@@ -123,10 +123,12 @@ class Scene(NamedTuple):
         """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
         return Flight.to(self.majorants, start, direction, self.spacing, end)
 
-    def light(self, place: Vec3, uniform: Scalar) -> Arriving:
+    def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
         """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
         weighted to give that of all of them on average."""
-        x, y, z = (o + c * s for o, c, s in zip(apart(self.volume.origin), place, self.spacing, strict=True))
+        x, y, z = (
+            o + c * s for o, c, s in zip(apart(self.volume.origin), coordinate, self.spacing, strict=True)
+        )
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
         each = [light.at((x, y, z)) for light in self.located]
@@ -164,14 +166,14 @@ def step(scene: Scene, walks: Walk) -> Walk:
     flight, candidate = in_memory(
         live, jax.vmap(lambda flight, draw: fly(scene.majorants, flight, draw)), walks.flight, draw
     )
-    measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.place)
+    measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.coordinate)
     extinction, albedo = in_memory(live, jax.vmap(scene.medium.meet), measured)
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
     scattering = in_memory(
         live,
         jax.vmap(lambda *of_one: _scatter(scene, *of_one)),
         walks,
-        candidate.place,
+        candidate.coordinate,
         albedo,
         turn,
         choose,
@@ -198,9 +200,9 @@ def _advance(
 
 
 def _scatter(
-    scene: Scene, walk: Walk, place: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
+    scene: Scene, walk: Walk, coordinate: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
 ) -> Scattering:
-    """The outcome for a walk if it is scattered at `place`, with `turn` as direction around the z axis."""
+    """The outcome for a walk that is scattered at `coordinate`; `turn`: the direction around the z axis."""
     before_roulette = _times(walk.throughput, albedo)
     throughput = _after_roulette(before_roulette, survive)
     direction = turned(turn, walk.direction)
@@ -208,7 +210,7 @@ def _scatter(
     if not scene.located:
         no = jnp.zeros(survive.shape, bool)
         return Scattering(direction, throughput, walk.unoccluded, no, direction, endless)
-    light = scene.light(place, choose)
+    light = scene.light(coordinate, choose)
     density = phase(_dot(walk.direction, light.toward), scene.anisotropy)
     unoccluded = _scaled(_times(before_roulette, light.irradiance), density)
     to_light = _greatest(unoccluded) > 0
@@ -225,7 +227,7 @@ def _delta_tracking(
     scatters = collides & ~capped
     gathered = _times(walk.throughput, scene.surroundings)
     gathered = _scaled(gathered, (candidate.over & walk.met).astype(share.dtype))
-    next_flight = scene.flight(candidate.place, scattering.toward, scattering.end)
+    next_flight = scene.flight(candidate.coordinate, scattering.toward, scattering.end)
     goes_on = scattering.to_light | (_greatest(scattering.throughput) > 0)
     return Walk(
         walk.words,

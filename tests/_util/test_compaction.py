@@ -15,9 +15,9 @@ def test_the_chosen_ones_are_in_front_and_in_order(shape, share):
     chosen = Chosen.of([jnp.asarray(mask) for mask in masks])
     expected = np.flatnonzero(masks)
     assert chosen.number == len(expected)
-    np.testing.assert_array_equal(chosen.place[: len(expected)], expected)
-    assert chosen.place.size % CHUNK == 0
-    assert np.all(chosen.place[len(expected) :] == masks.size)
+    np.testing.assert_array_equal(chosen.indices[: len(expected)], expected)
+    assert chosen.indices.size % CHUNK == 0
+    assert np.all(chosen.indices[len(expected) :] == masks.size)
 
 
 def test_each_chosen_one_is_taken_once_and_put_where_it_was():

@@ -284,7 +284,7 @@ def test_usual_constraints():
     view = CAMERAS[0]
     volume = jv.Volume(np.ones((2, 2, 2), np.float32))
     free, y = Free.of({"c": view, "v": volume, "b": HEAD, "t": TRUTH, "m": MARCH, "f": 2.0}, None, None)
-    kinds = {p: type(b).__name__ for p, b in zip(free.places, free.bijections, strict=True)}
+    kinds = {p: type(b).__name__ for p, b in zip(free.paths, free.bijections, strict=True)}
     fitted = {p.removeprefix("parameters"): kind for p, kind in kinds.items() if kind != "Fixed"}
     assert fitted == {
         "['c']": "Pose",
