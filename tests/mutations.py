@@ -527,15 +527,15 @@ MUTATIONS = [
     Mutation(
         "light: template brightness ignores a material's absorption",
         "lighting/scatterers.py",
-        "scale = matter * WHITE * notes.optics.reflectance",
+        "scale = matter * WHITE * shared.optics.reflectance",
         "scale = matter * WHITE",
         ("lighting/test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
     ),
     Mutation(
         "light: unlit emission at the soft edge of a material",
         "lighting/scatterers.py",
-        "matter = jnp.minimum(2 * sum(notes.shares), 1)",
-        "matter = sum(notes.shares)",
+        "matter = jnp.minimum(2 * sum(shared.shares), 1)",
+        "matter = sum(shared.shares)",
         ("lighting/test_lighting.py::test_nothing_of_a_material_shines_by_itself[soft]",),
     ),
     Mutation(

@@ -41,7 +41,7 @@ def march_image(
     space, pipeline = pipeline_of(scene, acceleration)
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
-        beams = Beams(rays, tiles.beams, tiles.box(scene.source, rays, tile))
+        beams = Beams(rays, tiles.beam_count, tiles.box(scene.source, rays, tile))
         recorder = VisibleRangeRecorder(rays.length.shape) if record and index is not None else None
         at, (ranges, *_) = march_rays(pipeline, index, beams, tiling, options.outputs, recorder)
         return vmap_rays(partial(end, pipeline))(rays, at), ranges

@@ -51,11 +51,11 @@ class OwnRays(eqx.Module):
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
-    - `number`: of tiles. `beams`: in each tile.
+    - `number`: of tiles. `beam_count`: of beams in each tile.
     """
 
     number: int = eqx.field(static=True)
-    beams: int = eqx.field(static=True)
+    beam_count: int = eqx.field(static=True)
     tiling: Tiling = eqx.field(static=True)
 
     @classmethod
@@ -65,12 +65,12 @@ class RayTiles(eqx.Module):
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // side), -(-height // side)
-            beams = min(most_beams, across * down)
-            return _PixelTiles(-(-across * down // beams), beams, tiling, source.size, across, down)
+            count = min(most_beams, across * down)
+            return _PixelTiles(-(-across * down // count), count, tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
         needed = -(-math.prod(shape) // tiling.rays_per_beam)
-        beams = max(min(most_beams, needed), 1)
-        return _OwnRayTiles(-(-needed // beams), beams, tiling, shape)
+        count = max(min(most_beams, needed), 1)
+        return _OwnRayTiles(-(-needed // count), count, tiling, shape)
 
     @abstractmethod
     def rays(self, source: Any, space: Space, tile: Int[Array, ""]) -> Ray:
@@ -113,7 +113,7 @@ class _PixelTiles(RayTiles):
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of the pixels (x, y) of each of a tile's beams."""
-        beam, side = (tile * self.beams + jnp.arange(self.beams))[:, None], self.tiling.beam
+        beam, side = (tile * self.beam_count + jnp.arange(self.beam_count))[:, None], self.tiling.beam
         return (beam % self.across) * side + x[None], (beam // self.across) * side + y[None]
 
     def assemble(self, leaf: Array) -> Array:
@@ -131,7 +131,7 @@ class _PixelTiles(RayTiles):
         image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
         image = image.reshape(self.down, 2, side, self.across, 2, side, *rest)
         beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, self.tiling.rays_per_beam, *rest)
-        missing = self.number * self.beams - self.across * self.down
+        missing = self.number * self.beam_count - self.across * self.down
         beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (1 + len(rest)))
         return beams.reshape(self.number, -1, self.tiling.group, *rest)
 
@@ -143,7 +143,7 @@ class _OwnRayTiles(RayTiles):
 
     @property
     def _rays_per_tile(self) -> int:
-        return self.beams * self.tiling.rays_per_beam
+        return self.beam_count * self.tiling.rays_per_beam
 
     def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""]) -> Ray:
         count = math.prod(self.shape)
@@ -156,7 +156,7 @@ class _OwnRayTiles(RayTiles):
         return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), number < count)
 
     def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
-        by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beams, -1), rays)
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
         return lambda occupancy: Box.around(occupancy, by_beam)
 
     def assemble(self, leaf: Array) -> Array:

@@ -39,7 +39,7 @@ from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
 from .segment import Ahead, Samples, SampleVisitor, pieces_ahead, vmap_cells
-from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
+from .shading_gradient import Shader, ShadingTotal, ShadingVjp, shading_vjp
 from .tiling import Tiling
 from .visible_samples import Weights, weights_of
 
@@ -75,23 +75,23 @@ class Total(eqx.Module):
     volume: PyTree
     """Of everything in it but the voxels."""
     voxels: Float[Array, " voxels"] | None
-    light: PyTree
-    """Of `Lit.leaves`."""
+    shader: PyTree
+    """Of `Shader.leaves`."""
 
     @classmethod
     def zeros(
-        cls, volume: Volume, transfer: Transfer, march: March, light: Lit | None, *, voxels: bool
+        cls, volume: Volume, transfer: Transfer, march: March, shader: Shader | None, *, voxels: bool
     ) -> "Total":
         """Zeros for these parts."""
-        lit = None if light is None else light.leaves
-        parts = transfer, march, without_voxels(volume), lit
-        transfer, march, volume_, lit = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
+        of_shader = None if shader is None else shader.leaves
+        parts = transfer, march, without_voxels(volume), of_shader
+        transfer, march, volume_, of_shader = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
         sums = None
         if voxels:
             # many small parts are summed, which 16 bits would lose
             dtype = volume.data.dtype
             sums = jnp.zeros(volume.data.size, dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32)
-        return cls(transfer, march, volume_, sums, lit)
+        return cls(transfer, march, volume_, sums, of_shader)
 
 
 class Replay(SampleVisitor):
@@ -104,7 +104,7 @@ class Replay(SampleVisitor):
     - `rays`: that are marched.
     - `given`: cotangents of the rays.
     - `total`: to be added to.
-    - `light`: what shades the samples.
+    - `shader`: what shades the samples.
     - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """
 
@@ -113,7 +113,7 @@ class Replay(SampleVisitor):
     transfer: Transfer
     pipeline: Pipeline
     geometric: bool
-    light: Lit | None
+    shader: Shader | None
     tiling: Tiling
     given: Cotangents
     carry: Scalar
@@ -128,13 +128,13 @@ class Replay(SampleVisitor):
         rays: Ray,
         given: Cotangents,
         total: Total,
-        light: Lit | None,
+        shader: Shader | None,
         tiling: Tiling,
         *,
         geometric: bool,
     ):
         self.volume, self.words, self.transfer = scene.volume, words, scene.transfer
-        self.pipeline, self.geometric, self.light = pipeline, geometric, light
+        self.pipeline, self.geometric, self.shader = pipeline, geometric, shader
         self.given, self.total, self.tiling = given, total, tiling
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
         self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if geometric else None
@@ -149,16 +149,16 @@ class Replay(SampleVisitor):
         depths = [self.pipeline.march.sample(cell) for cell in samples.cells]
         weights = weights_of(self.pipeline, at, samples.opacity)
         of_color = [(weight * red, weight * green, weight * blue) for weight in weights.weight]
-        lit: list[ShadingVjp] | None = None
+        shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
-        if self.light is not None:
-            sums = LightTotal(total.light, total.transfer, total.voxels)
-            lit, sums = shading_vjp(
-                *(self.light, self.pipeline, ray, samples, weights, of_color),
+        if self.shader is not None:
+            sums = ShadingTotal(total.shader, total.transfer, total.voxels)
+            shaded, sums = shading_vjp(
+                *(self.shader, self.pipeline, ray, samples, weights, of_color),
                 *(self.tiling.chunk, sums),
             )
-            total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
-            colors, of_color = [part.color for part in lit], [part.of_color for part in lit]
+            total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.shader)
+            colors, of_color = [part.color for part in shaded], [part.of_color for part in shaded]
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [
@@ -170,23 +170,23 @@ class Replay(SampleVisitor):
 
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
-            of_extinction = slopes[i] * cell.width + (0 if lit is None else lit[i].of_extinction)
+            of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
             transfer = self.transfer
             pull = transfer.pull_integrated if self.pipeline.march.integrates else transfer.pull
             of_transfer, of_read = pull(measured, of_color[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
-            of_measured.append(of_read if lit is None else added(of_read, lit[i].of_measured))
+            of_measured.append(of_read if shaded is None else added(of_read, shaded[i].of_measured))
         if not self.geometric:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
-        of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
+        of_point = [None] * len(depths) if shaded is None else [part.of_point for part in shaded]
         of_march, of_volume, of_rays, indices, of_voxels = self._geometric_vjp(
             ray, at, samples.ahead, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
         voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
-        return carry, of_rays, Total(total.transfer, march, volume, voxels, total.light)
+        return carry, of_rays, Total(total.transfer, march, volume, voxels, total.shader)
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, ahead: Ahead, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
@@ -217,7 +217,7 @@ class Replay(SampleVisitor):
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
             for piece in pieces_ahead(pipeline, ray, at, ahead):
                 depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
-                point = None if self.light is None else along(ray.entry, ray.direction, depth)
+                point = None if self.shader is None else along(ray.entry, ray.direction, depth)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, point))
             return found, record.indices

@@ -13,14 +13,14 @@ from jaxtyping import Array, Float, Int
 from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxel_fetch import scatter_add
-from ..lighting.shading import Shading, Surroundings, lit
+from ..lighting.shading import Shading, Surroundings, shade_sample
 from ..reference import Pipeline
 from ..space import Ray
 from .segment import Samples
 from .visible_samples import Weights, samples_of, visible
 
 
-class Lit(NamedTuple):
+class Shader(NamedTuple):
     """What shades the samples of an image."""
 
     shading: Shading
@@ -32,10 +32,10 @@ class Lit(NamedTuple):
         return self.shading, self.around.space
 
 
-class LightTotal(NamedTuple):
+class ShadingTotal(NamedTuple):
     """Gradients summed over all samples: of what shades them, of the transfer function, and of the voxels."""
 
-    light: PyTree
+    shader: PyTree
     transfer: PyTree
     voxels: Float[Array, " voxels"] | None
 
@@ -52,24 +52,24 @@ class ShadingVjp(NamedTuple):
 
 
 def shading_vjp(
-    light: Lit,
+    shader: Shader,
     pipeline: Pipeline,
     ray: Ray,
     samples: Samples,
     weights: Weights,
     cotangents: list[Vec3],
     chunk: int,
-    total: LightTotal,
-) -> tuple[list[ShadingVjp], LightTotal]:
+    total: ShadingTotal,
+) -> tuple[list[ShadingVjp], ShadingTotal]:
     """Pulls back the shading of a segment's samples, and adds to the total. `cotangents`: of each piece's
     shaded colour."""
-    chosen, around = visible(weights, chunk), light.around
+    chosen, around = visible(weights, chunk), shader.around
     size = sum(weight.size for weight in weights.weight)
-    moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
+    moving, fixed = eqx.partition((shader.leaves, around.transfer), eqx.is_inexact_array)
 
     def one(
-        indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
-    ) -> tuple[ShadingVjp, LightTotal]:
+        indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
+    ) -> tuple[ShadingVjp, ShadingTotal]:
         found, total = carry
         some = samples_of(chosen, indices, pipeline, ray, samples.cells, samples.measured, weights)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
@@ -78,7 +78,7 @@ def shading_vjp(
             (shading, space), transfer = eqx.combine(moving, fixed)
             here = Surroundings(around.volume, transfer, space)
             each = eqx.combine(moving_sample, fixed_sample)
-            return jax.vmap(lambda sample, perturbations: lit(shading, here, sample, perturbations))(
+            return jax.vmap(lambda sample, perturbations: shade_sample(shading, here, sample, perturbations))(
                 each, perturbations
             )
 
@@ -89,9 +89,9 @@ def shading_vjp(
         color, pull, fetches = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
         real = indices < size
         cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
-        (of_light, of_transfer), of_sample, of_perturbations = pull(cotangent)
+        (of_shader, of_transfer), of_sample, of_perturbations = pull(cotangent)
         voxels = None if total.voxels is None else scatter_add(total.voxels, fetches, of_perturbations)
-        total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
+        total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
         return chosen.put(found, indices, part), total
 

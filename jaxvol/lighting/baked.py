@@ -16,7 +16,7 @@ from .._util.memory import require_room
 from .._util.vec3 import Vec3
 from .._util.xla import gather
 from ..volume import Volume, split
-from .shading import Lighting, Sample, Shading, Surroundings, lit
+from .shading import Lighting, Sample, Shading, Surroundings, shade_sample
 
 
 LEVELS = 2**10 - 1
@@ -87,8 +87,8 @@ class BakedShading(Shading):
         red, green, blue = (c * high / LEVELS for c, high in zip((r, g, b), self.light.highest, strict=True))
         return red, green, blue
 
-    def color(self, sample: Sample, notes: Vec3, sums: Any) -> Vec3:
-        r, g, b = (c * ratio for c, ratio in zip(sample.color, notes, strict=True))
+    def color(self, sample: Sample, shared: Vec3, sums: Any) -> Vec3:
+        r, g, b = (c * ratio for c, ratio in zip(sample.color, shared, strict=True))
         return r, g, b
 
 
@@ -128,7 +128,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
         sample = node(number)
         r, g, b = (
             lit_color / jnp.maximum(color, DARKEST)
-            for lit_color, color in zip(lit(shading, around, sample)[0], sample.color, strict=True)
+            for lit_color, color in zip(shade_sample(shading, around, sample)[0], sample.color, strict=True)
         )
         return r, g, b
 

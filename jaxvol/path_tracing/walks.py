@@ -92,7 +92,7 @@ class Walk(eqx.Module):
         )
 
 
-class Scene(NamedTuple):
+class WalkScene(NamedTuple):
     """The scene that walks travel through.
 
     - `max_scatterings`: scatterings that a walk may have.
@@ -151,7 +151,7 @@ class Scattering(NamedTuple):
     end: Scalar
 
 
-def step(scene: Scene, walks: Walk) -> Walk:
+def step(scene: WalkScene, walks: Walk) -> Walk:
     """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome.
 
     XLA recomputes a shared intermediate for each of its uses, unless a branch has put it in memory. So every
@@ -186,7 +186,7 @@ def step(scene: Scene, walks: Walk) -> Walk:
 
 
 def _advance(
-    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
+    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """The walk after a candidate, where `share` is extinction / majorant; or after the end of its flight."""
     advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
@@ -200,7 +200,7 @@ def _advance(
 
 
 def _scatter(
-    scene: Scene, walk: Walk, coordinate: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
+    scene: WalkScene, walk: Walk, coordinate: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
 ) -> Scattering:
     """The outcome for a walk that is scattered at `coordinate`; `turn`: the direction around the z axis."""
     before_roulette = _times(walk.throughput, albedo)
@@ -219,7 +219,7 @@ def _scatter(
 
 
 def _delta_tracking(
-    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
+    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """Advance a walk on its own flight. A collision scatters it; at the end it gathers the constant light."""
     collides = candidate.found & (decide < share)
@@ -246,7 +246,9 @@ def _delta_tracking(
     )
 
 
-def _ratio_tracking(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar) -> Walk:
+def _ratio_tracking(
+    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar
+) -> Walk:
     """Advance a walk on its way to a light. At the end it continues from where it was scattered."""
     transmittance = walk.transmittance * jnp.where(candidate.found, jnp.maximum(1 - share, 0), 1)
     survivor = jnp.where(survive * ROULETTE < transmittance, ROULETTE, 0)
