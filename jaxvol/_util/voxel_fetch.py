@@ -1,5 +1,7 @@
 """Reads the voxels around a coordinate: one by one, from packed words, or recording each fetch."""
 
+import itertools
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import TypeAlias
@@ -110,6 +112,18 @@ def cube_of(
         [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
     ]
     return cube, fraction
+
+
+def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
+    """The eight nodes around a coordinate: the index of each into the flattened array, and its trilinear
+    weight."""
+    (i, j, k), fraction = split(coordinate, shape)
+    _, ny, nz = shape
+    found = []
+    for x, y, z in itertools.product((0, 1), repeat=3):
+        sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
+        found.append((((i + x) * ny + j + y) * nz + k + z, math.prod(sides)))
+    return found
 
 
 def split(

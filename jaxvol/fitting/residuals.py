@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from .._util.checks import Arrayable, described, finite, finite_array
 from .._util.trees import PyTree
-from ..camera import Camera
+from ..camera import Camera, rows_of
 from ..compositing import Compositing, Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march import March
@@ -188,7 +188,7 @@ class ImageResidual(Residual):
             view, first = item
             volume, transfer, camera, march, lighting = self._scene(parameters, group, view)
             if pieces > 1:
-                camera = _rows_of(camera, first, rows)
+                camera = rows_of(camera, first, rows)
             rendering = render(
                 *(volume, transfer, camera, march),
                 compositing=self.compositing,
@@ -267,16 +267,6 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
             f"views[{number}]: the image must be finite; {bad} of its numbers are NaN or infinite."
         )
     return camera, jnp.asarray(image)
-
-
-def _rows_of(camera: Camera, first: Int[Array, ""], rows: int) -> Camera:
-    """`Camera.crop` to `rows` whole rows from a traced row `first` on; they may reach past the image."""
-    left, right, bottom, top = camera.window
-    width, height = camera.size
-    edges = jnp.stack([first + rows, first]).astype(top.dtype) / height
-    below, above = top - (top - bottom) * edges
-    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
-    return camera._showing(jnp.stack([left, right, below, above]), (width, rows), corner)
 
 
 class Problem(eqx.Module):

@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from .._util.compaction import Chosen
 from .._util.memory import require_room
 from .._util.vec3 import Vec3
+from .._util.voxel_fetch import corners
 from .._util.xla import gather
-from ..volume import Volume, split
+from ..volume import Volume
 from .shading import Lighting, Sample, Shading, Surroundings, shade_sample
 
 
@@ -69,15 +70,8 @@ class BakedShading(Shading):
         coordinate = around.space.coordinate(sample.point)
         ends = zip(coordinate, self.light.shape, around.volume.shape, strict=True)
         x, y, z = (c * ((n - 1) / (whole - 1)) for c, n, whole in ends)
-        (i, j, k), fractions = split((x, y, z), self.light.shape)
-        _, ny, nz = self.light.shape
         r = g = b = jnp.zeros_like(x)
-        for a in range(8):
-            corner = a >> 2, a >> 1 & 1, a & 1
-            weight = jnp.ones_like(x)
-            for side, fraction in zip(corner, fractions, strict=True):
-                weight = weight * (fraction if side else 1 - fraction)
-            index = ((i + corner[0]) * ny + j + corner[1]) * nz + k + corner[2]
+        for index, weight in corners((x, y, z), self.light.shape):
             # int32, since signed integers are converted to float in one instruction
             word = gather(self.light.words, index).astype(jnp.int32)
             r, g, b = (
