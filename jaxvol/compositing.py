@@ -113,7 +113,7 @@ class Composite(eqx.Module):
         # not `> 0`, which is false for NaN: NaN is to be passed on
         visible = ~(self.opacity <= 0)
         # Both are divided by the opacity first, so that the quotient's denominator is 1: its derivative
-        # divides by the square of that, which for the opacity of a veil underflows to 0 in float32.
+        # divides by the square of that, which underflows to 0 in float32 where the opacity is very small.
         whole = jax.lax.stop_gradient(jnp.where(visible, self.opacity, 1))
         mean = (self.moment / whole) / jnp.where(visible, self.opacity / whole, 1)
         return jnp.where(visible, mean, jnp.inf)

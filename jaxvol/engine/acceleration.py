@@ -1,4 +1,4 @@
-"""What is found out about a scene before any ray is marched?"""
+"""What is found out about voxels and empty space before an image is marched?"""
 
 from functools import partial
 

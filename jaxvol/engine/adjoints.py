@@ -1,4 +1,4 @@
-"""How is an image differentiated? Each adjoint says how the image is made, and how it is pulled back.
+"""Which rule differentiates an image? Registers those of `adjoint=` with JAX; `gradients` has the VJP itself.
 
 An image is one compiled program, and its gradient another.
 """

@@ -1,4 +1,4 @@
-"""Vector–Jacobian product of `render`.
+"""VJP of a whole image: sums, over its tiles, the gradients of all that `render` was given.
 
 Rays are made and marched once more, tile by tile; `replay` pulls their samples back, and JAX the making of
 rays.

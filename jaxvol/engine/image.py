@@ -67,7 +67,7 @@ def scan_image(
 
 
 def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, Pipeline]:
-    """The space in which rays meet the volume, and what turns them into pixels."""
+    """The space of the volume, and the pipeline that the scene's rays go through."""
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
@@ -78,7 +78,8 @@ def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, 
 def _over_tiles(
     scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
 ) -> tuple[Rendering, Any]:
-    """`one` of the rays of each tile in turn, with the renderings assembled to an image."""
+    """Calls `one(tile, rays)` for each tile in turn. Returns the renderings, assembled to an image, and what
+    else it returned, stacked."""
     fault = fault_of(scene)
 
     def tile(number: Int[Array, ""]) -> tuple[Rendering, Any]:

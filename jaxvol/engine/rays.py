@@ -1,4 +1,4 @@
-"""In which order are the rays of an image made? Tile by tile, in beams of neighbouring pixels.
+"""How is an image divided into tiles, and a tile into beams and groups of rays?
 
 Only one tile's rays are in memory beside the finished pixels, however large the image. They are arrays
 (groups, rays in a group), in which equally many groups in a row make up a beam.

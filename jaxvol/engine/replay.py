@@ -1,4 +1,4 @@
-"""Vector–Jacobian product of a march: a second march, front to back, computes the samples again.
+"""VJP of marching a tile's rays: a second march, front to back, computes each sample again.
 
 Let c̄, ā and d̄ be the cotangents of a ray's colour C, opacity A and depth D = t_in + Σ w s / A, where sample
 k has weight w_k, colour c_k and depth s_k past the entry. Then a unit of its weight is worth
@@ -95,15 +95,15 @@ class Total(eqx.Module):
 
 
 class Replay(SampleVisitor):
-    """Pulls the samples of rays (groups, rays in a group) back.
+    """Pulls the cotangents of rays (groups, rays in a group) back to what their samples depend on.
 
     **Arguments:**
 
     - `pipeline`: of the rays; without lighting. `scene`: what the gradient is taken by.
     - `words`: the packed copy of the scene's voxels.
-    - `rays`: that are marched.
+    - `rays`: those that are marched.
     - `given`: cotangents of the rays.
-    - `total`: to be added to.
+    - `total`: the gradients so far, to which those of these rays are added.
     - `shader`: what shades the samples.
     - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """

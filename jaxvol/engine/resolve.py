@@ -46,8 +46,8 @@ def resolve_image(
 def of_visible(
     some: Callable[..., Float[Array, "chunk 5"]], size: int, found: Found
 ) -> Float[Array, "*rays 5"]:
-    """`some` of the indices of pixels, and of what was found of them, for all that are not transparent, so
-    many at a time; the others stay transparent, and infinitely far."""
+    """Pixels and depths by `some(indices, *found)`, called for `size` visible pixels at a time. Transparent
+    pixels stay 0, at infinite depth."""
     shape = found[1].shape
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0

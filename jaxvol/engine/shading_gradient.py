@@ -1,6 +1,6 @@
-"""Vector–Jacobian product of shading: each visible sample is shaded again, and pulled back.
+"""VJP of shading the visible samples of a segment: `replay` calls it for scenes with lighting.
 
-The counterpart of `visible_samples.shaded_colors` in the second march.
+Shades each sample again, as `visible_samples.shaded_colors` did in the first march.
 """
 
 from typing import Any, NamedTuple

@@ -25,10 +25,10 @@ def test_each_chosen_one_is_taken_once_and_put_where_it_was():
     values = [jnp.asarray(rng.normal(size=(4, 900)), jnp.float32) for _ in range(2)]
     chosen = Chosen.of([value > 0.5 for value in values])
 
-    def one(places, carry):
+    def one(indices, carry):
         whole, visits = carry
-        found = chosen.take(values, places)
-        return chosen.put(whole, places, 2 * found), visits.at[places].add(1, mode="drop")
+        found = chosen.take(values, indices)
+        return chosen.put(whole, indices, 2 * found), visits.at[indices].add(1, mode="drop")
 
     whole, visits = chosen.fold(one, (jnp.zeros(7200), jnp.zeros(7200)))
     for value, part, count in zip(values, chosen.split(whole, 2), chosen.split(visits, 2), strict=True):
