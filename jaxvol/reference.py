@@ -1,7 +1,7 @@
 """What does one ray see? The definition: one ray, cell by cell.
 
 This file defines what every combination of transforms means, by the step of one ray. The fast engine imports
-its parts, so that a fault in one of these shows in both: the independent check is `tests/oracle.py`. A cell of
+parts of it, so that a fault in these shows in both: the independent check is `tests/oracle.py`. A cell of
 extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` says how cells become a pixel.
 """
 

@@ -1,4 +1,4 @@
-"""Which rule differentiates an image? Registers those of `adjoint=` with JAX; `gradients` has the VJP itself.
+"""By which rule does JAX differentiate an image, for each `adjoint=`? `gradients` has the VJP of `"replay"`.
 
 An image is one compiled program, and its gradient another.
 """
