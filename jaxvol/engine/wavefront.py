@@ -50,8 +50,9 @@ def march_rays(
         finished |= ~jnp.repeat(visible, beams.groups // beams.count)[:, None]
     job = Job(pipeline, beams, tiling, visitor, index, prepared, jnp.zeros((), bool))
     at = with_fields(at, finished=finished)
-    # Rays that may shift begin behind a transparent first cell. Not for a `Selection`, to which such cells may
-    # matter; not where rays leap, since a leap shifts them, too; not for a visitor, which must see each sample.
+    # Rays that may shift begin behind a transparent first cell. Not for a `Selection`, to which such cells
+    # may matter; not where rays leap, since a leap shifts them, too; not for a visitor, which must see every
+    # sample.
     weighs = isinstance(pipeline.compositing, Weighting)
     if march.may_shift and weighs and index is None and visitor is None:
         at = _past_first_cell(pipeline, rays, at)
