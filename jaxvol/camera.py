@@ -172,7 +172,7 @@ class Camera(eqx.Module):
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
         x, y = self._column(column + 0.5), self._row(row + 0.5)
-        right, up, forward = (apart(axis) for axis in self._axes())
+        right, up, forward = (apart(axis) for axis in axes_of(self))
         position = apart(self.position)
         if self.parallel_scale is not None:
             scale = self.parallel_scale
@@ -210,13 +210,6 @@ class Camera(eqx.Module):
         )
         return camera if corner is None else eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
-    def _axes(self) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-        forward = self.focal_point - self.position
-        forward = forward / jnp.linalg.norm(forward)
-        right = jnp.cross(forward, self.view_up)
-        right = right / jnp.linalg.norm(right)
-        return right, jnp.cross(right, forward), forward
-
     def _column(self, column: Scalar | int) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
         left, right = self.window[0], self.window[1]
@@ -225,6 +218,23 @@ class Camera(eqx.Module):
     def _row(self, row: Scalar | int) -> Scalar:
         bottom, top = self.window[2], self.window[3]
         return top - (top - bottom) * (row / self.size[1])
+
+
+def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Unit vectors to the right of the image, up in it, and forward."""
+    forward = camera.focal_point - camera.position
+    forward = forward / jnp.linalg.norm(forward)
+    right = jnp.cross(forward, camera.view_up)
+    right = right / jnp.linalg.norm(right)
+    return right, jnp.cross(right, forward), forward
+
+
+def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
+    """`Camera.crop` to `count` whole rows from a traced row `first` on; they may reach past the image."""
+    left, right = camera.window[0], camera.window[1]
+    below, above = (camera._row(row.astype(camera.window.dtype)) for row in (first + count, first))
+    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
+    return camera._showing(jnp.stack([left, right, below, above]), (camera.size[0], count), corner)
 
 
 # Jitted: the first image would have to wait for a program per operation.

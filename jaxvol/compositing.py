@@ -113,7 +113,7 @@ class Composite(eqx.Module):
         # not `> 0`, which is false for NaN: NaN is to be passed on
         visible = ~(self.opacity <= 0)
         # Both are divided by the opacity first, so that the quotient's denominator is 1: its derivative
-        # divides by the square of that, which for the opacity of a veil underflows to 0 in float32.
+        # divides by the square of that, which underflows to 0 in float32 where the opacity is very small.
         whole = jax.lax.stop_gradient(jnp.where(visible, self.opacity, 1))
         mean = (self.moment / whole) / jnp.where(visible, self.opacity / whole, 1)
         return jnp.where(visible, mean, jnp.inf)
@@ -208,10 +208,11 @@ class RaySampler(NamedTuple):
 
     def measured(self, depth: Scalar) -> Measured:
         """The measured values at this depth, the volume's value first."""
-        return self.classification.at(self.ray.path(self.length(depth)))
+        return self.classification.at(self.ray.path(self.differentiable_depth(depth)))
 
-    def length(self, depth: Scalar) -> Scalar:
-        """The depth as a number to compute with, as in a fog: it changes with the step."""
+    def differentiable_depth(self, depth: Scalar) -> Scalar:
+        """The same depth, as a number to compute with, as in a fog: its derivative by the step is that of so
+        many steps."""
         return depth * self.depth_scale
 
     def color(
@@ -223,7 +224,7 @@ class RaySampler(NamedTuple):
         if self.classification.light is None:
             return color
         ray = self.ray
-        point = along(ray.entry, ray.direction, self.length(depth))
+        point = along(ray.entry, ray.direction, self.differentiable_depth(depth))
         return self.classification.light(
             Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
         )
@@ -254,7 +255,7 @@ class Selection(Compositing[State]):
     def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
         """Premultiplied colour and opacity, and the depth that is reported, of a ray for which a depth was
         chosen. It is differentiated by JAX. Depths, of the state and in the answer, are numbers of steps to
-        it: to compute with one, take `sampler.length(depth)`."""
+        it: to compute with one, take `sampler.differentiable_depth(depth)`."""
 
     def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
         depth = self.depth(state)

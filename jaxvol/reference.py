@@ -1,6 +1,7 @@
 """What does one ray see? The definition: one ray, cell by cell.
 
-This file defines what every combination of transforms means. There is no acceleration here. A cell of
+This file defines what every combination of transforms means, by the step of one ray. The fast engine imports
+parts of it, so that a fault in these shows in both: the independent check is `tests/oracle.py`. A cell of
 extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` says how cells become a pixel.
 """
 
@@ -126,8 +127,8 @@ def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] |
 
 def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
     """The measured values at a piece's sample, or over the piece where it is integrated, and what the
-    transfer function's search finds for them. `recorded`: fetches are recorded, and so not made in branches.
-    """
+    transfer function's search finds for them. `recorded`: for the engine's `Recording`, which cannot record
+    fetches inside branches."""
     march, classification = pipeline.march, pipeline.classification
     if not march.integrates:
         return classification.at(ray.path(march.sample(piece)))
@@ -271,6 +272,7 @@ def resolve(
         assert lighting is not None
         return lighting.shade_pixel(classification, space, line, rgba, depth), depth
     ray = enter(space, *line)
+    # 1, with a derivative: the selected depths are numbers of steps, and so grow with the step
     scale = march.step / jax.lax.stop_gradient(march.step)
     found = compositing.pixel(RaySampler(ray, classification, scale), jax.lax.stop_gradient(selected))
     check_answer(compositing, "pixel", found, (rgba, depth))

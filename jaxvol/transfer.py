@@ -124,13 +124,13 @@ class Transfer(eqx.Module):
         transfer function and of the measured values, from those of colour and extinction. None where there
         is no derivative. `measured` includes what `search` found."""
 
-        return _pulled(self, lambda transfer: transfer.classifier(), measured, color, extinction)
+        return _classification_vjp(self, lambda transfer: transfer.classifier(), measured, color, extinction)
 
     def pull_integrated(
         self, measured: Measured, color: Vec3, extinction: Scalar
     ) -> tuple["Transfer", Measured]:
         """The same of classifying cells by `integrator`; `measured` is what was measured over them."""
-        return _pulled(self, lambda transfer: transfer.integrator(), measured, color, extinction)
+        return _classification_vjp(self, lambda transfer: transfer.integrator(), measured, color, extinction)
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
@@ -165,7 +165,7 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool) -
     return classification._replace(integrate=integrate)
 
 
-def _pulled(
+def _classification_vjp(
     transfer: Transfer,
     classify_of: Callable[[Any], Any],
     measured: Measured,
@@ -333,8 +333,8 @@ class TransferFunction(Transfer):
         _, pull = jax.vjp(means, a, b, front[0], back[0])
         of_a, of_b, of_front, of_back = pull((color, extinction))
         sums = jnp.zeros(rows.shape, extinction.dtype)
-        for place, part in ((i, of_a), (j, of_b)):
-            sums = sums.at[place].add(jnp.stack(part, axis=-1), mode="promise_in_bounds")
+        for index, part in ((i, of_a), (j, of_b)):
+            sums = sums.at[index].add(jnp.stack(part, axis=-1), mode="promise_in_bounds")
         (transfer,) = pull_rows(sums)
         return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
 

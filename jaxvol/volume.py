@@ -5,8 +5,6 @@ n nodes spans n - 1 cells along an axis. Values are interpolated trilinearly bet
 a coordinate outside the grid takes the value of the nearest point of the grid.
 """
 
-import itertools
-import math
 from abc import abstractmethod
 from typing import Any, Literal
 
@@ -15,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, require
-from ._util.fetching import Fetch, OneByOne, fetched, split
 from ._util.vec3 import Scalar, Vec3
+from ._util.voxel_fetch import Fetch, OneByOne, corners, fetched
 from ._util.voxels import label_array, voxel_array
 
 
@@ -155,13 +153,9 @@ class Volume(eqx.Module):
         """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
         if self.labels is None:
             raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
-        (i, j, k), fraction = split(coordinate, self.shape)
-        _, ny, nz = self.shape
-        share = jnp.zeros_like(fraction[0])
-        for x, y, z in itertools.product((0, 1), repeat=3):
-            node = fetched(self.labels, ((i + x) * ny + j + y) * nz + k + z)
-            sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
-            share = share + math.prod(sides) * (node == label).astype(share.dtype)
+        share = jnp.zeros_like(coordinate[0])
+        for index, weight in corners(coordinate, self.shape):
+            share = share + weight * (fetched(self.labels, index) == label).astype(share.dtype)
         return share
 
     def _trilinear_slopes(self, coordinate: Vec3) -> Vec3:

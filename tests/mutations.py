@@ -151,8 +151,8 @@ MUTATIONS = [
     Mutation(
         "jitter: every shard draws the same numbers",
         "engine/rays.py",
-        "return self.first + place, jnp.zeros_like(place)",
-        "return place, jnp.zeros_like(place)",
+        "return self.first + index, jnp.zeros_like(index)",
+        "return index, jnp.zeros_like(index)",
         ("engine/test_sharding.py::test_image_and_gradient_are_those_of_one_device",),
     ),
     Mutation(
@@ -358,7 +358,7 @@ MUTATIONS = [
     Mutation(
         "rays: index of 64 bits added to one of 32 under x64",
         "engine/rays.py",
-        "place = place.astype(jnp.int32)  # from 64 bits under x64",
+        "index = index.astype(jnp.int32)  # from 64 bits under x64",
         "pass",
         ("engine/test_tiling.py::test_rays_of_ones_own_draw_the_same_numbers_in_float64",),
     ),
@@ -435,7 +435,7 @@ MUTATIONS = [
     # fetching, transfer functions, lighting, path tracing
     Mutation(
         "packing: sign of int16 and int8 lost",
-        "_util/fetching.py",
+        "_util/voxel_fetch.py",
         "if signed:  #",
         "if not signed:  #",
         (PACKED,),
@@ -499,7 +499,7 @@ MUTATIONS = [
     Mutation(
         "transfer function: unevenly spaced points treated as evenly spaced",
         "_util/piecewise_linear.py",
-        "even = jnp.all(jnp.abs(values - places) < 0.4 * step)",
+        "even = jnp.all(jnp.abs(values - evenly) < 0.4 * step)",
         "even = jnp.all(jnp.abs(values[1:] - values[:-1] - step) < 1e-3 * step)",
         ("test_transfer.py::test_points_that_lie_nearly_evenly_are_counted_exactly",),
     ),
@@ -513,7 +513,7 @@ MUTATIONS = [
     Mutation(
         "light: photons not occluded by what lies behind them",
         "lighting/scatterers.py",
-        "seen = intensity * self._visible(around, sample, offset, place.extinction)",
+        "seen = intensity * self._visible(around, sample, offset, at_photon.extinction)",
         "seen = intensity",
         ("lighting/test_lighting.py::test_step_2_a_wall_behind_a_photon_hides_it_within_reach[soft]",),
     ),
@@ -527,15 +527,15 @@ MUTATIONS = [
     Mutation(
         "light: template brightness ignores a material's absorption",
         "lighting/scatterers.py",
-        "scale = matter * WHITE * notes.optics.reflectance",
+        "scale = matter * WHITE * shared.optics.reflectance",
         "scale = matter * WHITE",
         ("lighting/test_lighting.py::test_templates_are_as_bright_as_path_tracing[0.6]",),
     ),
     Mutation(
         "light: unlit emission at the soft edge of a material",
         "lighting/scatterers.py",
-        "matter = jnp.minimum(2 * sum(notes.shares), 1)",
-        "matter = sum(notes.shares)",
+        "matter = jnp.minimum(2 * sum(shared.shares), 1)",
+        "matter = sum(shared.shares)",
         ("lighting/test_lighting.py::test_nothing_of_a_material_shines_by_itself[soft]",),
     ),
     Mutation(
@@ -586,9 +586,9 @@ MUTATIONS = [
     ),
     Mutation(
         "replay: one of the eight voxels of a sample gets no gradient",
-        "_util/fetching.py",
-        "for place, part in zip(indices, parts, strict=True):",
-        "for place, part in list(zip(indices, parts, strict=True))[1:]:",
+        "_util/voxel_fetch.py",
+        "for index, part in zip(indices, parts, strict=True):",
+        "for index, part in list(zip(indices, parts, strict=True))[1:]:",
         (DIFFERENCES,),
     ),
     Mutation(

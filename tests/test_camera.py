@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.camera import axes_of
 from jaxvol.engine.rays import RayTiles
 from jaxvol.engine.tiling import Tiling
 from jaxvol.space import Affine
@@ -96,7 +97,7 @@ def test_looking_at_sees_every_corner_of_the_volume():
     low, high = (np.asarray(end) for end in BOX.corners)
     for size in ((40, 20), (20, 40)):
         camera = jv.Camera.looking_at(BOX, (1, 2, 0.5), size=size)
-        right, up, forward = (np.asarray(axis) for axis in camera._axes())
+        right, up, forward = (np.asarray(axis) for axis in axes_of(camera))
         for corner in np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3):
             view = corner - np.asarray(camera.position)
             height = np.tan(np.radians(15)) * (view @ forward)
@@ -108,7 +109,7 @@ def test_looking_at_sees_every_corner_of_the_volume():
 @pytest.mark.parametrize("sign", [1, -1])
 def test_looking_at_from_above_and_below_picks_another_up(up, sign):
     right, upward, forward = (
-        np.asarray(axis) for axis in jv.Camera.looking_at(BOX, sign * np.array(up), up)._axes()
+        np.asarray(axis) for axis in axes_of(jv.Camera.looking_at(BOX, sign * np.array(up), up))
     )
     np.testing.assert_allclose(forward, -sign * np.array(up), atol=1e-6)
     np.testing.assert_allclose(upward, (0, 0, -1) if up == (0, 1, 0) else (0, 1, 0), atol=1e-6)

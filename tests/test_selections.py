@@ -325,7 +325,7 @@ class Fog(Maximum):
 
     def pixel(self, sampler, state):
         rgba, depth = super().pixel(sampler, state)
-        return rgba * jnp.exp(-0.3 * sampler.length(depth)), depth
+        return rgba * jnp.exp(-0.3 * sampler.differentiable_depth(depth)), depth
 
 
 def leaves(scene):

@@ -1,1 +1,1 @@
-"""Helpers for any numerical package, independent of volumes and images."""
+"""Helpers that need nothing else of jaxvol: checks, files, arrays of voxels, tables, random numbers, XLA."""

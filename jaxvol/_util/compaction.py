@@ -18,13 +18,13 @@ CHUNK = 2048
 class Chosen(NamedTuple):
     """Chosen entries of arrays (rows, columns), of which there may be several, stacked along the rows.
 
-    - `place`: flat indices of the chosen entries, padded with indices past the end.
+    - `indices`: flat indices of the chosen entries, padded with indices past the end.
     - `number`: how many are chosen.
     - `columns`: of the arrays.
     - `chunk`: entries processed at a time.
     """
 
-    place: Int[Array, " entries"]
+    indices: Int[Array, " entries"]
     number: Int[Array, ""]
     columns: int
     chunk: int
@@ -37,26 +37,26 @@ class Chosen(NamedTuple):
         return cls(in_front(whole.reshape(-1), chunk), number, whole.shape[1], chunk)
 
     def fold(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
-        """Folds `one(places, carry)` over the chunks. The last one is padded with places past the end."""
+        """Folds `one(indices, carry)` over the chunks of indices."""
 
         def body(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
             i, carry = state
-            return i + 1, one(jax.lax.dynamic_slice_in_dim(self.place, i * self.chunk, self.chunk), carry)
+            return i + 1, one(jax.lax.dynamic_slice_in_dim(self.indices, i * self.chunk, self.chunk), carry)
 
         begin = varying((jnp.zeros((), jnp.int32), start), self.number)
         return jax.lax.while_loop(lambda state: state[0] * self.chunk < self.number, body, begin)[1]
 
-    def take(self, arrays: list[PyTree], places: Int[Array, " chunk"]) -> PyTree:
-        """The entries at these places."""
+    def take(self, arrays: list[PyTree], indices: Int[Array, " chunk"]) -> PyTree:
+        """The entries at these flat indices."""
 
         def taken(*leaves: Array) -> Array:
-            return jnp.concatenate(leaves).reshape(-1).at[places].get(mode="clip")
+            return jnp.concatenate(leaves).reshape(-1).at[indices].get(mode="clip")
 
         return jax.tree.map(taken, *arrays)
 
-    def put(self, whole: PyTree, places: Int[Array, " chunk"], part: PyTree) -> PyTree:
-        """Flat arrays with these entries at these places."""
-        return jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), whole, part)
+    def put(self, whole: PyTree, indices: Int[Array, " chunk"], part: PyTree) -> PyTree:
+        """Flat arrays with these entries at these indices."""
+        return jax.tree.map(lambda leaf, new: leaf.at[indices].set(new, mode="drop"), whole, part)
 
     def split(self, whole: PyTree, arrays: int) -> list[PyTree]:
         """Flat arrays, split into so many arrays (rows, columns) again."""

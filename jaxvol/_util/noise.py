@@ -105,8 +105,8 @@ def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
     taken = np.zeros((side, side), bool)
     density = np.zeros((side, side), np.float32)
 
-    def put(place: int, sign: int) -> None:
-        y, x = divmod(place, side)
+    def put(index: int, sign: int) -> None:
+        y, x = divmod(index, side)
         taken[y, x] = sign > 0
         density[...] += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
 
@@ -117,8 +117,8 @@ def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
         return int(np.where(taken, density, -np.inf).argmax())
 
     first = side * side // 10
-    for place in np.random.default_rng(0).permutation(side * side)[:first]:
-        put(int(place), 1)
+    for index in np.random.default_rng(0).permutation(side * side)[:first]:
+        put(int(index), 1)
     while True:
         moved = tightest_cluster()
         put(moved, -1)

@@ -54,8 +54,8 @@ def points_below(
         return guess + sum(each.astype(jnp.int32) for each in reached)
 
     # compare positions rather than gaps: small deviations of gaps would add up
-    places = first + step * jnp.arange(last + 1, dtype=values.dtype)
-    even = jnp.all(jnp.abs(values - places) < 0.4 * step)
+    evenly = first + step * jnp.arange(last + 1, dtype=values.dtype)
+    even = jnp.all(jnp.abs(values - evenly) < 0.4 * step)
     return jax.lax.cond(even, counted, searched, value)
 
 

@@ -1,4 +1,4 @@
-"""What is found out about a scene before any ray is marched?"""
+"""What is found out about voxels and empty space before an image is marched?"""
 
 from functools import partial
 
@@ -73,7 +73,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         own = OwnRays(*(jnp.stack(part, axis=-1) for part in (through.origin, through.direction)))
         tiles, only = RayTiles.of(own, tiling._replace(tile=columns.size)), jnp.zeros((), jnp.int32)
         rays = tiles.rays(own, space, only)
-        beams = Beams(rays, tiles.beams, tiles.box(own, rays, only))
+        beams = Beams(rays, tiles.beam_count, tiles.box(own, rays, only))
         pipeline = Pipeline(
             plain, volume, classification_of(transfer, volume, integrated=march.integrates), FirstVisible()
         )

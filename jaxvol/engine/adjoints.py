@@ -1,4 +1,4 @@
-"""How is an image differentiated? Each adjoint says how the image is made, and how it is pulled back.
+"""By which rule does JAX differentiate an image, for each `adjoint=`? `gradients` has the VJP of `"replay"`.
 
 An image is one compiled program, and its gradient another.
 """

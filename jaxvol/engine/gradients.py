@@ -1,4 +1,4 @@
-"""Vector–Jacobian product of `render`.
+"""VJP of a whole image: sums, over its tiles, the gradients of all that `render` was given.
 
 Rays are made and marched once more, tile by tile; `replay` pulls their samples back, and JAX the making of
 rays.
@@ -26,7 +26,7 @@ from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
 from .scene import Scene
-from .shading_gradient import Lit
+from .shading_gradient import Shader
 from .tiling import Tiling
 from .wavefront import march_rays
 
@@ -69,19 +69,19 @@ class _Sums(NamedTuple):
 class _Image(NamedTuple):
     """What the tiles of an image share.
 
-    - `pipeline`: without lighting, since samples are shaded by `light`.
-    - `places`: whether volume, camera, rays or march have a gradient.
+    - `pipeline`: without lighting, since samples are shaded by `shader`.
+    - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """
 
     scene: Scene
     pipeline: Pipeline
     words: UInt32[Array, " voxels"] | None
     empty_space: EmptySpaceIndex | None
-    light: Lit | None
+    shader: Shader | None
     fault: Bool[Array, ""]
     tiles: RayTiles
     tiling: Tiling
-    places: bool
+    geometric: bool
 
     def pull_tile(
         self,
@@ -102,12 +102,12 @@ class _Image(NamedTuple):
         rays, pull = eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
         replay = Replay(
             *(self.pipeline, self.scene, self.words, rays, Cotangents.of(rays, rendering, cotangent)),
-            *(sums.total, self.light, self.tiling),
-            places=self.places,
+            *(sums.total, self.shader, self.tiling),
+            geometric=self.geometric,
         )
-        beams = Beams(rays, self.tiles.beams, self.tiles.box(source, rays, number), range_)
+        beams = Beams(rays, self.tiles.beam_count, self.tiles.box(source, rays, number), range_)
         _, (_, of_rays, total) = march_rays(self.pipeline, self.empty_space, beams, self.tiling, None, replay)
-        if not self.places:
+        if not self.geometric:
             return _Sums(total, sums.source)
         if cotangent.details.depth is not None:
             # depth is measured from the ray's origin, and a sample's from the entry
@@ -131,20 +131,20 @@ def _vjp_by_tiles(
     """The cotangents of a scene's parts, tile by tile."""
     volume, transfer, source, march, _, lighting = scene
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed.volume.data
-    places = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
+    geometric = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
     packed, tiling = acceleration.packed(scene), options.tiling
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
         index = index.within_ranges()
     _, pipeline = pipeline_of(packed._replace(lighting=None), acceleration)
-    light, pull_light = None, None
+    shader, pull_shader = None, None
     if lighting is not None:
-        light, pull_light = _light(scene, packed.volume, voxels=of_voxels)
+        shader, pull_shader = _shader_of(scene, packed.volume, voxels=of_voxels)
     image = _Image(
-        *(scene, pipeline, acceleration.words, index, light, fault_of(scene), tiles, tiling, places)
+        *(scene, pipeline, acceleration.words, index, shader, fault_of(scene), tiles, tiling, geometric)
     )
     sums = _Sums(
-        Total.zeros(volume, transfer, march, light, voxels=of_voxels),
+        Total.zeros(volume, transfer, march, shader, voxels=of_voxels),
         jax.tree.map(jnp.zeros_like, floats(source)),
     )
     parts = jax.tree.map(tiles.disassemble, (rendering, cotangent))
@@ -153,20 +153,20 @@ def _vjp_by_tiles(
         varying(sums, parts),
         (jnp.arange(tiles.number), ranges, *parts),
     )
-    return _cotangents(scene, *sums, pull_light)
+    return _cotangents(scene, *sums, pull_shader)
 
 
 def _cotangents(
-    scene: Scene, total: Total, of_source: PyTree, pull_light: Callable[[PyTree], Any] | None
+    scene: Scene, total: Total, of_source: PyTree, pull_shader: Callable[[PyTree], Any] | None
 ) -> Any:
     """The cotangents of a scene's parts."""
     of_volume, compositing = total.volume, scene.compositing  # which has no leaves
     if total.voxels is not None:
         data = scene.volume.data
         of_volume = with_voxels(of_volume, total.voxels.reshape(data.shape).astype(data.dtype))
-    if pull_light is None:
+    if pull_shader is None:
         return Scene(of_volume, total.transfer, of_source, total.march, compositing, None)
-    more_volume, more_transfer, more_march, of_lighting = pull_light(total.light)[0]
+    more_volume, more_transfer, more_march, of_lighting = pull_shader(total.shader)[0]
     return Scene(
         added(of_volume, more_volume),
         added(total.transfer, more_transfer),
@@ -177,20 +177,20 @@ def _cotangents(
     )
 
 
-def _light(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Lit, Callable[[PyTree], Any]]:
+def _shader_of(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Shader, Callable[[PyTree], Any]]:
     """What shades an image; and the pull-back of its leaves to volume, transfer function, march and
     lighting."""
     volume, transfer, _, march, _, lighting = scene
     parts = volume if voxels else without_voxels(volume), transfer, march, lighting
     moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
 
-    def made(moving: PyTree) -> tuple[PyTree, Lit]:
+    def made(moving: PyTree) -> tuple[PyTree, Shader]:
         moved, transfer, march, lighting = eqx.combine(moving, fixed)
         # the packed copy serves fetching only
         whole = moved if voxels else with_voxels(moved, volume.data)
         around = Surroundings(whole, transfer, march.locate(whole))
-        light = Lit(lighting.shading(around), around)
-        return floats(light.leaves), light
+        shader = Shader(lighting.shading(around), around)
+        return floats(shader.leaves), shader
 
-    _, pull, light = jax.vjp(made, moving, has_aux=True)
-    return light._replace(around=Surroundings(packed, transfer, march.locate(volume))), pull
+    _, pull, shader = jax.vjp(made, moving, has_aux=True)
+    return shader._replace(around=Surroundings(packed, transfer, march.locate(volume))), pull

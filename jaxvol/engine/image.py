@@ -41,7 +41,7 @@ def march_image(
     space, pipeline = pipeline_of(scene, acceleration)
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
-        beams = Beams(rays, tiles.beams, tiles.box(scene.source, rays, tile))
+        beams = Beams(rays, tiles.beam_count, tiles.box(scene.source, rays, tile))
         recorder = VisibleRangeRecorder(rays.length.shape) if record and index is not None else None
         at, (ranges, *_) = march_rays(pipeline, index, beams, tiling, options.outputs, recorder)
         return vmap_rays(partial(end, pipeline))(rays, at), ranges
@@ -67,7 +67,7 @@ def scan_image(
 
 
 def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, Pipeline]:
-    """The space in which rays meet the volume, and what turns them into pixels."""
+    """The space of the volume, and the pipeline that the scene's rays go through."""
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
@@ -78,7 +78,8 @@ def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, 
 def _over_tiles(
     scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
 ) -> tuple[Rendering, Any]:
-    """`one` of the rays of each tile in turn, with the renderings assembled to an image."""
+    """Calls `one(tile, rays)` for each tile in turn. Returns the renderings, assembled to an image, and what
+    else it returned, stacked."""
     fault = fault_of(scene)
 
     def tile(number: Int[Array, ""]) -> tuple[Rendering, Any]:

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Shaped, UInt32
 
 from .._util.checks import is_traced
-from .._util.fetching import Packed
 from .._util.memo import memoized
+from .._util.voxel_fetch import Packed
 from ..volume import Volume, with_fetch
 
 

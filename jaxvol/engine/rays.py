@@ -1,4 +1,4 @@
-"""In which order are the rays of an image made? Tile by tile, in beams of neighbouring pixels.
+"""How is an image divided into tiles, and a tile into beams and groups of rays?
 
 Only one tile's rays are in memory beside the finished pixels, however large the image. They are arrays
 (groups, rays in a group), in which equally many groups in a row make up a beam.
@@ -39,23 +39,23 @@ class OwnRays(eqx.Module):
     pixels: Int[Array, "*rays 2"] | None = None
     first: Int[Array, ""] | int = 0
 
-    def pixel(self, place: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
+    def pixel(self, index: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
         """The pixels of the rays at these indices."""
         if self.pixels is None:
-            place = place.astype(jnp.int32)  # from 64 bits under x64
-            return self.first + place, jnp.zeros_like(place)
+            index = index.astype(jnp.int32)  # from 64 bits under x64
+            return self.first + index, jnp.zeros_like(index)
         flat = self.pixels.reshape(-1, 2)
-        return flat[place, 0], flat[place, 1]
+        return flat[index, 0], flat[index, 1]
 
 
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
-    - `number`: of tiles. `beams`: in each tile.
+    - `number`: of tiles. `beam_count`: of beams in each tile.
     """
 
     number: int = eqx.field(static=True)
-    beams: int = eqx.field(static=True)
+    beam_count: int = eqx.field(static=True)
     tiling: Tiling = eqx.field(static=True)
 
     @classmethod
@@ -65,12 +65,12 @@ class RayTiles(eqx.Module):
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // side), -(-height // side)
-            beams = min(most_beams, across * down)
-            return _PixelTiles(-(-across * down // beams), beams, tiling, source.size, across, down)
+            count = min(most_beams, across * down)
+            return _PixelTiles(-(-across * down // count), count, tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
         needed = -(-math.prod(shape) // tiling.rays_per_beam)
-        beams = max(min(most_beams, needed), 1)
-        return _OwnRayTiles(-(-needed // beams), beams, tiling, shape)
+        count = max(min(most_beams, needed), 1)
+        return _OwnRayTiles(-(-needed // count), count, tiling, shape)
 
     @abstractmethod
     def rays(self, source: Any, space: Space, tile: Int[Array, ""]) -> Ray:
@@ -112,8 +112,8 @@ class _PixelTiles(RayTiles):
         return lambda occupancy: Box.within(occupancy, *vmap_rays(source.ray)(column, row))
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
-        """Columns and rows of these places in each of a tile's beams."""
-        beam, side = (tile * self.beams + jnp.arange(self.beams))[:, None], self.tiling.beam
+        """Columns and rows of the pixels (x, y) of each of a tile's beams."""
+        beam, side = (tile * self.beam_count + jnp.arange(self.beam_count))[:, None], self.tiling.beam
         return (beam % self.across) * side + x[None], (beam // self.across) * side + y[None]
 
     def assemble(self, leaf: Array) -> Array:
@@ -131,7 +131,7 @@ class _PixelTiles(RayTiles):
         image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
         image = image.reshape(self.down, 2, side, self.across, 2, side, *rest)
         beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, self.tiling.rays_per_beam, *rest)
-        missing = self.number * self.beams - self.across * self.down
+        missing = self.number * self.beam_count - self.across * self.down
         beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (1 + len(rest)))
         return beams.reshape(self.number, -1, self.tiling.group, *rest)
 
@@ -143,20 +143,20 @@ class _OwnRayTiles(RayTiles):
 
     @property
     def _rays_per_tile(self) -> int:
-        return self.beams * self.tiling.rays_per_beam
+        return self.beam_count * self.tiling.rays_per_beam
 
     def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
             source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
-        place = tile * self._rays_per_tile + jnp.arange(self._rays_per_tile).reshape(-1, self.tiling.group)
-        known = jnp.minimum(place, max(count - 1, 0))
+        number = tile * self._rays_per_tile + jnp.arange(self._rays_per_tile).reshape(-1, self.tiling.group)
+        known = jnp.minimum(number, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
-        return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), place < count)
+        return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), number < count)
 
     def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
-        by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beams, -1), rays)
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
         return lambda occupancy: Box.around(occupancy, by_beam)
 
     def assemble(self, leaf: Array) -> Array:
@@ -172,9 +172,9 @@ class _OwnRayTiles(RayTiles):
         return padded.reshape(self.number, groups, self.tiling.group, *rest)
 
 
-def _own_line(source: OwnRays, place: Int[Array, ""]) -> Line:
-    (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[place] for rays in (source.origins, source.directions))
-    return Line((x, y, z), (dx, dy, dz), source.pixel(place))
+def _own_line(source: OwnRays, index: Int[Array, ""]) -> Line:
+    (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[index] for rays in (source.origins, source.directions))
+    return Line((x, y, z), (dx, dy, dz), source.pixel(index))
 
 
 def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
@@ -182,11 +182,11 @@ def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Li
     return Line(*source.ray(column, row), (column + left, row + top))
 
 
-def lines_at(source: Camera | OwnRays, places: Int[Array, " rays"]) -> Line:
+def lines_at(source: Camera | OwnRays, indices: Int[Array, " rays"]) -> Line:
     """The rays of indices into the flattened image, as the march rounds them."""
     if not isinstance(source, Camera):
-        return jax.vmap(partial(_own_line, source))(places)
-    rows, columns = jnp.divmod(places, source.size[0])
+        return jax.vmap(partial(_own_line, source))(indices)
+    rows, columns = jnp.divmod(indices, source.size[0])
     return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None]))
 
 

@@ -1,4 +1,4 @@
-"""Vector–Jacobian product of a march: a second march, front to back, computes the samples again.
+"""VJP of marching a tile's rays: a second march, front to back, computes each sample again.
 
 Let c̄, ā and d̄ be the cotangents of a ray's colour C, opacity A and depth D = t_in + Σ w s / A, where sample
 k has weight w_k, colour c_k and depth s_k past the entry. Then a unit of its weight is worth
@@ -26,9 +26,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
-from .._util.fetching import Recording, scatter_add
 from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3, along
+from .._util.voxel_fetch import Recording, scatter_add
 from ..compositing import Weighting
 from ..march import March
 from ..reference import Pipeline, Progress, contained, measure
@@ -39,7 +39,7 @@ from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
 from .segment import Samples, SampleVisitor, pieces_ahead, vmap_cells
-from .shading_gradient import LightTotal, Lit, ShadingVjp, shading_vjp
+from .shading_gradient import Shader, ShadingTotal, ShadingVjp, shading_vjp
 from .tiling import Tiling
 from .visible_samples import Weights, weights_of
 
@@ -75,45 +75,45 @@ class Total(eqx.Module):
     volume: PyTree
     """Of everything in it but the voxels."""
     voxels: Float[Array, " voxels"] | None
-    light: PyTree
-    """Of `Lit.leaves`."""
+    shader: PyTree
+    """Of `Shader.leaves`."""
 
     @classmethod
     def zeros(
-        cls, volume: Volume, transfer: Transfer, march: March, light: Lit | None, *, voxels: bool
+        cls, volume: Volume, transfer: Transfer, march: March, shader: Shader | None, *, voxels: bool
     ) -> "Total":
         """Zeros for these parts."""
-        lit = None if light is None else light.leaves
-        parts = transfer, march, without_voxels(volume), lit
-        transfer, march, volume_, lit = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
+        of_shader = None if shader is None else shader.leaves
+        parts = transfer, march, without_voxels(volume), of_shader
+        transfer, march, volume_, of_shader = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
         sums = None
         if voxels:
             # many small parts are summed, which 16 bits would lose
             dtype = volume.data.dtype
             sums = jnp.zeros(volume.data.size, dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32)
-        return cls(transfer, march, volume_, sums, lit)
+        return cls(transfer, march, volume_, sums, of_shader)
 
 
 class Replay(SampleVisitor):
-    """Pulls the samples of rays (groups, rays in a group) back.
+    """Pulls the cotangents of rays (groups, rays in a group) back to what their samples depend on.
 
     **Arguments:**
 
     - `pipeline`: of the rays; without lighting. `scene`: what the gradient is taken by.
     - `words`: the packed copy of the scene's voxels.
-    - `rays`: that are marched.
+    - `rays`: those that are marched.
     - `given`: cotangents of the rays.
-    - `total`: to be added to.
-    - `light`: what shades the samples.
-    - `places`: whether volume, camera, rays or march have a gradient.
+    - `total`: the gradients so far, to which those of these rays are added.
+    - `shader`: what shades the samples.
+    - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """
 
     volume: Volume
     words: UInt32[Array, " voxels"] | None
     transfer: Transfer
     pipeline: Pipeline
-    places: bool
-    light: Lit | None
+    geometric: bool
+    shader: Shader | None
     tiling: Tiling
     given: Cotangents
     carry: Scalar
@@ -128,16 +128,16 @@ class Replay(SampleVisitor):
         rays: Ray,
         given: Cotangents,
         total: Total,
-        light: Lit | None,
+        shader: Shader | None,
         tiling: Tiling,
         *,
-        places: bool,
+        geometric: bool,
     ):
         self.volume, self.words, self.transfer = scene.volume, words, scene.transfer
-        self.pipeline, self.places, self.light = pipeline, places, light
+        self.pipeline, self.geometric, self.shader = pipeline, geometric, shader
         self.given, self.total, self.tiling = given, total, tiling
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
-        self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if places else None
+        self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if geometric else None
 
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, carry: Scalar, total: Total
@@ -149,16 +149,16 @@ class Replay(SampleVisitor):
         depths = [self.pipeline.march.sample(cell) for cell in samples.cells]
         weights = weights_of(self.pipeline, at, samples.opacity)
         of_color = [(weight * red, weight * green, weight * blue) for weight in weights.weight]
-        lit: list[ShadingVjp] | None = None
+        shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
-        if self.light is not None:
-            sums = LightTotal(total.light, total.transfer, total.voxels)
-            lit, sums = shading_vjp(
-                *(self.light, self.pipeline, ray, samples, weights, of_color),
+        if self.shader is not None:
+            sums = ShadingTotal(total.shader, total.transfer, total.voxels)
+            shaded, sums = shading_vjp(
+                *(self.shader, self.pipeline, ray, samples, weights, of_color),
                 *(self.tiling.chunk, sums),
             )
-            total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.light)
-            colors, of_color = [part.color for part in lit], [part.of_color for part in lit]
+            total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.shader)
+            colors, of_color = [part.color for part in shaded], [part.of_color for part in shaded]
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [
@@ -170,25 +170,25 @@ class Replay(SampleVisitor):
 
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
-            of_extinction = slopes[i] * cell.width + (0 if lit is None else lit[i].of_extinction)
+            of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
             transfer = self.transfer
             pull = transfer.pull_integrated if self.pipeline.march.integrates else transfer.pull
             of_transfer, of_read = pull(measured, of_color[i], of_extinction)
             total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
-            of_measured.append(of_read if lit is None else added(of_read, lit[i].of_measured))
-        if not self.places:
+            of_measured.append(of_read if shaded is None else added(of_read, shaded[i].of_measured))
+        if not self.geometric:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
-        of_point = [None] * len(depths) if lit is None else [part.of_point for part in lit]
-        of_march, of_volume, of_rays, indices, of_voxels = self._placed(
+        of_point = [None] * len(depths) if shaded is None else [part.of_point for part in shaded]
+        of_march, of_volume, of_rays, indices, of_voxels = self._geometric_vjp(
             ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
         voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_voxels)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
-        return carry, of_rays, Total(total.transfer, march, volume, voxels, total.light)
+        return carry, of_rays, Total(total.transfer, march, volume, voxels, total.shader)
 
-    def _placed(
+    def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
     ) -> tuple[PyTree, PyTree, PyTree, list[Array], list[Array]]:
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
@@ -209,15 +209,15 @@ class Replay(SampleVisitor):
             number: Int[Array, ""],
         ) -> tuple[list[Any], list[Array]]:
             march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
-            placed = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
+            whole = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
             record = Recording(perturbations or [], [])
-            here = with_fetch(placed, record) if voxels else with_words(placed, self.words)
+            here = with_fetch(whole, record) if voxels else with_words(whole, self.words)
             found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
             for piece in pieces_ahead(pipeline, ray, at, number):
                 depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
-                point = None if self.light is None else along(ray.entry, ray.direction, depth)
+                point = None if self.shader is None else along(ray.entry, ray.direction, depth)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, point))
             return found, record.indices
@@ -239,7 +239,7 @@ class Replay(SampleVisitor):
                     ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
                     " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
-            perturbations = [jnp.zeros(place.shape, self.volume.data.dtype) for place in indices]
+            perturbations = [jnp.zeros(index.shape, self.volume.data.dtype) for index in indices]
         _, pull, indices = jax.vjp(all_, march, volume, ray_floats, perturbations, has_aux=True)
         of_march, of_volume, of_ray, of_perturbations = pull(cotangents)
         return of_march, of_volume, of_ray, indices, of_perturbations

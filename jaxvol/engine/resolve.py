@@ -36,8 +36,8 @@ def resolve_image(
         rgba, depth = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)
         return jnp.concatenate([rgba, depth[None]])
 
-    def some(places: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk 5"]:
-        return jax.vmap(one)(lines_at(scene.source, places), *found)
+    def some(indices: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk 5"]:
+        return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
     resolved = of_visible(some, options.tiling.chunk, found)
     return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
@@ -46,8 +46,8 @@ def resolve_image(
 def of_visible(
     some: Callable[..., Float[Array, "chunk 5"]], size: int, found: Found
 ) -> Float[Array, "*rays 5"]:
-    """`some` of the indices of pixels, and of what was found of them, for all that are not transparent, so
-    many at a time; the others stay transparent, and infinitely far."""
+    """Pixels and depths by `some(indices, *found)`, called for `size` visible pixels at a time. Transparent
+    pixels stay 0, at infinite depth."""
     shape = found[1].shape
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
@@ -56,17 +56,17 @@ def of_visible(
         return nothing.reshape(*shape, 5)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
-    place, count = in_front(visible, size), jnp.sum(visible, dtype=jnp.int32)
+    chosen, count = in_front(visible, size), jnp.sum(visible, dtype=jnp.int32)
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
-    def computed(places: Int[Array, " chunk"]) -> Float[Array, "chunk 5"]:
-        places = jnp.minimum(places, visible.size - 1)
-        return some(places, *jax.tree.map(lambda leaf: leaf[places], flat))
+    def computed(indices: Int[Array, " chunk"]) -> Float[Array, "chunk 5"]:
+        indices = jnp.minimum(indices, visible.size - 1)
+        return some(indices, *jax.tree.map(lambda leaf: leaf[indices], flat))
 
     def chunk(start: Int[Array, ""]) -> Float[Array, "chunk 5"]:
-        places = jax.lax.dynamic_slice_in_dim(place, start, size)
-        return jax.lax.cond(start < count, computed, lambda _: jnp.zeros((size, 5), nothing.dtype), places)
+        indices = jax.lax.dynamic_slice_in_dim(chosen, start, size)
+        return jax.lax.cond(start < count, computed, lambda _: jnp.zeros((size, 5), nothing.dtype), indices)
 
-    pixels = jax.lax.map(chunk, jnp.arange(0, place.size, size, dtype=jnp.int32)).reshape(-1, 5)
-    return nothing.at[place].set(pixels, mode="drop").reshape(*shape, 5)
+    pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, 5)
+    return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, 5)

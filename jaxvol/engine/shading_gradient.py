@@ -1,6 +1,6 @@
-"""Vector–Jacobian product of shading: each visible sample is shaded again, and pulled back.
+"""VJP of shading the visible samples of a segment: `replay` calls it for scenes with lighting.
 
-The counterpart of `visible_samples.shaded_colors` in the second march.
+Shades each sample again, as `visible_samples.shaded_colors` did in the first march.
 """
 
 from typing import Any, NamedTuple
@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.fetching import scatter_add
 from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3
-from ..lighting.shading import Shading, Surroundings, lit
+from .._util.voxel_fetch import scatter_add
+from ..lighting.shading import Shading, Surroundings, shade_sample
 from ..reference import Pipeline
 from ..space import Ray
 from .segment import Samples
 from .visible_samples import Weights, samples_of, visible
 
 
-class Lit(NamedTuple):
+class Shader(NamedTuple):
     """What shades the samples of an image."""
 
     shading: Shading
@@ -32,10 +32,10 @@ class Lit(NamedTuple):
         return self.shading, self.around.space
 
 
-class LightTotal(NamedTuple):
+class ShadingTotal(NamedTuple):
     """Gradients summed over all samples: of what shades them, of the transfer function, and of the voxels."""
 
-    light: PyTree
+    shader: PyTree
     transfer: PyTree
     voxels: Float[Array, " voxels"] | None
 
@@ -52,48 +52,48 @@ class ShadingVjp(NamedTuple):
 
 
 def shading_vjp(
-    light: Lit,
+    shader: Shader,
     pipeline: Pipeline,
     ray: Ray,
     samples: Samples,
     weights: Weights,
     cotangents: list[Vec3],
     chunk: int,
-    total: LightTotal,
-) -> tuple[list[ShadingVjp], LightTotal]:
+    total: ShadingTotal,
+) -> tuple[list[ShadingVjp], ShadingTotal]:
     """Pulls back the shading of a segment's samples, and adds to the total. `cotangents`: of each piece's
     shaded colour."""
-    chosen, around = visible(weights, chunk), light.around
+    chosen, around = visible(weights, chunk), shader.around
     size = sum(weight.size for weight in weights.weight)
-    moving, fixed = eqx.partition((light.leaves, around.transfer), eqx.is_inexact_array)
+    moving, fixed = eqx.partition((shader.leaves, around.transfer), eqx.is_inexact_array)
 
     def one(
-        places: Int[Array, " chunk"], carry: tuple[ShadingVjp, LightTotal]
-    ) -> tuple[ShadingVjp, LightTotal]:
+        indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
+    ) -> tuple[ShadingVjp, ShadingTotal]:
         found, total = carry
-        some = samples_of(chosen, places, pipeline, ray, samples.cells, samples.measured, weights)
+        some = samples_of(chosen, indices, pipeline, ray, samples.cells, samples.measured, weights)
         moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
 
         def colors(moving: PyTree, moving_sample: PyTree, perturbations: Any) -> tuple[Vec3, Any]:
             (shading, space), transfer = eqx.combine(moving, fixed)
             here = Surroundings(around.volume, transfer, space)
             each = eqx.combine(moving_sample, fixed_sample)
-            return jax.vmap(lambda sample, perturbations: lit(shading, here, sample, perturbations))(
+            return jax.vmap(lambda sample, perturbations: shade_sample(shading, here, sample, perturbations))(
                 each, perturbations
             )
 
         perturbations = None
         if total.voxels is not None:
-            _, indices = jax.eval_shape(lambda: colors(moving, moving_sample, []))
-            perturbations = [jnp.zeros(each.shape, around.volume.data.dtype) for each in indices]
-        color, pull, indices = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
-        real = places < size
-        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, places))
-        (of_light, of_transfer), of_sample, of_perturbations = pull(cotangent)
-        voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_perturbations)
-        total = LightTotal(added(total.light, of_light), added(total.transfer, of_transfer), voxels)
+            _, fetches = jax.eval_shape(lambda: colors(moving, moving_sample, []))
+            perturbations = [jnp.zeros(each.shape, around.volume.data.dtype) for each in fetches]
+        color, pull, fetches = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
+        real = indices < size
+        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
+        (of_shader, of_transfer), of_sample, of_perturbations = pull(cotangent)
+        voxels = None if total.voxels is None else scatter_add(total.voxels, fetches, of_perturbations)
+        total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
-        return chosen.put(found, places, part), total
+        return chosen.put(found, indices, part), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))

@@ -54,19 +54,19 @@ def visible(weights: Weights, chunk: int) -> Chosen:
 
 def samples_of(
     chosen: Chosen,
-    places: Int[Array, " chunk"],
+    indices: Int[Array, " chunk"],
     pipeline: Pipeline,
     ray: Ray,
     cells: list[Cell],
     measured: list[Measured],
     weights: Weights,
 ) -> Sample:
-    """The samples at these places of a segment."""
+    """The samples at these flat indices of a segment."""
     entry, direction, pixel = jax.tree.map(
-        lambda leaf: leaf.at[places % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
+        lambda leaf: leaf.at[indices % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
     )
     depths = [pipeline.march.sample(cell) for cell in cells]
-    depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), places)
+    depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), indices)
     color, extinction = jax.vmap(pipeline.classification.of_cells)(read)
     transmittance = pipeline.compositing.transmittance(Composite(before))
     return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
@@ -86,9 +86,9 @@ def shaded_colors(
     chosen = visible(weights, chunk)
     assert light is not None
 
-    def one(places: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        samples = samples_of(chosen, places, pipeline, ray, cells, measured, weights)
-        return chosen.put(colors, places, jax.vmap(light)(samples))
+    def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
+        samples = samples_of(chosen, indices, pipeline, ray, cells, measured, weights)
+        return chosen.put(colors, indices, jax.vmap(light)(samples))
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
     return chosen.split(chosen.fold(one, (none, none, none)), len(alphas))

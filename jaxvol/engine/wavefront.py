@@ -1,4 +1,4 @@
-"""In which order are rays marched? In batches of groups, refilled as rays finish.
+"""In which order are the rays of a tile marched? In batches of groups, refilled as rays finish.
 
 - Rays are compacted in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is
   marched segment by segment until too few of its groups are left (`Tiling.min_alive`); then batches are made
@@ -61,14 +61,17 @@ def march_rays(
         finished |= ~jnp.repeat(visible, beams.groups // beams.count)[:, None]
     job = Job(pipeline, beams, tiling, visitor, index, prepared, jnp.zeros((), bool))
     at = with_fields(at, finished=finished)
-    weighs = isinstance(pipeline.compositing, Weighting)  # to others, transparent cells may matter
+    # Rays that may shift begin behind a transparent first cell. Not for a `Selection`, to which such cells
+    # may matter; not where rays leap, since a leap shifts them, too; not for a visitor, which must see every
+    # sample.
+    weighs = isinstance(pipeline.compositing, Weighting)
     if march.may_shift and weighs and index is None and visitor is None:
         at = _past_first_cell(pipeline, rays, at)
         alive = job.alive(at)
         job = job._replace(any_order=_mostly(alive & ~regular_from_here(at), of=alive))
     if beams.range is not None:
         over = vmap_rays(partial(over_transparent, pipeline))
-        # Rays that see nothing are finished first, and so stay where they are: their `first` is no index.
+        # `first` is not a valid index for rays that see nothing: these are finished before, and so not moved.
         at = over(rays, finished_after(beams.range, at), beams.range.first)
     visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
     state: State = varying((at, visited), rays)

@@ -18,7 +18,7 @@ from jax.scipy.special import logit
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, number, require
-from ..camera import Camera
+from ..camera import Camera, axes_of
 
 
 MARGIN = 1e-3
@@ -158,7 +158,7 @@ class Pose(Bijection):
                 f"{name} must be a camera that differs from the pose's start only in position and "
                 f"orientation, at the same distance from its focal point; got {value} for the start {start}."
             )
-        axes = [np.stack([np.asarray(axis, float) for axis in c._axes()], axis=1) for c in (start, value)]
+        axes = [np.stack([np.asarray(axis, float) for axis in axes_of(c)], axis=1) for c in (start, value)]
         rotation = Rotation.from_matrix(axes[1] @ axes[0].T).as_rotvec()
         shift = (value.focal_point - start.focal_point) / _distance(start)
         return {"rotation": jnp.asarray(rotation, shift.dtype), "translation": shift}

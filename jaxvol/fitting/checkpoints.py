@@ -27,7 +27,7 @@ def save(path: Path, state: Any, about: dict[str, Any]) -> None:
     eqx.tree_serialise_leaves(buffer, state)
     part = path.with_name(path.name + ".part")
     with part.open("wb") as file:
-        file.write(_seal(buffer))
+        file.write(_checksum_line(buffer))
         file.write(buffer.getbuffer())
         file.flush()
         os.fsync(file.fileno())
@@ -83,16 +83,16 @@ def before(path: Path) -> Path:
 def _read(path: Path) -> tuple[dict[str, Any] | None, io.BytesIO]:
     """The description, None for a zip archive; and the rest of the file."""
     with path.open("rb") as file:
-        seal = file.readline()
+        first = file.readline()
         content = io.BytesIO(file.read())
-    if seal.startswith(b"PK"):
+    if first.startswith(b"PK"):
         return None, content
-    if seal != _seal(content):
+    if first != _checksum_line(content):
         raise ValueError("its checksum does not match")
     return json.loads(content.readline()), content
 
 
-def _seal(content: io.BytesIO) -> bytes:
+def _checksum_line(content: io.BytesIO) -> bytes:
     """First line of a file with this content."""
     return b"jaxvol checkpoint, SHA-256 " + hashlib.sha256(content.getbuffer()).hexdigest().encode() + b"\n"
 

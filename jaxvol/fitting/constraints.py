@@ -29,7 +29,7 @@ class Free(eqx.Module):
 
     bijections: list[Bijection]
     held: list[Any]
-    places: list[str] = eqx.field(static=True)
+    paths: list[str] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
 
     @classmethod
@@ -43,12 +43,12 @@ class Free(eqx.Module):
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
         bijections = [bijection for _, bijection in found]
         nodes = structure.flatten_up_to(parameters)
-        places = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
-        start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, places, strict=True))
+        paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
+        start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, paths, strict=True))
         if not jax.tree.leaves(start):
             raise ValueError("parameters must hold a float array that is free; everything given is fixed.")
         held = [n if isinstance(b, Fixed) else None for b, n in zip(bijections, nodes, strict=True)]
-        return cls(bijections, held, places, structure), start
+        return cls(bijections, held, paths, structure), start
 
     def forward(self, free: FreeVariables) -> PyTree:
         """Parameters for these free variables."""
@@ -62,9 +62,9 @@ class Free(eqx.Module):
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []
-        for place, node in zip(self.places, self.moved(free), strict=True):
-            for path, leaf in jax.tree_util.tree_flatten_with_path(node)[0]:
-                name = place.removeprefix("parameters") + jax.tree_util.keystr(path)
+        for path, node in zip(self.paths, self.moved(free), strict=True):
+            for inner, leaf in jax.tree_util.tree_flatten_with_path(node)[0]:
+                name = path.removeprefix("parameters") + jax.tree_util.keystr(inner)
                 names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
 

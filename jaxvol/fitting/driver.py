@@ -328,7 +328,7 @@ def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
     kinds = [type(b).__name__ for b in free.bijections]
     return {
         "solver": type(solver).__name__,
-        "parameters": [f"{place}: {kind}" for place, kind in zip(free.places, kinds, strict=True)],
+        "parameters": [f"{path}: {kind}" for path, kind in zip(free.paths, kinds, strict=True)],
         "state": [f"{x.dtype}{list(x.shape)}" for x in jax.tree.leaves(eqx.filter(run, eqx.is_array))],
         "number of residuals": problem.residual.count(),
         "loss at the start": run.losses[0],

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from .._util.checks import Arrayable, described, finite, finite_array
 from .._util.trees import PyTree
-from ..camera import Camera
+from ..camera import Camera, rows_of
 from ..compositing import Compositing, Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march import March
@@ -39,9 +39,9 @@ TANGENTS = 64
 
 
 class Tiles(NamedTuple):
-    """Pieces of a residual, of equal shape: `of(parameters, item, adjoint)` for each of the stacked items."""
+    """Pieces of a residual, of equal shape: `residual(parameters, item, adjoint)` of each stacked item."""
 
-    of: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
+    residual: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
     items: PyTree
     entries: int
 
@@ -95,10 +95,10 @@ class OwnResidual(Residual):
                 "custom function is not split into tiles. Raise max_jacobian, or use an ImageResidual."
             )
 
-        def of(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
+        def residual(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
             return ravel_pytree(self.function(parameters))[0]
 
-        return [Tiles(of, jnp.zeros(1), self.length)]
+        return [Tiles(residual, jnp.zeros(1), self.length)]
 
 
 class _Group(eqx.Module):
@@ -108,8 +108,8 @@ class _Group(eqx.Module):
     images: Float[Array, "views height width channels"]
 
 
-Made = tuple[Volume, Transfer, Camera, March] | tuple[Volume, Transfer, Camera, March, Lighting | None]
-Scene = Callable[[Any, Camera], Made]
+SceneParts = tuple[Volume, Transfer, Camera, March] | tuple[Volume, Transfer, Camera, March, Lighting | None]
+SceneFunction = Callable[[Any, Camera], SceneParts]
 
 
 class ImageResidual(Residual):
@@ -134,14 +134,14 @@ class ImageResidual(Residual):
     NaN or infinite pixels, and a scene that returns something else.
     """
 
-    scene: Scene
+    scene: SceneFunction
     groups: list[_Group]
     background: Float[Array, "3"]
     compositing: Compositing[Any]
 
     def __init__(
         self,
-        scene: Scene | Any,
+        scene: SceneFunction | Any,
         views: Sequence[tuple[Camera, Arrayable]] | Any,
         background: Arrayable = (1.0, 1.0, 1.0),
         *,
@@ -149,7 +149,7 @@ class ImageResidual(Residual):
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
-        self.scene = cast(Scene, scene)
+        self.scene = cast(SceneFunction, scene)
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
         by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
@@ -184,11 +184,11 @@ class ImageResidual(Residual):
         rows = math.ceil(height / pieces)
         weight = 1 / math.sqrt(self.count())
 
-        def of(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
+        def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
             volume, transfer, camera, march, lighting = self._scene(parameters, group, view)
             if pieces > 1:
-                camera = _rows_of(camera, first, rows)
+                camera = rows_of(camera, first, rows)
             rendering = render(
                 *(volume, transfer, camera, march),
                 compositing=self.compositing,
@@ -204,7 +204,7 @@ class ImageResidual(Residual):
             return jnp.where(inside, (rendered - reference) * weight, 0).reshape(-1)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
-        return Tiles(of, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
+        return Tiles(residual, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
 
     def _scene(
         self, parameters: PyTree, group: _Group, view: Int[Array, ""]
@@ -269,16 +269,6 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
     return camera, jnp.asarray(image)
 
 
-def _rows_of(camera: Camera, first: Int[Array, ""], rows: int) -> Camera:
-    """`Camera.crop` to `rows` whole rows from a traced row `first` on; they may reach past the image."""
-    left, right, bottom, top = camera.window
-    width, height = camera.size
-    edges = jnp.stack([first + rows, first]).astype(top.dtype) / height
-    below, above = top - (top - bottom) * edges
-    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
-    return camera._showing(jnp.stack([left, right, below, above]), (width, rows), corner)
-
-
 class Problem(eqx.Module):
     """A residual as a function of the free variables, in the forms that solvers need."""
 
@@ -335,7 +325,7 @@ class Problem(eqx.Module):
 
         def add(tiles: Tiles, triangle: Array, item: Any) -> Array:
             def residual(flat: Array) -> Array:
-                return tiles.of(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
+                return tiles.residual(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
 
             rows = jnp.concatenate([triangle, _jacobian(residual, flat)])
             return jnp.linalg.qr(rows, mode="r")
@@ -349,7 +339,7 @@ class Problem(eqx.Module):
         return jnp.zeros(())
 
     def _loss_of(self, tiles: Tiles, item: Any, free: FreeVariables) -> Float[Array, ""]:
-        return jnp.sum(tiles.of(self.free.forward(free), item, "replay") ** 2) / 2
+        return jnp.sum(tiles.residual(self.free.forward(free), item, "replay") ** 2) / 2
 
     def _accumulate(self, add: Callable[[Tiles, Any, Any], Any], total: Any) -> Any:
         """Accumulate `add` over all tiles, starting from `total`."""

@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from .._util.compaction import Chosen
 from .._util.memory import require_room
 from .._util.vec3 import Vec3
+from .._util.voxel_fetch import corners
 from .._util.xla import gather
-from ..volume import Volume, split
-from .shading import Lighting, Sample, Shading, Surroundings, lit
+from ..volume import Volume
+from .shading import Lighting, Sample, Shading, Surroundings, shade_sample
 
 
 LEVELS = 2**10 - 1
@@ -69,17 +70,10 @@ class BakedShading(Shading):
         coordinate = around.space.coordinate(sample.point)
         ends = zip(coordinate, self.light.shape, around.volume.shape, strict=True)
         x, y, z = (c * ((n - 1) / (whole - 1)) for c, n, whole in ends)
-        (i, j, k), fractions = split((x, y, z), self.light.shape)
-        _, ny, nz = self.light.shape
         r = g = b = jnp.zeros_like(x)
-        for a in range(8):
-            corner = a >> 2, a >> 1 & 1, a & 1
-            weight = jnp.ones_like(x)
-            for side, fraction in zip(corner, fractions, strict=True):
-                weight = weight * (fraction if side else 1 - fraction)
-            place = ((i + corner[0]) * ny + j + corner[1]) * nz + k + corner[2]
+        for index, weight in corners((x, y, z), self.light.shape):
             # int32, since signed integers are converted to float in one instruction
-            word = gather(self.light.words, place).astype(jnp.int32)
+            word = gather(self.light.words, index).astype(jnp.int32)
             r, g, b = (
                 total + weight * (word >> shift & LEVELS).astype(x.dtype)
                 for total, shift in zip((r, g, b), (0, 10, 20), strict=True)
@@ -87,8 +81,8 @@ class BakedShading(Shading):
         red, green, blue = (c * high / LEVELS for c, high in zip((r, g, b), self.light.highest, strict=True))
         return red, green, blue
 
-    def color(self, sample: Sample, notes: Vec3, sums: Any) -> Vec3:
-        r, g, b = (c * ratio for c, ratio in zip(sample.color, notes, strict=True))
+    def color(self, sample: Sample, shared: Vec3, sums: Any) -> Vec3:
+        r, g, b = (c * ratio for c, ratio in zip(sample.color, shared, strict=True))
         return r, g, b
 
 
@@ -112,10 +106,10 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     classification = around.transfer.classification(around.volume)
 
     def node(number: Int[Array, ""]) -> Sample:
-        places = jnp.unravel_index(number, (nx, ny, nz))
+        indices = jnp.unravel_index(number, (nx, ny, nz))
         x, y, z = (
             i.astype(around.volume.spacing.dtype) * ((n - 1) / (m - 1))
-            for i, n, m in zip(places, around.volume.shape, (nx, ny, nz), strict=True)
+            for i, n, m in zip(indices, around.volume.shape, (nx, ny, nz), strict=True)
         )
         measured = classification.at((x, y, z))
         color, extinction = classification.classify(measured)
@@ -128,7 +122,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
         sample = node(number)
         r, g, b = (
             lit_color / jnp.maximum(color, DARKEST)
-            for lit_color, color in zip(lit(shading, around, sample)[0], sample.color, strict=True)
+            for lit_color, color in zip(shade_sample(shading, around, sample)[0], sample.color, strict=True)
         )
         return r, g, b
 
@@ -137,8 +131,8 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     chosen = Chosen.of([visible.reshape(1, -1)])
     zeros = jnp.zeros(count, around.volume.spacing.dtype)
 
-    def chunk(places: Int[Array, " chunk"], channels: Vec3) -> Vec3:
-        return chosen.put(channels, places, jax.vmap(ratio)(jnp.minimum(places, count - 1)))
+    def chunk(indices: Int[Array, " chunk"], channels: Vec3) -> Vec3:
+        return chosen.put(channels, indices, jax.vmap(ratio)(jnp.minimum(indices, count - 1)))
 
     ratios = jnp.stack(chosen.fold(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
     ratios = _dilate(ratios, visible.reshape(nx, ny, nz))

@@ -45,7 +45,7 @@ Occlusion = Literal["soft", "hard"]
 EDGE = 0.1
 """With soft occlusion, a material fades in and out over this fraction of its value range."""
 
-TWILIGHT = 0.25
+LIT_SIDE_COSINE = 0.25
 """With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
 
 
@@ -284,7 +284,7 @@ def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
     return lighting._bake(around)
 
 
-class _Notes(NamedTuple):
+class _Shared(NamedTuple):
     """What is common to all photons of a sample."""
 
     shares: tuple[Scalar, ...]
@@ -316,7 +316,7 @@ class TemplateShading(Shading):
         edge = EDGE if self._soft else 0.0
         return shares(self.how.materials, around.volume, coordinate, value, edge=edge)
 
-    def about(self, around: Surroundings, sample: Sample) -> _Notes:
+    def about(self, around: Surroundings, sample: Sample) -> _Shared:
         material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
         choice = jnp.zeros((), jnp.int32)
         if (count := self.templates.intensity.shape[1]) > 1:
@@ -332,67 +332,67 @@ class TemplateShading(Shading):
         total = sum(material_shares)
         parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
         default = Optics(*(jnp.ones_like(total),) * 3)
-        return _Notes(material_shares, parts, _blend(self.optics, parts, default), choice, tuple(lights))
+        return _Shared(material_shares, parts, _blend(self.optics, parts, default), choice, tuple(lights))
 
-    def term(self, around: Surroundings, sample: Sample, notes: _Notes, number: Int[Array, ""]) -> Any:
-        offset, intensity = self._photon(notes, number)
+    def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
+        offset, intensity = self._photon(shared, number)
         if self.cutoff is not None:
             unblended = intensity * (self.how.templates if self.how.blend else 1)
             intensity = jnp.where(sample.transmittance * unblended < self.cutoff, 0, intensity)
-        place = around.at(_beside(sample, offset))
-        place_shares = self._shares(around, place.coordinate, place.value)
-        place_shares = tuple(place.inside * share for share in place_shares)
-        optics, scale = _blend(self.optics, place_shares, notes.optics), intensity
+        at_photon = around.at(_beside(sample, offset))
+        shares = self._shares(around, at_photon.coordinate, at_photon.value)
+        shares = tuple(at_photon.inside * share for share in shares)
+        optics, scale = _blend(self.optics, shares, shared.optics), intensity
         if len(self.how.materials) > 1:
             # refraction into another material stretches the template by the ratio of the speeds of light
-            speed_ratio = notes.optics.refractive_index / optics.refractive_index
+            speed_ratio = shared.optics.refractive_index / optics.refractive_index
             x, y, z = offset
             offset = x * speed_ratio, y * speed_ratio, z * speed_ratio
-            place = around.at(_beside(sample, offset))
-            own = notes.optics.opacity
+            at_photon = around.at(_beside(sample, offset))
+            own = shared.optics.opacity
             scale = intensity * jnp.where(own == 0, 0, optics.opacity / jnp.where(own == 0, 1, own))
         if self._soft:  # the opacity of one mean free path there
-            matter = -jnp.expm1(-place.extinction * optics.mean_free_path)
+            matter = -jnp.expm1(-at_photon.extinction * optics.mean_free_path)
         else:
-            matter = step(place.extinction, 0.0)
-        r, g, b = (scale * sum(place_shares) * matter * c for c in place.color)
+            matter = step(at_photon.extinction, 0.0)
+        r, g, b = (scale * sum(shares) * matter * c for c in at_photon.color)
 
-        seen = intensity * self._visible(around, sample, offset, place.extinction)
-        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in notes.lights)
+        seen = intensity * self._visible(around, sample, offset, at_photon.extinction)
+        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
         return brightness, (r, g, b)
 
-    def color(self, sample: Sample, notes: _Notes, sums: Any) -> Vec3:
+    def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
         brightness, inner = sums
         # 1 from a material's soft edge inwards: an unlit part of the colour would look like emission
-        matter = jnp.minimum(2 * sum(notes.shares), 1)
-        scale = matter * WHITE * notes.optics.reflectance
+        matter = jnp.minimum(2 * sum(shared.shares), 1)
+        scale = matter * WHITE * shared.optics.reflectance
         red, green, blue = (
             c * (1 - matter)
             + scale
             * (c + s)
-            * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, notes.lights, strict=True))
+            * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, shared.lights, strict=True))
             for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
         )
         return red, green, blue
 
-    def _photon(self, notes: _Notes, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
+    def _photon(self, shared: _Shared, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
         """Offset and intensity of a photon of the sample's material, or of several blended by their parts."""
-        x = y = z = intensity = jnp.zeros_like(notes.parts[0])
-        for m, part in enumerate(notes.parts):
-            offset = self.templates.offset[m, notes.template, number]
-            intensity = intensity + part * self.templates.intensity[m, notes.template, number]
+        x = y = z = intensity = jnp.zeros_like(shared.parts[0])
+        for m, part in enumerate(shared.parts):
+            offset = self.templates.offset[m, shared.template, number]
+            intensity = intensity + part * self.templates.intensity[m, shared.template, number]
             x, y, z = x + part * offset[0], y + part * offset[1], z + part * offset[2]
         return (x, y, z), intensity
 
     def _visible(self, around: Surroundings, sample: Sample, offset: Vec3, first: Scalar) -> Scalar:
         """Visibility of a photon from the sample; `first` is the extinction at the photon itself."""
         further = [around.extinction(_beside(sample, offset, k)) for k in self.how.reach]
-        places = [first, *further]
+        extinctions = [first, *further]
         if not self._soft:
-            clear = (1 - step(extinction, 0.0) for extinction in places)
+            clear = (1 - step(extinction, 0.0) for extinction in extinctions)
             return functools.reduce(jnp.multiply, clear)
         pieces = np.diff([0.0, 1.0, *self.how.reach])
-        depth = sum(piece * extinction for piece, extinction in zip(pieces, places, strict=True))
+        depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
         return jnp.exp(-depth * _norm(offset))
 
     def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
@@ -405,7 +405,7 @@ class TemplateShading(Shading):
         near = closer - length**2 / (2 * distance)
         if not self._soft:
             return step(near, 0.0)
-        return smoothstep(0.5 + near / length / (2 * TWILIGHT))
+        return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
 
 
 def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:

@@ -1,7 +1,7 @@
 """How is a classified sample shaded? The interface of lightings.
 
 Shading comes between the transfer function and compositing. A user passes a `Lighting`; it makes a `Shading`
-for each image; and engines call `lit`, which looks at places around a sample, one by one, and sums up.
+for each image; and engines call `shade_sample`, which adds up terms for points around a sample, one by one.
 """
 
 from abc import abstractmethod
@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.fetching import Recording
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
+from .._util.voxel_fetch import Recording
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
@@ -41,7 +41,7 @@ class Sample(NamedTuple):
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
 
 
-class Place(NamedTuple):
+class ClassifiedPoint(NamedTuple):
     """What is at a point of the world.
 
     - `inside`: 1 in the volume, falling to 0 at one voxel outside, so that light does not jump at the
@@ -65,7 +65,7 @@ class Surroundings(eqx.Module):
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
 
-    def at(self, point: Vec3) -> Place:
+    def at(self, point: Vec3) -> ClassifiedPoint:
         """What is at a world point."""
         inside, coordinate, measured = self._measured(point)
 
@@ -73,7 +73,7 @@ class Surroundings(eqx.Module):
             return self.transfer.classification(self.volume).classify(measured)
 
         color, extinction = self._in_memory(found, measured)
-        return Place(inside, coordinate, measured[0], color, inside * extinction)
+        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
 
     def extinction(self, point: Vec3) -> Scalar:
         """The extinction at a world point."""
@@ -96,7 +96,7 @@ class Surroundings(eqx.Module):
 class Shading(eqx.Module):
     """A lighting, made ready for one image. All methods see one sample.
 
-    A sample's light is a sum of `terms` over places around it. Only `term` may read voxels: under replay,
+    A sample's light is a sum of `terms` over points around it. Only `term` may read voxels: under replay,
     those that are read elsewhere get no gradient.
     """
 
@@ -107,14 +107,14 @@ class Shading(eqx.Module):
 
     @abstractmethod
     def about(self, around: Surroundings, sample: Sample) -> PyTree:
-        """What all terms need to know about the sample itself."""
+        """What all terms and `color` share: it is computed once for each sample."""
 
-    def term(self, around: Surroundings, sample: Sample, notes: PyTree, number: Int[Array, ""]) -> PyTree:
+    def term(self, around: Surroundings, sample: Sample, shared: PyTree, number: Int[Array, ""]) -> PyTree:
         """One term: arrays, which are summed over all terms. Not called where `terms` is 0."""
         return ()
 
     @abstractmethod
-    def color(self, sample: Sample, notes: PyTree, sums: PyTree) -> Vec3:
+    def color(self, sample: Sample, shared: PyTree, sums: PyTree) -> Vec3:
         """The shaded colour."""
 
 
@@ -150,29 +150,28 @@ class Lighting(eqx.Module):
 def lit_classification(
     volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None, *, integrated: bool = False
 ) -> Classification:
-    """Measuring, classifying and, where there is a lighting, shading the places of a volume, or also cells
+    """Measuring, classifying and, where there is a lighting, shading the points of a volume, or also cells
     that are `integrated`."""
     classification = classification_of(transfer, volume, integrated=integrated)
     if lighting is None:
         return classification
     around = Surroundings(volume, transfer, space)
     shading = lighting.shading(around)
-    return classification._replace(light=lambda sample: lit(shading, around, sample)[0])
+    return classification._replace(light=lambda sample: shade_sample(shading, around, sample)[0])
 
 
-def lit(
+def shade_sample(
     shading: Shading, around: Surroundings, sample: Sample, perturbations: Any = None
 ) -> tuple[Vec3, Any]:
-    """The colour of a sample as lit.
+    """The shaded colour of a sample, and the indices of the voxels that its terms fetched.
 
-    `perturbations`: for a gradient of the voxels, what `replay` adds to each voxel that a term asks for:
-    arrays with a leading axis for the terms. Returned are also the voxels that were asked for, in the same
-    way: none where there are no terms. None: nobody wants to know.
+    `perturbations`: None, and then no indices are returned; or, for a gradient of the voxels, those of
+    `Recording`. Perturbations and indices are arrays with a leading axis over the terms, one for each fetch.
     """
-    notes = shading.about(around, sample)
+    shared = shading.about(around, sample)
 
-    # What it knows of one place is computed again on the way back, where it would take a place in memory for
-    # each of them.
+    # The backward pass computes each term again, so that memory holds the intermediate values of one term,
+    # not of all.
     @jax.checkpoint
     def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
         number, perturbations = each
@@ -181,12 +180,12 @@ def lit(
             indices, live = [], None
             volume = with_fetch(volume, Recording(perturbations, indices))
         here = Surroundings(volume, around.transfer, around.space, live)
-        added = shading.term(here, sample, notes, number)
+        added = shading.term(here, sample, shared, number)
         return jax.tree.map(jnp.add, sums, added), indices
 
     if shading.terms == 0:
-        return shading.color(sample, notes, None), None if perturbations is None else []
-    term = jax.eval_shape(lambda: shading.term(around, sample, notes, jnp.zeros((), jnp.int32)))
+        return shading.color(sample, shared, None), None if perturbations is None else []
+    term = jax.eval_shape(lambda: shading.term(around, sample, shared, jnp.zeros((), jnp.int32)))
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
     sums, indices = jax.lax.scan(one, none, (jnp.arange(shading.terms), perturbations))
-    return shading.color(sample, notes, sums), indices
+    return shading.color(sample, shared, sums), indices

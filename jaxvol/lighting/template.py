@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from .._util.checks import integer, is_traced, number
 from .._util.memory import require_room
 from .._util.npy import read_arrays
-from .._util.vec3 import Scalar, golden_spiral, orthonormal
+from .._util.vec3 import Scalar, golden_spiral, turned
 from .materials import Material, Optics, materials_of, smoothstep
 
 
@@ -286,15 +286,18 @@ class _Growth(NamedTuple):
         return math.floor(1 / (FADES * self.threshold) + 1e-9)
 
     @property
+    def tree_size(self) -> int:
+        """Photons of all levels, each twice as wide as the one before, up to `max_width`."""
+        doubling = sum(min(self.packets * 2**level, self.max_width) for level in range(min(self.levels, 64)))
+        return doubling + max(self.levels - 64, 0) * self.max_width
+
+    @property
     def capacity(self) -> int:
-        whole = sum(min(self.packets * 2**level, self.max_width) for level in range(min(self.levels, 64)))
-        whole += max(self.levels - 64, 0) * self.max_width
-        return min(whole, self.max_width) if self.conserving else whole
+        return min(self.tree_size, self.max_width) if self.conserving else self.tree_size
 
     def require_room(self, templates: int) -> None:
         """**Raises** `ValueError` if this many templates would not fit into memory."""
-        tree = sum(min(self.packets * 2**level, self.max_width) for level in range(min(self.levels, 64)))
-        tree += max(self.levels - 64, 0) * self.max_width
+        tree = self.tree_size
         each = tree * (BYTES_PER_PHOTON + (BYTES_PER_PAIR * tree if self.merge > 0 else 0))
         require_room(
             templates * each,
@@ -391,11 +394,9 @@ def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
     """Directions at an angle to `direction` given by its cosine; `u` in [0, 1) selects the azimuth."""
     x, y, z = direction.T
-    first, second = (jnp.stack(axis, axis=-1) for axis in orthonormal((x, y, z)))
     sine = _root(1 - cosine**2)
     around = 2 * jnp.pi * u
-    turned = (sine * jnp.cos(around))[:, None] * first + (sine * jnp.sin(around))[:, None] * second
-    return turned + cosine[:, None] * direction
+    return jnp.stack(turned((sine * jnp.cos(around), sine * jnp.sin(around), cosine), (x, y, z)), axis=-1)
 
 
 def _sorted(photons: ScattererTemplate) -> ScattererTemplate:
@@ -409,8 +410,8 @@ def _sorted(photons: ScattererTemplate) -> ScattererTemplate:
 
 def _merged(photons: ScattererTemplate, distance: float) -> ScattererTemplate:
     """Add each photon's intensity to the brightest photon within this distance."""
-    place = jax.lax.stop_gradient(photons.offset)
-    near = sum((place[:, None, i] - place[None, :, i]) ** 2 for i in range(3)) <= distance**2
+    offset = jax.lax.stop_gradient(photons.offset)
+    near = sum((offset[:, None, i] - offset[None, :, i]) ** 2 for i in range(3)) <= distance**2
     # Photons are sorted, so argmax finds the brightest: the photon itself if none near is brighter. A host
     # may have a host in turn; doubling follows the chain to its end.
     host = jnp.argmax(near, axis=-1)

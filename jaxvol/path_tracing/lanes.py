@@ -100,7 +100,7 @@ def _compact(state: _Lanes, lanes: int, count: int) -> _Lanes:
     """Compact the walks that are alive into `lanes` lanes, and store the results of the others."""
     alive = state.walks.alive
     results = state.results.store(jnp.where(alive, count, state.queue_index), state.walks)
-    place = jnp.nonzero(alive, size=lanes, fill_value=alive.shape[0])[0]
-    queue_index = state.queue_index.at[place].get(mode="fill", fill_value=count)
-    walks = jax.tree.map(lambda leaf: leaf.at[place].get(mode="fill", fill_value=0), state.walks)
+    indices = jnp.nonzero(alive, size=lanes, fill_value=alive.shape[0])[0]
+    queue_index = state.queue_index.at[indices].get(mode="fill", fill_value=count)
+    walks = jax.tree.map(lambda leaf: leaf.at[indices].get(mode="fill", fill_value=0), state.walks)
     return _Lanes(walks, queue_index, state.begun, results)

@@ -31,7 +31,7 @@ from .lanes import PathResults, walk_all
 from .majorants import Majorants
 from .medium import Medium
 from .result import PathTraced
-from .walks import Scene, Walk, Words, step
+from .walks import Walk, WalkScene, Words, step
 
 
 LANES = 2**13
@@ -136,8 +136,8 @@ def path_trace(
         limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
-    how = _How(paths, integer("lanes", lanes, 1), bool(antialias))
-    how.require_room(camera)
+    options = _TraceOptions(paths, integer("lanes", lanes, 1), bool(antialias))
+    options.require_room(camera)
     seed = _seed(key)
     first = 0
     if onto is not None:
@@ -152,11 +152,11 @@ def path_trace(
         anisotropy,
         jnp.asarray(limit, jnp.int32),
     )
-    traced = _trace(inputs, camera, seed, jnp.asarray(first, jnp.uint32), how)
+    traced = _trace(inputs, camera, seed, jnp.asarray(first, jnp.uint32), options)
     return traced if onto is None else onto.joined(traced)
 
 
-class _How(eqx.Module):
+class _TraceOptions(eqx.Module):
     """Static settings of the compiled program."""
 
     paths: int = eqx.field(static=True)
@@ -213,9 +213,9 @@ class _Inputs(eqx.Module):
     anisotropy: Scalar
     max_scatterings: Int[Array, ""]
 
-    def scene(self) -> Scene:
+    def scene(self) -> WalkScene:
         volume = with_words(self.volume, self.words)
-        return Scene(
+        return WalkScene(
             volume,
             Medium.of(volume, self.transfer, self.materials),
             Majorants.of(volume, self.blocks, self.transfer, self.materials),
@@ -227,7 +227,7 @@ class _Inputs(eqx.Module):
 
 @compiled
 def _trace(
-    inputs: _Inputs, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], how: _How
+    inputs: _Inputs, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], options: _TraceOptions
 ) -> PathTraced:
     """Trace the pixels row by row, in waves that bound the memory."""
     inputs, camera = jax.tree.map(_single, (inputs, camera))
@@ -237,23 +237,23 @@ def _trace(
     ranges = inputs.blocks if inputs.volume.field is None else None
     valid = all_finite((without_voxels(inputs.volume), ranges, scene.majorants, inputs.transfer))
     valid &= all_finite((inputs.materials, inputs.lights, inputs.anisotropy, camera))
-    pixels = how.pixels(camera)
+    pixels = options.pixels(camera)
     waves = -(-width * height // pixels)
-    count = pixels * how.paths
+    count = pixels * options.paths
 
     def wave(number: Int[Array, ""]) -> tuple[Array, ...]:
-        def begin(place: Int[Array, " lanes"]) -> Walk:
-            pixel, path = number * pixels + place // how.paths, place % how.paths
-            alive = valid & (place < count) & (pixel < width * height)
+        def begin(index: Int[Array, " lanes"]) -> Walk:
+            pixel, path = number * pixels + index // options.paths, index % options.paths
+            alive = valid & (index < count) & (pixel < width * height)
             words = (
                 pixel.astype(jnp.uint32),
                 first + path.astype(jnp.uint32),
-                jnp.broadcast_to(seed, place.shape),
+                jnp.broadcast_to(seed, index.shape),
             )
-            return jax.vmap(lambda *of_one: _begin(scene, camera, how, *of_one))(words, alive)
+            return jax.vmap(lambda *of_one: _begin(scene, camera, options, *of_one))(words, alive)
 
-        results = walk_all(begin, lambda walks: step(scene, walks), count, how.lanes)
-        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, how.paths), results))
+        results = walk_all(begin, lambda walks: step(scene, walks), count, options.lanes)
+        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, options.paths), results))
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
@@ -262,7 +262,7 @@ def _trace(
     images = jax.tree.map(
         lambda leaf: jnp.where(valid, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, images
     )
-    return PathTraced(*images, seed=seed, paths=how.paths)
+    return PathTraced(*images, seed=seed, paths=options.paths)
 
 
 def _single(leaf: Array) -> Array:
@@ -270,11 +270,13 @@ def _single(leaf: Array) -> Array:
     return leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf
 
 
-def _begin(scene: Scene, camera: Camera, how: _How, words: Words, alive: Bool[Array, ""]) -> Walk:
+def _begin(
+    scene: WalkScene, camera: Camera, options: _TraceOptions, words: Words, alive: Bool[Array, ""]
+) -> Walk:
     """Start a walk where the camera's ray enters the volume."""
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
-    if how.antialias:
+    if options.antialias:
         x, y, *_ = hashed_uniforms_4(pixel, path, jnp.full_like(pixel, BEFORE_FIRST_STEP), seed)
         origin, direction = camera.ray(column.astype(x.dtype) + x - 0.5, row.astype(y.dtype) + y - 0.5)
     else:

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from .._util.vec3 import Scalar, Vec3, orthonormal
+from .._util.vec3 import Scalar, Vec3, turned
 
 
 def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
@@ -40,15 +40,10 @@ def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
     return sine * jnp.cos(angle), sine * jnp.sin(angle), cosine
 
 
-def turned(around_z: Vec3, direction: Vec3) -> Vec3:
-    """Rotate a unit direction around the z axis to one that lies in the same way around `direction`."""
-    (x, y, cosine), (dx, dy, dz) = around_z, direction
-    (a, b, c), (d, e, f) = orthonormal(direction)
-    return _unit((x * a + y * d + cosine * dx, x * b + y * e + cosine * dy, x * c + y * f + cosine * dz))
+def scattered(around_z: Vec3, direction: Vec3) -> Vec3:
+    """The direction after a scattering, drawn by `sample_phase`, of light that travels along `direction`.
 
-
-def _unit(direction: Vec3) -> Vec3:
-    """Restore unit length up to first order; rounding errors would add up over many scatterings."""
-    x, y, z = direction
+    Restores unit length up to first order, since rounding errors would add up over many scatterings."""
+    x, y, z = turned(around_z, direction)
     scale = (3 - (x * x + y * y + z * z)) / 2  # 1 / sqrt(n), to first order around 1
     return x * scale, y * scale, z * scale

@@ -60,13 +60,13 @@ class Flight(eqx.Module):
 class Candidate(eqx.Module):
     """Where a flight has stopped.
 
-    - `found`: at a collision candidate, at the grid coordinate `place`, under this `majorant`.
+    - `found`: at a collision candidate, at the grid coordinate `coordinate`, under this `majorant`.
     - `over`: at its end. If neither holds, the flight is still on its way.
     """
 
     found: Bool[Array, "..."]
     over: Bool[Array, "..."]
-    place: Vec3
+    coordinate: Vec3
     majorant: Scalar
 
 
@@ -86,8 +86,8 @@ def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, 
     no = jnp.zeros((), bool)
     start = flight, -jnp.log1p(-uniform), no, no
     flight, _, found, over = jax.lax.fori_loop(0, CROSSINGS, cross, start)
-    place = majorants.within(along(flight.start, flight.rate, flight.depth), flight.block)
-    return flight, Candidate(found, over, place, flight.entry)
+    coordinate = majorants.within(along(flight.start, flight.rate, flight.depth), flight.block)
+    return flight, Candidate(found, over, coordinate, flight.entry)
 
 
 def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Flight, Scalar, Array, Array]:

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.noise import hashed_uniforms_4
-from .._util.vec3 import Scalar, Vec3, apart
+from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, select, times
 from .._util.xla import in_memory
 from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
 from ..volume import Volume
 from .majorants import Majorants
 from .medium import Medium
-from .phase import phase, sample_phase, turned
+from .phase import phase, sample_phase, scattered
 from .tracking import Candidate, Flight, fly
 
 
@@ -92,7 +92,7 @@ class Walk(eqx.Module):
         )
 
 
-class Scene(NamedTuple):
+class WalkScene(NamedTuple):
     """The scene that walks travel through.
 
     - `max_scatterings`: scatterings that a walk may have.
@@ -123,10 +123,12 @@ class Scene(NamedTuple):
         """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
         return Flight.to(self.majorants, start, direction, self.spacing, end)
 
-    def light(self, place: Vec3, uniform: Scalar) -> Arriving:
+    def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
         """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
         weighted to give that of all of them on average."""
-        x, y, z = (o + c * s for o, c, s in zip(apart(self.volume.origin), place, self.spacing, strict=True))
+        x, y, z = (
+            o + c * s for o, c, s in zip(apart(self.volume.origin), coordinate, self.spacing, strict=True)
+        )
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
         each = [light.at((x, y, z)) for light in self.located]
@@ -149,7 +151,7 @@ class Scattering(NamedTuple):
     end: Scalar
 
 
-def step(scene: Scene, walks: Walk) -> Walk:
+def step(scene: WalkScene, walks: Walk) -> Walk:
     """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome.
 
     XLA recomputes a shared intermediate for each of its uses, unless a branch has put it in memory. So every
@@ -164,14 +166,14 @@ def step(scene: Scene, walks: Walk) -> Walk:
     flight, candidate = in_memory(
         live, jax.vmap(lambda flight, draw: fly(scene.majorants, flight, draw)), walks.flight, draw
     )
-    measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.place)
+    measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.coordinate)
     extinction, albedo = in_memory(live, jax.vmap(scene.medium.meet), measured)
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
     scattering = in_memory(
         live,
         jax.vmap(lambda *of_one: _scatter(scene, *of_one)),
         walks,
-        candidate.place,
+        candidate.coordinate,
         albedo,
         turn,
         choose,
@@ -184,7 +186,7 @@ def step(scene: Scene, walks: Walk) -> Walk:
 
 
 def _advance(
-    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
+    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """The walk after a candidate, where `share` is extinction / majorant; or after the end of its flight."""
     advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
@@ -198,45 +200,45 @@ def _advance(
 
 
 def _scatter(
-    scene: Scene, walk: Walk, place: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
+    scene: WalkScene, walk: Walk, coordinate: Vec3, albedo: Vec3, turn: Vec3, choose: Scalar, survive: Scalar
 ) -> Scattering:
-    """The outcome for a walk if it is scattered at `place`, with `turn` as direction around the z axis."""
-    before_roulette = _times(walk.throughput, albedo)
+    """The outcome for a walk that is scattered at `coordinate`; `turn`: the direction around the z axis."""
+    before_roulette = times(walk.throughput, albedo)
     throughput = _after_roulette(before_roulette, survive)
-    direction = turned(turn, walk.direction)
+    direction = scattered(turn, walk.direction)
     endless = jnp.full_like(survive, jnp.inf)
     if not scene.located:
         no = jnp.zeros(survive.shape, bool)
         return Scattering(direction, throughput, walk.unoccluded, no, direction, endless)
-    light = scene.light(place, choose)
-    density = phase(_dot(walk.direction, light.toward), scene.anisotropy)
-    unoccluded = _scaled(_times(before_roulette, light.irradiance), density)
-    to_light = _greatest(unoccluded) > 0
-    toward, end = _where(to_light, light.toward, direction), jnp.where(to_light, light.distance, endless)
+    light = scene.light(coordinate, choose)
+    density = phase(dot(walk.direction, light.toward), scene.anisotropy)
+    unoccluded = scaled(times(before_roulette, light.irradiance), density)
+    to_light = greatest(unoccluded) > 0
+    toward, end = select(to_light, light.toward, direction), jnp.where(to_light, light.distance, endless)
     return Scattering(direction, throughput, unoccluded, to_light, toward, end)
 
 
 def _delta_tracking(
-    scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
+    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """Advance a walk on its own flight. A collision scatters it; at the end it gathers the constant light."""
     collides = candidate.found & (decide < share)
     capped = collides & (walk.scatterings >= scene.max_scatterings)
     scatters = collides & ~capped
-    gathered = _times(walk.throughput, scene.surroundings)
-    gathered = _scaled(gathered, (candidate.over & walk.met).astype(share.dtype))
-    next_flight = scene.flight(candidate.place, scattering.toward, scattering.end)
-    goes_on = scattering.to_light | (_greatest(scattering.throughput) > 0)
+    gathered = times(walk.throughput, scene.surroundings)
+    gathered = scaled(gathered, (candidate.over & walk.met).astype(share.dtype))
+    next_flight = scene.flight(candidate.coordinate, scattering.toward, scattering.end)
+    goes_on = scattering.to_light | (greatest(scattering.throughput) > 0)
     return Walk(
         walk.words,
         walk.steps,
         jax.tree.map(lambda new, old: jnp.where(scatters, new, old), next_flight, walk.flight),
         scatters & scattering.to_light,
-        _where(scatters, scattering.direction, walk.direction),
-        _where(scatters, scattering.throughput, walk.throughput),
-        _where(scatters, scattering.unoccluded, walk.unoccluded),
+        select(scatters, scattering.direction, walk.direction),
+        select(scatters, scattering.throughput, walk.throughput),
+        select(scatters, scattering.unoccluded, walk.unoccluded),
         jnp.ones_like(walk.transmittance),
-        _plus(walk.radiance, gathered),
+        plus(walk.radiance, gathered),
         walk.met | collides,
         walk.scatterings + scatters.astype(jnp.int32),
         walk.alive & ~candidate.over & ~capped & (~scatters | goes_on),
@@ -244,13 +246,15 @@ def _delta_tracking(
     )
 
 
-def _ratio_tracking(scene: Scene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar) -> Walk:
+def _ratio_tracking(
+    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, survive: Scalar
+) -> Walk:
     """Advance a walk on its way to a light. At the end it continues from where it was scattered."""
     transmittance = walk.transmittance * jnp.where(candidate.found, jnp.maximum(1 - share, 0), 1)
     survivor = jnp.where(survive * ROULETTE < transmittance, ROULETTE, 0)
     transmittance = jnp.where(candidate.found & (transmittance < ROULETTE), survivor, transmittance)
     done = candidate.over | (transmittance == 0)
-    gathered = _scaled(walk.unoccluded, jnp.where(candidate.over, transmittance, 0))
+    gathered = scaled(walk.unoccluded, jnp.where(candidate.over, transmittance, 0))
     own_flight = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
     return eqx.tree_at(
         lambda w: (w.flight, w.to_light, w.transmittance, w.radiance, w.alive),
@@ -259,47 +263,22 @@ def _ratio_tracking(scene: Scene, walk: Walk, candidate: Candidate, share: Scala
             jax.tree.map(lambda new, old: jnp.where(done, new, old), own_flight, walk.flight),
             ~done,
             transmittance,
-            _plus(walk.radiance, gathered),
-            walk.alive & (~done | (_greatest(walk.throughput) > 0)),
+            plus(walk.radiance, gathered),
+            walk.alive & (~done | (greatest(walk.throughput) > 0)),
         ),
     )
 
 
 def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:
     """Russian roulette: a small throughput becomes 0, or is divided by the probability of survival."""
-    greatest = _greatest(throughput)
-    small = greatest < ROULETTE
-    survives = uniform * ROULETTE < greatest
-    weight = ROULETTE / jnp.where(greatest > 0, greatest, 1)
-    return _scaled(throughput, jnp.where(small, jnp.where(survives, weight, 0), 1))
+    most = greatest(throughput)
+    small = most < ROULETTE
+    survives = uniform * ROULETTE < most
+    weight = ROULETTE / jnp.where(most > 0, most, 1)
+    return scaled(throughput, jnp.where(small, jnp.where(survives, weight, 0), 1))
 
 
 def _uniforms(walk: Walk, stage: int) -> Uniforms:
     """Four uniform random numbers for stage 0 or 1 of a walk's next step."""
     pixel, path, seed = walk.words
     return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
-
-
-def _where(condition: Bool[Array, ""], a: Vec3, b: Vec3) -> Vec3:
-    x, y, z = (jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
-    return x, y, z
-
-
-def _times(a: Vec3, b: Vec3) -> Vec3:
-    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-def _plus(a: Vec3, b: Vec3) -> Vec3:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _scaled(a: Vec3, factor: Scalar) -> Vec3:
-    return a[0] * factor, a[1] * factor, a[2] * factor
-
-
-def _dot(a: Vec3, b: Vec3) -> Scalar:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _greatest(a: Vec3) -> Scalar:
-    return jnp.maximum(jnp.maximum(a[0], a[1]), a[2])

@@ -84,8 +84,8 @@ def _divided(cell: Cell, region: Region) -> tuple[Cell, Cell, Cell]:
     """Split a cell where its region first and last changes: three pieces, front to back. If the region does
     not change, the last two have width 0."""
     front, width = jax.lax.stop_gradient((cell.front, cell.width))
-    places = [front + width * (i / PROBES) for i in range(PROBES + 1)]
-    regions = [region(place) for place in places]
+    depths = [front + width * (i / PROBES) for i in range(PROBES + 1)]
+    regions = [region(depth) for depth in depths]
 
     def face(inner: Int[Array, ""], brackets: list[Bracket]) -> tuple[Scalar, Scalar]:
         """Both sides of the face where the region stops being `inner`, in the first bracket whose outer end
@@ -104,8 +104,8 @@ def _divided(cell: Cell, region: Region) -> tuple[Cell, Cell, Cell]:
 
     changed_to = [r != regions[0] for r in regions]
     changed_from = [r != regions[-1] for r in regions]
-    forward = list(zip(places, places[1:], changed_to[1:], strict=False))
-    backward = list(zip(places[:0:-1], places[-2::-1], changed_from[-2::-1], strict=True))
+    forward = list(zip(depths, depths[1:], changed_to[1:], strict=False))
+    backward = list(zip(depths[:0:-1], depths[-2::-1], changed_from[-2::-1], strict=True))
     changes = jnp.any(jnp.stack(changed_to))
     # each piece begins on its own side of the face, since it is sampled there
     _, first = face(regions[0], forward)

@@ -143,8 +143,8 @@ class _Beams(EmptySpaceIndex):
     ) -> Float[Array, " rays"]:
         count, beams = prepared.following.shape
         near = gather(prepared.near, beam)
-        place = (rays.t_in + depth - near) / prepared.length
-        stretch = jnp.clip(place.astype(jnp.int32), 0, count - 1)
+        position = (rays.t_in + depth - near) / prepared.length
+        stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
         entry = stretch * beams + beam
         following = gather(prepared.following.reshape(-1), entry)
         begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in

@@ -15,9 +15,9 @@ def test_the_chosen_ones_are_in_front_and_in_order(shape, share):
     chosen = Chosen.of([jnp.asarray(mask) for mask in masks])
     expected = np.flatnonzero(masks)
     assert chosen.number == len(expected)
-    np.testing.assert_array_equal(chosen.place[: len(expected)], expected)
-    assert chosen.place.size % CHUNK == 0
-    assert np.all(chosen.place[len(expected) :] == masks.size)
+    np.testing.assert_array_equal(chosen.indices[: len(expected)], expected)
+    assert chosen.indices.size % CHUNK == 0
+    assert np.all(chosen.indices[len(expected) :] == masks.size)
 
 
 def test_each_chosen_one_is_taken_once_and_put_where_it_was():
@@ -25,10 +25,10 @@ def test_each_chosen_one_is_taken_once_and_put_where_it_was():
     values = [jnp.asarray(rng.normal(size=(4, 900)), jnp.float32) for _ in range(2)]
     chosen = Chosen.of([value > 0.5 for value in values])
 
-    def one(places, carry):
+    def one(indices, carry):
         whole, visits = carry
-        found = chosen.take(values, places)
-        return chosen.put(whole, places, 2 * found), visits.at[places].add(1, mode="drop")
+        found = chosen.take(values, indices)
+        return chosen.put(whole, indices, 2 * found), visits.at[indices].add(1, mode="drop")
 
     whole, visits = chosen.fold(one, (jnp.zeros(7200), jnp.zeros(7200)))
     for value, part, count in zip(values, chosen.split(whole, 2), chosen.split(visits, 2), strict=True):

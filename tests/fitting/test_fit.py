@@ -127,7 +127,7 @@ def test_a_residual_is_composited_as_it_was_told():
     (view, _), how = VIEWS[0], jv.FirstVisible()
     target = jv.render(*seen(TRUTH, view), compositing=how).image()
     (tiles,) = jv.ImageResidual(seen, [(view, target)], compositing=how).tiles(10**6)
-    residual = tiles.of(TRUTH, jax.tree.map(lambda leaf: leaf[0], tiles.items), "forward")
+    residual = tiles.residual(TRUTH, jax.tree.map(lambda leaf: leaf[0], tiles.items), "forward")
     np.testing.assert_allclose(residual, 0, atol=1e-7)
     assert float(jnp.abs(target - image(TRUTH, view)).max()) > 0.1
 
@@ -284,7 +284,7 @@ def test_usual_constraints():
     view = CAMERAS[0]
     volume = jv.Volume(np.ones((2, 2, 2), np.float32))
     free, y = Free.of({"c": view, "v": volume, "b": HEAD, "t": TRUTH, "m": MARCH, "f": 2.0}, None, None)
-    kinds = {p: type(b).__name__ for p, b in zip(free.places, free.bijections, strict=True)}
+    kinds = {p: type(b).__name__ for p, b in zip(free.paths, free.bijections, strict=True)}
     fitted = {p.removeprefix("parameters"): kind for p, kind in kinds.items() if kind != "Fixed"}
     assert fitted == {
         "['c']": "Pose",

@@ -29,7 +29,7 @@ from jaxvol.lighting import (
     shading as lighting_shading,
 )
 from jaxvol.lighting.baked import BakedLighting
-from jaxvol.lighting.shading import Sample, Shading, Surroundings, lit
+from jaxvol.lighting.shading import Sample, Shading, Surroundings, shade_sample
 from jaxvol.space import Affine, Line
 
 from ..half_space import chandrasekhar, reflected, under_sky
@@ -72,7 +72,7 @@ def lit_points(lighting, volume, transfer, points, pixels, transmittance):
     shading = lighting.shading(around)
 
     def one(point, pixel):
-        return jnp.stack(lit(shading, around, sample_at(around, point, pixel, transmittance))[0])
+        return jnp.stack(shade_sample(shading, around, sample_at(around, point, pixel, transmittance))[0])
 
     return jax.vmap(one)(points, pixels)
 
@@ -939,7 +939,7 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
 
         def one(point, color, pixel):
             sample = sample_at(around, point, pixel, 1.0)._replace(color=apart(color))
-            return jnp.stack(lit(shading, around, sample)[0])
+            return jnp.stack(shade_sample(shading, around, sample)[0])
 
         return jax.vmap(one)(points, colors, pixels)
 
@@ -960,7 +960,7 @@ class Dimmed(Lighting):
         def about(self, around, sample):
             return None
 
-        def color(self, sample, notes, sums):
+        def color(self, sample, shared, sums):
             r, g, b = (part / 2 for part in sample.color)
             return r, g, b
 
@@ -1112,7 +1112,7 @@ def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     """All lighting goes through these names, which the programs of lit images call."""
     called = []
     for module in (lighting_shading, compositing, visible_samples):
-        for name in ("lit", "shaded_colors", "Chosen", "Sample"):
+        for name in ("shade_sample", "shaded_colors", "Chosen", "Sample"):
             if hasattr(module, name):
                 original = getattr(module, name)
 
@@ -1132,7 +1132,7 @@ def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     assert not called
     eqx.filter_eval_shape(loss, camera, by_hand(), "direct")
     assert "Sample" in called
-    assert "lit" in called
+    assert "shade_sample" in called
 
 
 # ---------------------------------------------------------------- gradients of images

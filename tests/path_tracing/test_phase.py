@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.path_tracing.phase import phase, sample_phase, scattered_cosine, turned
+from jaxvol.path_tracing.phase import phase, sample_phase, scattered, scattered_cosine
 
 
 ANISOTROPIES = [-0.95, -0.5, -1e-4, 0.0, 1e-6, 0.3, 0.9, 0.99]
@@ -42,7 +42,7 @@ def test_directions_turn_around_the_one_before(axis):
     first, second = jax.random.uniform(jax.random.key(0), (2, 40_000))
     around = sample_phase(jnp.float32(0.4), first, second)
     x, y, z = (jnp.full(40_000, a) for a in axis)
-    x, y, z = turned(around, (x, y, z))
+    x, y, z = scattered(around, (x, y, z))
     direction = np.stack([x, y, z], axis=-1).astype(float)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-6)
     np.testing.assert_allclose(direction @ axis, around[2], atol=1e-6)

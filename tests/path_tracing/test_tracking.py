@@ -139,7 +139,9 @@ def tracked(volume, transfer, start, direction, length):
         zero = jnp.zeros_like(lane)
         draw, decide, _, _ = hashed_uniforms_4(lane, zero, zero + step.astype(jnp.uint32), zero)
         flights, candidate = jax.vmap(lambda flight, u: fly(majorants, flight, u))(flights, draw)
-        extinction, _ = jax.vmap(lambda place: medium.meet(medium.measure(place)))(candidate.place)
+        extinction, _ = jax.vmap(lambda coordinate: medium.meet(medium.measure(coordinate)))(
+            candidate.coordinate
+        )
         share = extinction / jnp.maximum(candidate.majorant, 1e-30)
         counts = candidate.found & ~done
         left = jnp.where(counts, left * (1 - share), left)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
-from jaxvol._util.fetching import Packed
 from jaxvol._util.vec3 import apart
+from jaxvol._util.voxel_fetch import Packed
 from jaxvol.engine import packing
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling

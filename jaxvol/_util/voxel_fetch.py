@@ -1,5 +1,7 @@
 """Reads the voxels around a coordinate: one by one, from packed words, or recording each fetch."""
 
+import itertools
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import TypeAlias
@@ -45,10 +47,10 @@ class Packed(Fetch):
         bits = 8 * data.dtype.itemsize
         signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
 
-        def voxel(word: Int[Array, ""], place: int) -> Scalar:
+        def voxel(word: Int[Array, ""], number: int) -> Scalar:
             if signed:  # shifting down from the top bits extends the sign
-                return (word << (32 - bits * (place + 1)) >> (32 - bits)).astype(dtype)
-            return (word >> (bits * place) & (2**bits - 1)).astype(dtype)
+                return (word << (32 - bits * (number + 1)) >> (32 - bits)).astype(dtype)
+            return (word >> (bits * number) & (2**bits - 1)).astype(dtype)
 
         def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
             if bits == 8:
@@ -90,8 +92,8 @@ def scatter_add(
     voxels: Float[Array, " voxels"], indices: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
 ) -> Float[Array, " voxels"]:
     """Add the cotangents `parts` of fetches to the voxels `indices` that they read."""
-    for place, part in zip(indices, parts, strict=True):
-        voxels = voxels.at[place].add(
+    for index, part in zip(indices, parts, strict=True):
+        voxels = voxels.at[index].add(
             part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
         )
     return voxels
@@ -110,6 +112,18 @@ def cube_of(
         [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
     ]
     return cube, fraction
+
+
+def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
+    """The eight nodes around a coordinate: the index of each into the flattened array, and its trilinear
+    weight."""
+    (i, j, k), fraction = split(coordinate, shape)
+    _, ny, nz = shape
+    found = []
+    for x, y, z in itertools.product((0, 1), repeat=3):
+        sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
+        found.append((((i + x) * ny + j + y) * nz + k + z, math.prod(sides)))
+    return found
 
 
 def split(
