@@ -43,7 +43,7 @@ class Halves(jv.Transform):
 
 
 class Long(jv.Transform):
-    """Cells of so many steps from the grid coordinate x = `beyond` on."""
+    """Cells of so many steps in runs that begin at the grid coordinate x = `beyond` or behind it."""
 
     steps: jax.Array = eqx.field(converter=jnp.asarray)  # arrays, so that all values share one program
     beyond: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
@@ -52,14 +52,14 @@ class Long(jv.Transform):
     def longest_stride(self) -> int:
         return 4
 
-    def stride(self, ray, depth, step):
-        x, _, _ = ray.path(depth)
-        return jnp.where(x >= self.beyond, self.steps, 1)
+    def stride_error(self, ray, run):
+        x, _, _ = ray.path(run.front)
+        return jnp.where(x >= self.beyond, run.stride / self.steps, jnp.inf).astype(x.dtype), jnp.ones_like(x)
 
 
 class Unlimited(jv.Transform):
-    def stride(self, ray, depth, step):
-        return jnp.full(depth.shape, 2)
+    def stride_error(self, ray, run):
+        return jnp.zeros_like(run.front), jnp.ones_like(run.front)
 
 
 class Three(Long):
@@ -132,12 +132,11 @@ def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, 
     [
         ((Long(1),), 2.1, 7),
         ((Long(2),), 2.4, 4),  # at 0, 0.6, 1.2, 1.8
-        ((Long(3),), 2.4, 4),  # rounded down
+        ((Long(3),), 2.4, 4),  # no power of two
         ((Long(4),), 2.4, 2),  # at 0, 1.2
         ((Long(50),), 2.4, 2),  # no longer than the longest stride
-        ((Long(-1),), 2.1, 7),
-        # steps 0, 1, 2; 3 lies beyond x = 1.7, but only a cell of one step may begin there; 4 is divisible
-        ((Long(4, 1.7),), 2.4, 5),
+        ((Long(0.1),), 2.1, 7),  # one step is always allowed
+        ((Long(4, 1.7),), 2.1, 7),  # the second run begins behind 1.7, but only one of one step may be there
         ((Shift(), Long(4)), 2.4, 2),  # at 0.15, 1.35
         ((Halves(), Long(4)), 2.4, 4),  # half cells
         ((jv.AlphaCorrection(), Long(4)), 2.0, 2),

@@ -18,52 +18,55 @@ from ..variation import MARGIN, Variation, Windows
 
 
 SHARE = 1 / 20
-"""What a block's predicted error is worth in the image: errors of a ray's cells have either sign, most are
-much smaller than predicted, and what lies in front hides them. Measured: `experiments.accuracy`."""
+"""What a block's predicted error is worth in the image: errors of a ray's cells have either sign, and most
+are much smaller than predicted. Measured: `experiments.adaptive_error`."""
 
 FARTHEST = 8
-"""Blocks around its own that a stretch may touch: it is at most 17 blocks long."""
+"""Blocks around its own that a run may touch: it is at most 34 voxels long."""
 
 
 class AdaptiveSampling(Transform):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
     Where the value bends little between nodes, or the transfer function changes little with it, a long cell
-    is as good as several short ones. Take a block of 4³ voxels, of side ℓ, whose values, with those up to two
-    nodes around it, range over R, with second differences of at most H (per length²). Between the ends of a
-    cell of width w the value leaves the straight line by at most δ = H w² / 8. While it runs through R once,
-    extinction and emission change by V in total, and their slopes by K (`variation.Variation`). Then the
-    optical depth of a stretch as long as the block is wrong by about
+    is as good as several short ones; and so it is behind what hides most of it. Take a block of 4³ voxels, of
+    side ℓ, whose values, with those up to two nodes around it, range over R, with second differences of at
+    most H (per length²). Between the ends of a cell of width w the value leaves the straight line by at most
+    δ = H w² / 8. While it runs through R once, extinction and emission change by V in total, and their slopes
+    by K (`variation.Variation`). Then the optical depth of a stretch as long as the block is wrong by about
 
         e = ℓ V min(1, δ / R) + q
 
     where q is what the quadrature errs by where the value is linear: 0 for `"preintegrated"`; V w / 2 for
     `"left"`; and for `"midpoint"` K (R / ℓ) w² / 24, since it errs where a cell crosses a control point, or
-    V w / 2 where that is less. All cells of a stretch of `longest` steps are equally long: as long as e / 20
-    is at most `tolerance` in all blocks that may hold a part of it.
+    V w / 2 where that is less. Cells come in runs of four that are equally long: as long as T e / 20 is at
+    most `tolerance`, with the largest e of the blocks that may hold a part of the run, and T the
+    transmittance in front of it (`Transform.stride_error`).
 
-    **It is an estimate, not a bound**: of the RMSE of the image's colours, calibrated on five scenes
-    (`experiments.accuracy`). It knows neither what is hidden by what lies in front nor how light varies along
-    a cell. Cells are never shorter than a step: choose the step for the finest detail, half or a quarter of a
-    voxel, and `longest` so that a stretch is about four voxels long: of longer ones less is known.
+    **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes, from
+    outside and inside (`experiments.adaptive_error`). It does not know how light varies along a cell, nor
+    can cells be shorter than the shortest that it is given: an eighth of a voxel suits tolerances of 0.001, a
+    quarter larger ones. `Rendering.error` holds the root of the summed squares of T e / 20 of a ray's runs.
 
-    **It saves samples, and as yet no time**: on CPU a sample takes about twice as long, since where it lies
-    must be looked up first, so that uniform steps of the same error are somewhat faster in all five scenes.
+    **It saves samples, and on CPU little time**: a sample takes longer, since its place must be looked up
+    (`experiments.accuracy`). So it pays where samples are expensive: under light, and in gradients.
 
     For modes that do not composite "over", and for transfer functions that do not say how they vary, all
-    cells are one step long.
+    cells are one step long, and `Rendering.error` is infinite.
 
     **Arguments:**
 
     - `tolerance`: of the image's RMSE, > 0. It may be traced: images of any tolerance are made by one
       program.
-    - `longest`: the most steps of a cell, a power of two up to 64.
+    - `longest`: the most steps of the march that a cell is long, a power of two up to 64.
+    - `finest`: into how many parts the march divides its steps, a power of two; with `longest` at most 64.
+      What other transforms and `max_samples` count in steps are then these parts.
 
     What is known of the voxels is computed once for each array of them. Which cells may be long follows from
     the transfer function in each image, inside `jax.jit`, too. Strides are constants to derivatives; the
     image jumps where one changes.
 
-    **Raises:** `ValueError` for another tolerance or `longest`.
+    **Raises:** `ValueError` for another tolerance, `longest` or `finest`.
 
     Source: unpublished.
     """
@@ -72,7 +75,7 @@ class AdaptiveSampling(Transform):
     longest: int = eqx.field(static=True)
     finest: int = eqx.field(static=True)
     errors: Int32[Array, "levels bx by bz"] | None
-    """By stride and block, the predicted error as `_coded`; None before the scene is known."""
+    """By stride and block, the predicted error, `_coded`; None before the scene is known."""
 
     def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
         self.tolerance = number("tolerance", tolerance, above=0)
@@ -128,7 +131,7 @@ def _coded(error: Float[Array, "*blocks"]) -> Int32[Array, "*blocks"]:
     return jax.lax.bitcast_convert_type(known, jnp.int32)
 
 
-def _decoded(code: Int32[Array, ""], dtype: Any) -> Scalar:
+def _decoded(code: Int32[Array, "*blocks"], dtype: Any) -> Float[Array, "*blocks"]:
     """The error of a code."""
     return jax.lax.bitcast_convert_type(code, jnp.float32).astype(dtype)
 

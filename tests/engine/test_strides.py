@@ -1,11 +1,15 @@
 """Cells of several steps: the fast engine against the reference, leaping against none, and gradients."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
+from jaxvol.march import RUN
+from jaxvol.space import Affine, enter
 
 from ..scenes import in_float64, slow
 from ..test_agreement import compare, reference_image
@@ -21,9 +25,67 @@ class Patchy(jv.Transform):
     def longest_stride(self):
         return self.longest
 
-    def stride(self, ray, depth, step):
-        x, y, z = ray.path(depth)
-        return 2 ** (jnp.floor(x / 3 + y / 2 + z / 5).astype(jnp.int32) % 5)
+    def stride_error(self, ray, run):
+        x, y, z = ray.path(run.middle)
+        longest = 2 ** (jnp.floor(x / 3 + y / 2 + z / 5).astype(jnp.int32) % 5)
+        # longer cells than that behind what hides some of them
+        return jnp.where(run.stride <= longest, 0.0, run.stride / longest).astype(x.dtype), jnp.ones_like(x)
+
+
+class Table(jv.Transform):
+    """Allows runs as a table says, by stride and number of the run, where at most half is visible; and
+    behind less than that all of them."""
+
+    allowed: jax.Array
+
+    @property
+    def longest_stride(self):
+        return 16
+
+    def stride_error(self, ray, run):
+        number = jnp.round(run.front / run.step / (RUN * run.stride)).astype(jnp.int32)
+        fits = self.allowed[run.stride.bit_length() - 1, number]
+        return jnp.where(fits, 1.0, 4.0).astype(ray.length.dtype), jnp.ones_like(run.front)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**16), share=st.sampled_from([0.1, 0.3, 0.5]))
+def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share):
+    """By steps or by leaps, from where a run begins or from within it."""
+    random, steps = np.random.default_rng(seed), 16 * RUN * 4
+    allowed = random.random((5, steps // RUN)) < share
+    march = jv.March(0.5, (Table(jnp.asarray(allowed)),))
+    box, zero = Affine(jv.Volume(np.zeros((3, 3, 3)), (200.0, 200.0, 200.0))), jnp.float32(0)
+    line = (zero + 1, zero + 1, zero + 1), (zero + 1, zero, zero)
+    ray = enter(box, *line, (jnp.int32(0), jnp.int32(0)))
+
+    @jax.jit
+    def strides(index, stride, target, transmittance):
+        each = (jnp.asarray(i, jnp.int32) for i in (index, stride, target))
+        return march.strides(ray, *each, jnp.asarray(transmittance, jnp.float32))
+
+    runs, index, stride = [], 0, 1
+    while index < steps:
+        begin, stride, error = (int(each) for each in strides(index, stride, index, 1.0))
+        level = stride.bit_length() - 1
+        assert begin == index
+        assert index % (RUN * stride) == 0
+        assert stride == 1 or allowed[level, index // (RUN * stride)]
+        assert error == (1 if allowed[level, index // (RUN * stride)] else 4)
+        runs.append((index, stride))
+        index += RUN * stride
+    for target in random.integers(0, steps, 30):
+        (begin, stride), *_ = [run for run in runs if run[0] <= target < run[0] + RUN * run[1]]
+        since = runs[random.integers(0, runs.index((begin, stride)) + 1)]
+        before = runs[max(runs.index(since) - 1, 0)][1]
+        found = strides(since[0], before, target, 1.0)
+        assert (int(found.begin), int(found.stride)) == (begin, stride)
+        within = since[0] + since[1] * random.integers(1, RUN)
+        if within <= target:
+            found = strides(within, since[1], target, 1.0)
+            ahead = target // stride * stride if since == (begin, stride) else begin
+            assert (int(found.begin), int(found.stride)) == (ahead, stride)
+    assert int(strides(0, 1, 0, 0.25).stride) == 16
 
 
 def with_strides(scene):

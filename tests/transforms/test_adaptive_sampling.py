@@ -14,10 +14,11 @@ from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 from experiments import scenes as real_scenes
+from jaxvol.march import RUN, Run
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import BLOCK
 from jaxvol.space import Affine, enter
-from jaxvol.transforms.adaptive_sampling import _node_distance
+from jaxvol.transforms.adaptive_sampling import _coded, _decoded, _node_distance
 from jaxvol.variation import MARGIN, Windows
 
 from ..engine.test_gradient_matrix import CAMERAS, TOPS, assert_same, gradient
@@ -30,12 +31,14 @@ RAMP = jv.TransferFunction([0.0, 1.0], [[1.0, 1.0, 1.0]] * 2, [0.0, 2.0])
 
 
 def strides(volume, transfer, sampling, step=1.0, quadrature="preintegrated", mode: Any = None):
-    """By block, the most steps of a cell."""
+    """By block, the most steps of a cell with nothing in front."""
     variation = partial((mode or jv.Over()).variation, transfer)
     march = jv.March(step, (sampling,), quadrature).prepared(Affine(volume), Windows.of(volume), variation)
     (prepared,) = march.transforms
     assert isinstance(prepared, jv.AdaptiveSampling)
-    return np.asarray(prepared.strides)
+    assert prepared.errors is not None
+    allowed = np.asarray(_decoded(prepared.errors, jnp.float32)) <= float(sampling.tolerance)
+    return np.max([np.where(fits, 2**k, 1) for k, fits in enumerate(allowed)], axis=0)
 
 
 # -- what is known of the voxels -------------------------------------------------------------------------
@@ -130,11 +133,12 @@ def test_long_stretches_heed_what_lies_farther_away():
     """A window says nothing of what lies beyond it. One voxel differs from the others."""
     data = np.full((65, 65, 65), 0.5, np.float32)
     data[32, 32, 32] = 1
-    for longest, step, blocks in ((4, 1.0, 2), (8, 1.0, 4), (16, 0.25, 2), (32, 0.25, 4), (64, 1.0, 16)):
+    for longest, step, blocks in ((2, 0.5, 2), (4, 0.5, 4), (4, 1.0, 6), (8, 1.0, 10), (32, 0.25, 10)):
         found = strides(jv.Volume(data), RAMP, jv.AdaptiveSampling(1e-3, longest), step)
         assert (found < longest).any(axis=(1, 2)).sum() == blocks, (longest, step)
-        assert found.max() == (longest if blocks < 16 else 1)
-    assert strides(jv.Volume(data), RAMP, jv.AdaptiveSampling(1e-3, 64), 2.0).max() == 1
+        assert found.max() == longest
+    for step, longest in ((1.0, 16), (2.0, 8)):  # nothing is known of 64 voxels
+        assert strides(jv.Volume(data), RAMP, jv.AdaptiveSampling(1e3, 64), step).max() == longest
 
 
 def test_samples_must_find_what_integrals_hold():
@@ -160,22 +164,27 @@ def test_samples_must_find_what_integrals_hold():
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**16), step=st.sampled_from([0.1, 0.3, 0.5]))
-def test_a_stretch_lies_within_a_window_that_allows_its_stride(seed, step):
-    allowed = 2 ** np.random.default_rng(seed).integers(0, 4, 16)
+def test_the_error_of_a_run_is_that_of_a_window_that_holds_it(seed, step):
+    errors = np.random.default_rng(seed).random((2, 16)).astype(np.float32)
     volume = jv.Volume(np.zeros((65, 3, 3), np.float32))
-    table = jnp.asarray(allowed, jnp.uint8)[:, None, None]
     sampling = eqx.tree_at(
-        lambda of: of.strides, jv.AdaptiveSampling(1.0), table, is_leaf=lambda leaf: leaf is None
+        lambda of: of.errors,
+        jv.AdaptiveSampling(1.0, 2),
+        _coded(jnp.asarray(errors)[:, :, None, None]),
+        is_leaf=lambda leaf: leaf is None,
     )
     zero, one = jnp.float32(0), jnp.float32(1)
     ray = enter(Affine(volume), (zero - 1, one, one), (one, zero, zero), (jnp.int32(0), jnp.int32(0)))
-    depths = jnp.arange(0, 56, 0.5, dtype=jnp.float32)
-    found = jax.vmap(lambda depth: sampling.stride(ray, depth, jnp.float32(step)))(depths)
-    assert len(np.unique(found)) > 2
+    fronts = jnp.arange(0, 56, 0.5, dtype=jnp.float32)
     start = BLOCK * np.arange(16)
-    for depth, stride in zip(np.asarray(depths), np.asarray(found), strict=True):
-        holds = (start - MARGIN <= depth) & (depth + 8 * step <= start + BLOCK + MARGIN)
-        assert (allowed[holds] == stride).any(), (depth, stride)
+    for level in (0, 1):
+        run = partial(Run, stride=2**level, step=jnp.float32(step))
+        found, tolerated = jax.vmap(lambda front, run=run: sampling.stride_error(ray, run(front)))(fronts)
+        assert (np.asarray(tolerated) == 1).all()
+        for front, error in zip(np.asarray(fronts), np.asarray(found), strict=True):
+            back = front + RUN * 2**level * step
+            holds = (start - MARGIN <= front) & (back <= start + BLOCK + MARGIN)
+            assert (errors[level][holds] == error).any(), (front, level)
 
 
 @pytest.mark.parametrize("case", ["nan", "field", "selection", "unknown", "labels"])
@@ -351,7 +360,13 @@ def test_a_tolerance_that_is_none_is_refused(given):
         jv.AdaptiveSampling(given)
 
 
+@pytest.mark.parametrize("name", ["longest", "finest"])
 @pytest.mark.parametrize("given", [0, 3, 128, 2.0, True])
-def test_a_longest_stride_that_is_none_is_refused(given):
-    with pytest.raises(ValueError, match="longest must be"):
-        jv.AdaptiveSampling(0.01, given)
+def test_a_stride_that_is_none_is_refused(name, given):
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        jv.AdaptiveSampling(0.01, **{name: given})
+
+
+def test_strides_that_are_too_many_are_refused():
+    with pytest.raises(ValueError, match=r"longest \* finest must be at most 64; got 32 \* 4"):
+        jv.AdaptiveSampling(0.01, 32, 4)
