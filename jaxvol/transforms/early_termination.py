@@ -13,9 +13,15 @@ class EarlyTermination(Transform):
     """End a ray once its transmittance is at most `opacity_left`.
 
     Everything behind is left out: the error of a colour channel is at most `opacity_left` times the
-    brightest colour behind, that of the accumulated opacity at most `opacity_left`. The gradient with
-    respect to what is left out is taken as 0, an error of the same order. If the sample at which a ray
-    ends changes, the image jumps by as much; gradients do not include these jumps.
+    brightest colour behind, that of the accumulated opacity at most `opacity_left`. If the sample at which
+    a ray ends changes, the image jumps by as much.
+
+    **Gradients are less exact than the image.** They include neither what is left out nor these jumps, and
+    what they miss has the same sign in all opaque pixels: while an image hardly changes with the extinction
+    of what is opaque, the rays' last transmittances T do, by T log(1/T) for each relative change. For the
+    sum of all pixels of README's first scene, and a factor of all extinctions, the gradient is wrong by 55 %
+    at 1/255, 17 % at 0.001 and 2 % at 0.0001 (128² pixels, compared with that without early termination). For
+    fits take 0.0001, or none.
 
     **Arguments:**
 

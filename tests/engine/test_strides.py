@@ -61,8 +61,8 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share):
 
     @jax.jit
     def strides(index, stride, target, transmittance):
-        each = (jnp.asarray(i, jnp.int32) for i in (index, stride, target))
-        return march.strides(ray, *each, jnp.asarray(transmittance, jnp.float32))
+        index, stride, target = (jnp.asarray(i, jnp.int32) for i in (index, stride, target))
+        return march.strides(ray, index, stride, target, jnp.asarray(transmittance, jnp.float32))
 
     runs, index, stride = [], 0, 1
     while index < steps:
@@ -86,6 +86,8 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share):
             ahead = target // stride * stride if since == (begin, stride) else begin
             assert (int(found.begin), int(found.stride)) == (ahead, stride)
     assert int(strides(0, 1, 0, 0.25).stride) == 16
+    for index, _ in runs:  # what became allowed behind something does not reach before it
+        assert int(strides(index, 1, index, 0.25).begin) == index
 
 
 def with_strides(scene):
