@@ -108,13 +108,13 @@ def with_stride(
         return at, steps
     transmittance = pipeline.compositing.transmittance(at.composite)
     ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance)
+    inside = front(pipeline.march, at, steps) < ray.length  # a ray that leaves goes all the way
+    begin, stride = jnp.where(inside, ahead.begin - at.index, steps), jnp.where(inside, ahead.stride, 1)
     stats = at.stats
     if stats is not None:
         assert stats.error is not None
-        stats = replace(stats, error=stats.error + jnp.where(at.finished, 0, ahead.error) ** 2)
-    # a ray that leaves goes all the way
-    inside = front(pipeline.march, at, steps) < ray.length
-    begin, stride = jnp.where(inside, ahead.begin - at.index, steps), jnp.where(inside, ahead.stride, 1)
+        error = jnp.where(inside & ~at.finished, ahead.error, 0)
+        stats = replace(stats, error=stats.error + error**2)
     return replace(at, stride=stride, stats=stats), begin
 
 

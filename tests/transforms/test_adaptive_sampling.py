@@ -237,6 +237,55 @@ def test_a_real_volume_is_rendered_within_the_tolerance_by_fewer_samples(real_vo
     assert share * int(found.samples.sum()) < int(uniform.samples.sum())
 
 
+@pytest.mark.parametrize("quadrature", ["midpoint", *slow("left", "preintegrated")])
+def test_the_estimated_error_is_mostly_above_the_true_one(quadrature):
+    """And within two orders of magnitude."""
+    volume, transfer, camera, march = scene_of()
+    march = jv.March(march.step, march.transforms[1:], quadrature)  # no jitter
+    fine = jv.March(march.step / 8, march.transforms[:-1], quadrature)
+    found, truth = (jv.render(volume, transfer, camera, m) for m in (march, fine))
+    assert rmse(found.image(), truth.image()) <= 0.03
+    error = np.sqrt(np.mean((np.asarray(found.image()) - np.asarray(truth.image())) ** 2, axis=-1))
+    seen = np.asarray(truth.rgba[..., 3]) > 0.01
+    estimate = np.asarray(found.error)
+    assert np.isfinite(estimate).all()
+    assert np.mean(error[seen] <= estimate[seen]) > 0.95
+    assert np.sqrt(np.mean(estimate[seen] ** 2)) < 100 * np.sqrt(np.mean(error[seen] ** 2))
+
+
+def test_the_estimated_error_is_that_of_the_reference():
+    scene = changed(scene_of(), without=[jv.SpaceLeaping], max_samples=256)
+    volume, transfer, camera, march = scene
+    origins, directions = camera.rays()
+    found = np.asarray(jv.render(*scene).error)
+    for row, column in ((10, 18), (7, 12), (12, 27), (0, 0)):
+        ray = origins[row, column], directions[row, column]
+        alone = jv.render_ray_reference(volume, transfer, *ray, march, pixel=(column, row))
+        np.testing.assert_allclose(found[row, column], alone.error, rtol=1e-4, atol=1e-9)
+    assert found.max() > 0
+
+
+def test_the_estimated_error_is_infinite_where_nothing_is_known_and_missing_where_nothing_is_estimated():
+    volume, transfer, camera, march = scene_of()
+    nearest = jv.render(volume, transfer, camera, march, compositing=jv.FirstVisible())
+    seen = np.asarray(nearest.rgba[..., 3]) > 0
+    assert np.isinf(nearest.error[seen]).all()
+    uniform = jv.render(*changed((volume, transfer, camera, march), without=[jv.AdaptiveSampling]))
+    with pytest.raises(AttributeError, match="error is not part of this rendering: give the march Adaptive"):
+        _ = uniform.error
+
+
+def test_finest_divides_the_steps_of_the_march():
+    """Steps four times as long, divided by four, and cells of as many parts are the same march."""
+    volume, transfer, camera, march = scene_of()
+    rest = march.transforms[1:-1]
+    fine = jv.March(march.step, (*rest, jv.AdaptiveSampling(0.03, 8)), march.quadrature)
+    divided = jv.March(4 * march.step, (*rest, jv.AdaptiveSampling(0.03, 2, finest=4)), march.quadrature)
+    found, expected = (jv.render(volume, transfer, camera, m) for m in (divided, fine))
+    np.testing.assert_allclose(found.rgba, expected.rgba, atol=1e-6)
+    np.testing.assert_array_equal(found.samples, expected.samples)
+
+
 # -- both engines ----------------------------------------------------------------------------------------
 
 
