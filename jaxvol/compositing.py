@@ -68,7 +68,7 @@ class Compositing(eqx.Module, Generic[State]):
     def transmittance(self, state: State) -> Scalar:
         """Of all cells so far: `Transform.stop` decides by it, and it is what shading is told."""
 
-    def settled(self, state: State) -> Bool[Array, ""]:
+    def finished(self, state: State) -> Bool[Array, ""]:
         """Whether what follows cannot change the pixel, so that the ray is finished."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
@@ -283,7 +283,7 @@ class FirstVisible(Selection[Scalar]):
     def depth(self, state: Scalar) -> Scalar:
         return state
 
-    def settled(self, state: Scalar) -> Bool[Array, ""]:
+    def finished(self, state: Scalar) -> Bool[Array, ""]:
         return state < jnp.inf
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:

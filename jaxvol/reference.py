@@ -192,9 +192,9 @@ def stop(pipeline: Pipeline, at: Progress) -> Progress:
 def stopped(pipeline: Pipeline, composite: Any) -> Bool[Array, ""]:
     """Whether a ray in this state of compositing needs no other cell."""
     march, _, _, compositing = pipeline
-    stops, settled = march.stop(compositing.transmittance(composite)), compositing.settled(composite)
-    check_answer(compositing, "settled", settled, stops)
-    return stops | settled
+    stops, finished = march.stop(compositing.transmittance(composite)), compositing.finished(composite)
+    check_answer(compositing, "finished", finished, stops)
+    return stops | finished
 
 
 def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:

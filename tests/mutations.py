@@ -393,9 +393,9 @@ MUTATIONS = [
     Mutation(
         "selection: finished rays go on looking",
         "reference.py",
-        "return stops | settled",
+        "return stops | finished",
         "return stops",
-        ("test_selections.py::test_a_settled_ray_takes_no_more_samples",),
+        ("test_selections.py::test_a_finished_ray_takes_no_more_samples",),
     ),
     Mutation(
         "stride: asked about a run that begins where the ray is",

@@ -54,7 +54,7 @@ class Isosurface(jv.Selection):
         above = jnp.where(fragment.valid, now, above)
         return last, above, jnp.where(crosses, state[0], near), jnp.where(crosses, fragment.depth, far)
 
-    def settled(self, state):
+    def finished(self, state):
         return state[3] < jnp.inf
 
     def depth(self, state):
@@ -181,7 +181,7 @@ def test_rays_shift_where_they_are_transparent_alone():
     np.testing.assert_allclose(found.depth, 1 + 36 * 0.11, rtol=1e-6)
 
 
-def test_a_settled_ray_takes_no_more_samples():
+def test_a_finished_ray_takes_no_more_samples():
     """The value 0.33 lies between the fifth sample and the sixth."""
     x = np.linspace(0.0, 1.0, 11, dtype=np.float32)
     volume = jv.Volume(np.broadcast_to(x[:, None, None], (11, 5, 5)).copy(), spacing=[0.1] * 3)
@@ -299,8 +299,8 @@ class Wrong(jv.FirstVisible):
         state = super().add(state, fragment)
         return state.astype(jnp.int32) if self.method == "add" else state
 
-    def settled(self, state):
-        return state if self.method == "settled" else super().settled(state)
+    def finished(self, state):
+        return state if self.method == "finished" else super().finished(state)
 
     def occupied(self, transfer, blocks):
         return jnp.ones(3, bool) if self.method == "occupied" else super().occupied(transfer, blocks)
@@ -309,7 +309,7 @@ class Wrong(jv.FirstVisible):
         return (jnp.ones(3), state) if self.method == "pixel" else super().pixel(sampler, state)
 
 
-@pytest.mark.parametrize("method", ["add", "settled", "occupied", "pixel"])
+@pytest.mark.parametrize("method", ["add", "finished", "occupied", "pixel"])
 def test_a_wrong_answer_of_a_mode_is_named(method):
     march = jv.March(0.11, (jv.SpaceLeaping(),))
     with pytest.raises(ValueError, match=rf"Wrong.{method} must return .*; got "):

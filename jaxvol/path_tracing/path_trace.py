@@ -38,14 +38,14 @@ LANES = 2**13
 """Walks that run side by side by default on a CPU; 32 times as many on a GPU."""
 
 WALKS_PER_LANE = 128
-"""Walks that each lane of a wave runs, one after the other."""
+"""Walks that each lane of a batch runs, one after the other."""
 
 MAX_SCATTERINGS = 2**20
 """Scatterings that a walk may have by default. A path of albedo 1 leaves a medium of optical thickness τ
 after about τ² scatterings, so this limits only paths in media a thousand mean free paths thick."""
 
 BYTES_PER_WALK, BYTES_PER_RESULT = 2**10, 2**6
-"""Memory of a walk in its lane, and of its result until its wave is over."""
+"""Memory of a walk in its lane, and of its result until its batch is over."""
 
 NOT_DIFFERENTIABLE = (
     "path_trace has no derivative, but volume, transfer, camera, lights, materials or anisotropy carries a "
@@ -164,11 +164,11 @@ class _TraceOptions(eqx.Module):
     antialias: bool = eqx.field(static=True)
 
     def pixels(self, camera: Camera) -> int:
-        """Number of pixels in one wave."""
+        """Number of pixels in one batch."""
         return min(max(WALKS_PER_LANE * self.lanes // self.paths, 1), camera.size[0] * camera.size[1])
 
     def require_room(self, camera: Camera) -> None:
-        """**Raises** `ValueError` if a wave would not fit into memory."""
+        """**Raises** `ValueError` if a batch would not fit into memory."""
         walks = self.pixels(camera) * self.paths
         require_room(
             walks * BYTES_PER_RESULT + min(self.lanes, walks) * BYTES_PER_WALK,
@@ -229,7 +229,7 @@ class _Inputs(eqx.Module):
 def _trace(
     inputs: _Inputs, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], options: _TraceOptions
 ) -> PathTraced:
-    """Trace the pixels row by row, in waves that bound the memory."""
+    """Trace the pixels row by row, in batches that bound the memory."""
     inputs, camera = jax.tree.map(_single, (inputs, camera))
     scene, (width, height) = inputs.scene(), camera.size
     # Checked here, since comparisons in the walks would hide a NaN. The values of a volume with its own field
@@ -238,10 +238,10 @@ def _trace(
     valid = all_finite((without_voxels(inputs.volume), ranges, scene.majorants, inputs.transfer))
     valid &= all_finite((inputs.materials, inputs.lights, inputs.anisotropy, camera))
     pixels = options.pixels(camera)
-    waves = -(-width * height // pixels)
+    batches = -(-width * height // pixels)
     count = pixels * options.paths
 
-    def wave(number: Int[Array, ""]) -> tuple[Array, ...]:
+    def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
         def begin(index: Int[Array, " lanes"]) -> Walk:
             pixel, path = number * pixels + index // options.paths, index % options.paths
             alive = valid & (index < count) & (pixel < width * height)
@@ -258,7 +258,7 @@ def _trace(
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
-    images = jax.tree.map(image, jax.lax.map(wave, jnp.arange(waves, dtype=jnp.int32)))
+    images = jax.tree.map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
     images = jax.tree.map(
         lambda leaf: jnp.where(valid, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, images
     )
