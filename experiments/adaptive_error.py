@@ -112,19 +112,19 @@ def draw(result: dict[str, Any], path: Path) -> None:
             ratios = [row["rmse over tolerance"] for row in rows.values()]
             style: dict[str, Any] = {"color": color, "markersize": 4, "linewidth": 1}
             images.plot([float(t) for t in rows], ratios, mark + "-", label=f"{name}, {view}", **style)
-    limits = np.array(pixels.get_xlim())
-    pixels.plot((1e-5, 1), (1e-5, 1), "k-", linewidth=0.8)
     pixels.set_xscale("log")
     pixels.set_yscale("log")
-    pixels.set_xlim(max(limits[0], 1e-5), None)
+    limits = pixels.get_xlim()
+    pixels.plot(limits, limits, "k-", linewidth=0.8)
+    pixels.set_xlim(limits)
     pixels.set_xlabel("estimated error of a pixel")
     pixels.set_ylabel("true error (root mean square of a quarter of the pixels)")
     images.axhline(1, color="k", linewidth=0.8)
     images.set_xscale("log")
     images.set_xlabel("tolerance")
     images.set_ylabel("RMSE of the image / tolerance")
-    images.set_ylim(0, None)
-    images.legend(fontsize=7)
+    images.set_ylim(0, 1.5)
+    images.legend(fontsize=7, ncols=2)
     common.save(figure, path)
 
 

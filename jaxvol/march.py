@@ -174,10 +174,10 @@ class Transform(eqx.Module):
 
         Both depend on the ray and the run alone. A run is allowed if its error, times the transmittance in
         front of it, is at most what is tolerated (if several transforms override this, by each), and always
-        if its stride is 1. A run of stride s begins at a multiple of RUN s steps. Of those that hold a cell
-        and are allowed, a march takes the longest one, none of whose cells it has taken in another one
-        already. So leaps, which only cross what is transparent, do not change it. Gradients take strides as
-        given; the image jumps where one changes."""
+        if its stride is 1. A run of stride s begins at a multiple of RUN s steps, from `March.phase` steps
+        before the ray's first cell on. Of those that hold a cell and are allowed, a march takes the longest
+        one that holds no cell taken before. So leaps, which only cross what is transparent, do not change
+        it. Gradients take strides as given; the image jumps where one changes."""
         unknown = jnp.full(jnp.shape(run.front), jnp.inf, ray.length.dtype)
         return unknown, jnp.zeros_like(unknown)
 
@@ -333,6 +333,18 @@ class March(eqx.Module):
         # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
+    def phase(self, ray: Ray) -> Int[Array, ""] | None:
+        """How many steps before a ray's first cell the first of all runs begins, less than the longest one:
+        at random where `start` or `shift` are. These move samples by less than a step, which would leave the
+        wood grain of longer cells, and of the runs themselves. None if 0 for all rays."""
+        if not self._overriding("start") and not self.may_shift:
+            return None
+        part = jax.lax.stop_gradient(self.start(ray) - self.shift(ray))
+        # its lower digits, of which the part of a step is nearly independent; all of it is exact
+        part = 32 * part
+        longest = RUN * self.longest_stride
+        return jnp.floor((part - jnp.floor(part)) * longest).astype(jnp.int32) & (longest - 1)
+
     def divided(self) -> "March":
         """This march with its steps as short as its transforms want them."""
         parts = max((transform.subdivision for transform in self.transforms), default=1)
@@ -346,28 +358,33 @@ class March(eqx.Module):
         target: Int[Array, ""],
         transmittance: Scalar,
     ) -> Strides:
-        """The cells of a ray from `target` on, or from where the cell begins that holds it. The ray has come
-        to `index`, in a run of this `stride`, unless that ends there; from there to `target` all is
+        """The cells of a ray from where the run begins that holds `target`, or from `index` on, to which the
+        ray has come, in a run of this `stride`, if `target` lies in the same run. Up to `target` all is
         transparent."""
         march, ray, transmittance = jax.lax.stop_gradient((self, ray, transmittance))
-        length = RUN * stride
-        end = jnp.where(index & (length - 1) == 0, index, (index | (length - 1)) + 1)
-        start, chosen = march.start(ray), None
+        phase, start, chosen = march.phase(ray), march.start(ray), None
+        phase = jnp.zeros_like(index) if phase is None else phase
+        since, ahead, length = index + phase, target + phase, RUN * stride
+        end = jnp.where(since & (length - 1) == 0, since, (since | (length - 1)) + 1)
+        # before the ray's first cell there is no run
+        end = jnp.where(index == 0, phase, end)
         for level in range(self.longest_stride.bit_length()):
-            first = target & -(RUN << level)
-            run = Run((start + first.astype(start.dtype)) * march.step, 1 << level, march.step)
+            first = ahead & -(RUN << level)
+            front = (start + (first - phase).astype(start.dtype)) * march.step
+            run = Run(front, 1 << level, march.step)
             predicted = [_predicted(transform, ray, run) for transform in march._overriding("stride_error")]
             error = transmittance * reduce(jnp.maximum, [error for error, _ in predicted])
-            found = Strides(first, jnp.full_like(index, run.stride), error)
+            found = Strides(first - phase, jnp.full_like(index, run.stride), error)
             if chosen is None:
-                chosen = found
+                # the first of all runs may have begun before the ray's first cell
+                chosen = found._replace(begin=jnp.maximum(found.begin, end - phase))
                 continue
             fits = first >= end
             for error, tolerated in predicted:
                 fits &= transmittance * error <= tolerated
             chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)
-        going = Strides(target & -stride, stride, jnp.zeros_like(ray.length))
-        return jax.tree.map(partial(jnp.where, target < end), going, chosen)
+        going = Strides(index, stride, jnp.zeros_like(ray.length))
+        return jax.tree.map(partial(jnp.where, ahead < end), going, chosen)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""

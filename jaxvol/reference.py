@@ -56,7 +56,8 @@ class Progress(eqx.Module):
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
     the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
     first transparent cell, and is 0 from then on. `stride`: steps of each cell of the current run, which ends
-    at a multiple of RUN of them. What is not asked for is None.
+    at a multiple of RUN of them, counted from `phase` steps before the ray's first cell. What is not asked
+    for, or not needed, is None.
     """
 
     index: Int[Array, ""]
@@ -66,6 +67,7 @@ class Progress(eqx.Module):
     finished: Bool[Array, ""]
     shift: Scalar | None
     stride: Int[Array, ""] | None = None
+    phase: Int[Array, ""] | None = None
 
 
 class SampleStats(eqx.Module):
@@ -96,6 +98,7 @@ def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Prog
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
         stride=count + 1 if strides else None,
+        phase=march.phase(ray) if strides else None,
     )
 
 
@@ -108,21 +111,22 @@ def with_stride(
         return at, steps
     transmittance = pipeline.compositing.transmittance(at.composite)
     ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance)
-    inside = front(pipeline.march, at, steps) < ray.length  # a ray that leaves goes all the way
-    begin, stride = jnp.where(inside, ahead.begin - at.index, steps), jnp.where(inside, ahead.stride, 1)
+    leaves = (steps > 0) & (front(pipeline.march, at, steps) >= ray.length)  # all the way
+    begin, stride = jnp.where(leaves, steps, ahead.begin - at.index), jnp.where(leaves, 1, ahead.stride)
     stats = at.stats
     if stats is not None:
         assert stats.error is not None
-        error = jnp.where(inside & ~at.finished, ahead.error, 0)
+        error = jnp.where(leaves | at.finished | (ray.length <= 0), 0, ahead.error)
         stats = replace(stats, error=stats.error + error**2)
     return replace(at, stride=stride, stats=stats), begin
 
 
-def pieces(pipeline: Pipeline, ray: Ray, front: Scalar, stride: Int[Array, ""] | int) -> tuple[Cell, ...]:
-    """The pieces of the cell that begins at depth `front`, and is so many steps long."""
-    march = pipeline.march
-    cell = Cell(front, jnp.asarray(stride, march.step.dtype) * march.step, jnp.zeros(front.shape, bool))
-    return march.cut(cell, ray, pipeline.volume)
+def pieces(pipeline: Pipeline, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
+    """The pieces of the ray's next cell, or the one so many cells behind it in its run."""
+    march, stride = pipeline.march, 1 if at.stride is None else at.stride
+    width = jnp.asarray(stride, march.step.dtype) * march.step
+    begin = front(march, at, number * stride)
+    return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, pipeline.volume)
 
 
 def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
@@ -218,7 +222,7 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     at, _ = with_stride(pipeline, ray, at)
     stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, classification)
     after, alphas, color = at, [], None
-    for piece in pieces(pipeline, ray, front(march, at), stride):
+    for piece in pieces(pipeline, ray, at):
         measured = measure(pipeline, ray, piece)
         alphas.append(opacity(pipeline, ray, piece, measured))
         if not isinstance(compositing, Selection):

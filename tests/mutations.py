@@ -414,8 +414,9 @@ MUTATIONS = [
     Mutation(
         "stride: the fast engine's cells are one step wide",
         "engine/segment.py",
-        "return pieces(pipeline, ray, front(pipeline.march, at, number * stride), stride)",
-        "return pieces(pipeline, ray, front(pipeline.march, at, number * stride), 1)",
+        "partial(pieces, pipeline), in_axes=(0, 0, None))",
+        "lambda ray, at, k: pieces(pipeline, ray, eqx.tree_at(lambda a: a.stride, at, 1 + 0 * at.stride), k),"
+        " in_axes=(0, 0, None))",
         ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
     ),
     Mutation(
@@ -431,6 +432,13 @@ MUTATIONS = [
         "steps = jnp.minimum(left, run - (at.index & (run - 1)))",
         "steps = left",
         ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
+    ),
+    Mutation(
+        "stride: all rays' runs begin where the ray does",
+        "march.py",
+        "return jnp.floor((part - jnp.floor(part)) * longest).astype(jnp.int32) & (longest - 1)",
+        "return jnp.zeros(part.shape, jnp.int32)",
+        ("transforms/test_adaptive_sampling.py::test_jitter_breaks_the_wood_grain_of_long_cells",),
     ),
     Mutation(
         "stride: transmittance does not count",

@@ -31,14 +31,14 @@ from .._util.vec3 import Scalar, Vec3, along
 from .._util.voxel_fetch import Recording, scatter_add
 from ..compositing import Weighting
 from ..march import March
-from ..reference import Pipeline, Progress, contained, measure
+from ..reference import Pipeline, Progress, contained, measure, pieces
 from ..rendering import Rendering
 from ..space import Ray
 from ..transfer import Transfer, classification_of
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
-from .segment import Samples, SampleVisitor, pieces_ahead, vmap_cells
+from .segment import Samples, SampleVisitor, vmap_cells
 from .shading_gradient import Shader, ShadingTotal, ShadingVjp, shading_vjp
 from .tiling import Tiling
 from .visible_samples import Weights, weights_of
@@ -215,7 +215,7 @@ class Replay(SampleVisitor):
             found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
-            for piece in pieces_ahead(pipeline, ray, at, number):
+            for piece in pieces(pipeline, ray, at, number):
                 depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
                 point = None if self.shader is None else along(ray.entry, ray.direction, depth)
                 at_depth = depth if self.given.depth is not None else None

@@ -21,7 +21,7 @@ from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
 from ..compositing import Selection
 from ..march import RUN, Cell, March
-from ..reference import Pipeline, Progress, add, front, move, opacity, pieces, stop
+from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..space import Ray
 from ..transfer import Classification, Measured
 from .tiling import Tiling
@@ -88,8 +88,9 @@ def march_segment(
     samples = _sampled(pipeline, number, ray, at)
     taken: Int[Array, " rays"] | int
     taken, shifted = number, None
-    # without shifts, runs begin with segments, and end with them
-    if not regular or (at.stride is not None and (march.may_shift or RUN % number > 0)):
+    # otherwise runs begin and end with segments
+    partly = at.phase is not None or RUN % number > 0
+    if not regular or (at.stride is not None and partly):
         taken, shifted = _taken(march, at, samples)
         samples = _without(samples, taken, ray)
     colors: list[Vec3] | list[None]
@@ -122,7 +123,7 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
     march, classification = pipeline.march, pipeline.classification
 
     def pieces_of(at: Progress) -> tuple[Cell, ...]:
-        rays = jax.vmap(partial(pieces_ahead, pipeline), in_axes=(0, 0, None))
+        rays = jax.vmap(partial(pieces, pipeline), in_axes=(0, 0, None))
         return jax.vmap(rays, in_axes=(None, None, 0))(ray, at, jnp.arange(number, dtype=at.index.dtype))
 
     cut = pieces_of(at)
@@ -213,20 +214,14 @@ def _measured_over(
     return [classification.spanned(*each) for each in zip(beside, fronts, backs, strict=True)]
 
 
-def pieces_ahead(pipeline: Pipeline, ray: Ray, at: Progress, number: Int[Array, ""]) -> tuple[Cell, ...]:
-    """The pieces of one of the next cells of a ray."""
-    stride = 1 if at.stride is None else at.stride
-    return pieces(pipeline, ray, front(pipeline.march, at, number * stride), stride)
-
-
 def _taken(march: March, at: Progress, samples: Samples) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
     """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
     shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
     left = march.most_samples - at.index
     number = jnp.arange(samples.number, dtype=at.index.dtype)
     if at.stride is not None:
-        run = RUN * at.stride
-        steps = jnp.minimum(left, run - (at.index & (run - 1)))
+        run, phase = RUN * at.stride, 0 if at.phase is None else at.phase
+        steps = jnp.minimum(left, run - ((at.index + phase) & (run - 1)))
         left = jnp.sum(begins(at, samples.number) < steps[None], axis=0, dtype=left.dtype)
     transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=0)
     cells = number.size

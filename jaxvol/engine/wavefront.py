@@ -27,7 +27,6 @@ from ..reference import (
     Pipeline,
     Progress,
     begin,
-    front,
     is_sample,
     measure,
     move,
@@ -117,12 +116,12 @@ def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     march = pipeline.march
 
     def one(ray: Ray, at: Progress) -> Progress:
-        at, _ = with_stride(pipeline, ray, at)
-        stride = 1 if at.stride is None else at.stride
-        cut = pieces(pipeline, ray, front(march, at), stride)
+        begun, _ = with_stride(pipeline, ray, at)
+        stride = 1 if begun.stride is None else begun.stride
+        cut = pieces(pipeline, ray, begun)
         alphas = [opacity(pipeline, ray, piece, measure(pipeline, ray, piece)) for piece in cut]
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
-        moved = move(march, ray, at, jnp.ones((), bool), stride)
+        moved = move(march, ray, begun, jnp.ones((), bool), stride)
         if moved.stats is not None:
             taken = jnp.sum(jnp.stack([is_sample(march, ray, piece) for piece in cut]))
             samples = moved.stats.samples + taken.astype(moved.stats.samples.dtype)

@@ -62,6 +62,9 @@ class AdaptiveSampling(Transform):
     - `finest`: into how many parts the march divides its steps, a power of two; with `longest` at most 64.
       What other transforms and `max_samples` count in steps are then these parts.
 
+    Where `Jitter` or `EmptySpaceJitter` move samples, each ray's runs begin at a random depth, too, since
+    otherwise long cells, and runs, would leave a wood grain of their own.
+
     What is known of the voxels is computed once for each array of them. Which cells may be long follows from
     the transfer function in each image, inside `jax.jit`, too. Strides are constants to derivatives; the
     image jumps where one changes.

@@ -83,7 +83,7 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share):
         within = since[0] + since[1] * random.integers(1, RUN)
         if within <= target:
             found = strides(within, since[1], target, 1.0)
-            ahead = target // stride * stride if since == (begin, stride) else begin
+            ahead = within if since == (begin, stride) else begin
             assert (int(found.begin), int(found.stride)) == (ahead, stride)
     assert int(strides(0, 1, 0, 0.25).stride) == 16
     for index, _ in runs:  # what became allowed behind something does not reach before it

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
-from experiments import scenes as real_scenes
+from experiments import jitter_accuracy, scenes as real_scenes
 from jaxvol.march import RUN, Run
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import BLOCK
@@ -284,6 +284,23 @@ def test_finest_divides_the_steps_of_the_march():
     found, expected = (jv.render(volume, transfer, camera, m) for m in (divided, fine))
     np.testing.assert_allclose(found.rgba, expected.rgba, atol=1e-6)
     np.testing.assert_array_equal(found.samples, expected.samples)
+
+
+def test_jitter_breaks_the_wood_grain_of_long_cells():
+    """The rings of cells that are all two steps long, on an inclined plane."""
+    scene = jitter_accuracy.cut_block(48, 256)
+    step = float(scene.volume.spacing[0])
+
+    def image(*transforms, step=step):
+        march = jv.March(step, transforms)
+        return np.asarray(jv.render(scene.volume, scene.transfer, scene.camera, march).rgba[..., :3], float)
+
+    truth, sampling = image(step=step / 4), jv.AdaptiveSampling(1e3, 2)
+    plain, jittered = (
+        scene.grain(image(sampling, *more) - truth, 2 * step) for more in ((), (jv.EmptySpaceJitter(1),))
+    )
+    assert plain > 1e-5
+    assert jittered < plain / 100
 
 
 # -- both engines ----------------------------------------------------------------------------------------
