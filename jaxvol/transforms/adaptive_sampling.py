@@ -48,8 +48,9 @@ class AdaptiveSampling(Transform):
     can cells be shorter than the shortest that it is given: an eighth of a voxel suits tolerances of 0.001, a
     quarter larger ones. `Rendering.error` holds the root of the summed squares of T e / 20 of a ray's runs.
 
-    **It saves samples, and on CPU little time**: a sample takes longer, since its place must be looked up
-    (`experiments.accuracy`). So it pays where samples are expensive: under light, and in gradients.
+    It takes 1.7 times fewer samples for the same error (five scenes, `experiments.accuracy`). On CPU that
+    saves time only where rays take many samples, or samples are expensive: each run of four must be looked
+    up.
 
     For modes that do not composite "over", and for transfer functions that do not say how they vary, all
     cells are one step long, and `Rendering.error` is infinite.
