@@ -400,15 +400,15 @@ MUTATIONS = [
     Mutation(
         "stride: asked about a run that begins where the ray is",
         "march.py",
-        "first = target & -(RUN << level)",
-        "first = target & -RUN",
+        "first = ahead & -(RUN << level)",
+        "first = ahead & -RUN",
         ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
     ),
     Mutation(
         "stride: a leap ends within a run",
         "reference.py",
-        "jnp.where(inside, ahead.begin - at.index, steps)",
-        "jnp.where(inside, steps, steps)",
+        "jnp.where(leaves, steps, ahead.begin - at.index)",
+        "jnp.where(leaves, steps, steps)",
         ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
     ),
     Mutation(
@@ -429,7 +429,7 @@ MUTATIONS = [
     Mutation(
         "stride: a segment goes on past the end of a run",
         "engine/segment.py",
-        "steps = jnp.minimum(left, run - (at.index & (run - 1)))",
+        "steps = jnp.minimum(left, run - ((at.index + phase) & (run - 1)))",
         "steps = left",
         ("engine/test_strides.py::test_strides_are_those_of_the_reference",),
     ),

@@ -166,7 +166,7 @@ def over_transparent(pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Arra
 
 def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""] | int) -> Progress:
     moved = move(march, ray, at, jnp.ones((), bool), steps)
-    return jax.tree.map(lambda a, b: jnp.where(~at.finished & (steps > 0), a, b), moved, at)
+    return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
 
 def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
