@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.checks import check_answer, described, integer, number
+from ._util.checks import check_answer, described, integer, number, power_of_two
 from ._util.vec3 import Scalar, Vec3
 from .beams import Box
 from .occupancy import Occupancy
@@ -357,12 +357,13 @@ class March(eqx.Module):
         stride: Int[Array, ""],
         target: Int[Array, ""],
         transmittance: Scalar,
+        phase: Int[Array, ""] | None,
     ) -> Strides:
         """The cells of a ray from where the run begins that holds `target`, or from `index` on, to which the
         ray has come, in a run of this `stride`, if `target` lies in the same run. Up to `target` all is
-        transparent."""
+        transparent. `phase`: of the ray, which does not change along it."""
         march, ray, transmittance = jax.lax.stop_gradient((self, ray, transmittance))
-        phase, start, chosen = march.phase(ray), march.start(ray), None
+        start, chosen = march.start(ray), None
         phase = jnp.zeros_like(index) if phase is None else phase
         since, ahead, length = index + phase, target + phase, RUN * stride
         end = jnp.where(since & (length - 1) == 0, since, (since | (length - 1)) + 1)
@@ -467,6 +468,4 @@ def _check_stride(transform: Transform) -> None:
         raise ValueError(
             f"transforms: {name} must override both stride_error and longest_stride, or neither."
         )
-    longest = integer(f"{name}.longest_stride", longest, 1, 64)
-    if longest & (longest - 1):
-        raise ValueError(f"transforms: {name}.longest_stride must be a power of two; got {longest}.")
+    power_of_two(f"transforms: {name}.longest_stride", longest, 64)

@@ -110,7 +110,7 @@ def with_stride(
     if at.stride is None:
         return at, steps
     transmittance = pipeline.compositing.transmittance(at.composite)
-    ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance)
+    ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance, at.phase)
     leaves = (steps > 0) & (front(pipeline.march, at, steps) >= ray.length)  # all the way
     begin, stride = jnp.where(leaves, steps, ahead.begin - at.index), jnp.where(leaves, 1, ahead.stride)
     stats = at.stats

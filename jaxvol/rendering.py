@@ -39,7 +39,7 @@ class Rendering(eqx.Module):
       (Kye 2013, Fig. 13).
 
     - `error`: under `AdaptiveSampling`, a cautious estimate of how far a pixel's colour is wrong because of
-      the distance of its samples; more than the true error in some 98 % of all pixels
+      the distance of its samples; more than the true error in 97 % of the pixels or more
       (`experiments.adaptive_error`). Infinite where nothing can be predicted.
 
     The last four raise `AttributeError` where they were not asked for (`outputs="rgba"`), and `error` without

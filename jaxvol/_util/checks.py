@@ -154,6 +154,14 @@ def integer(name: str, value: Any, least: int, most: int | None = None, *, other
     return whole
 
 
+def power_of_two(name: str, value: Any, most: int) -> int:
+    """A power of two from 1 to `most`."""
+    found = integer(name, value, 1, most)
+    if found & (found - 1):
+        raise ValueError(f"{name} must be a power of two; got {value!r}.")
+    return found
+
+
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
     """Check that the file `path` can be written, and create its folder, before a long computation.
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32
 
-from .._util.checks import integer, number
+from .._util.checks import number, power_of_two
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import gather, in_memory
 from ..march import RUN, March, Run, Transform
@@ -22,7 +22,7 @@ SHARE = 1 / 20
 are much smaller than predicted. Measured: `experiments.adaptive_error`."""
 
 FARTHEST = 8
-"""Blocks around its own that a run may touch: it is at most 34 voxels long."""
+"""Blocks around its own that a run may touch: it is at most 68 voxels long."""
 
 
 class AdaptiveSampling(Transform):
@@ -83,8 +83,8 @@ class AdaptiveSampling(Transform):
 
     def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
         self.tolerance = number("tolerance", tolerance, above=0)
-        self.longest = _power_of_two("longest", longest)
-        self.finest = _power_of_two("finest", finest)
+        self.longest = power_of_two("longest", longest, 64)
+        self.finest = power_of_two("finest", finest, 64)
         if self.longest * self.finest > 64:
             raise ValueError(f"longest * finest must be at most 64; got {longest!r} * {finest!r}.")
         self.errors = None
@@ -120,13 +120,6 @@ class AdaptiveSampling(Transform):
             for c, n in zip(coordinate, (nx, ny, nz), strict=True)
         )
         return gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
-
-
-def _power_of_two(name: str, given: int | Any) -> int:
-    found = integer(name, given, 1, 64)
-    if found & (found - 1):
-        raise ValueError(f"{name} must be a power of two; got {given!r}.")
-    return found
 
 
 def _coded(error: Float[Array, "*blocks"]) -> Int32[Array, "*blocks"]:

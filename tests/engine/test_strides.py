@@ -62,7 +62,8 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share):
     @jax.jit
     def strides(index, stride, target, transmittance):
         index, stride, target = (jnp.asarray(i, jnp.int32) for i in (index, stride, target))
-        return march.strides(ray, index, stride, target, jnp.asarray(transmittance, jnp.float32))
+        transmittance = jnp.asarray(transmittance, jnp.float32)
+        return march.strides(ray, index, stride, target, transmittance, march.phase(ray))
 
     runs, index, stride = [], 0, 1
     while index < steps:
