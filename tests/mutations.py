@@ -609,8 +609,8 @@ MUTATIONS = [
     Mutation(
         "replay: one of the eight voxels of a sample gets no gradient",
         "_util/voxel_fetch.py",
-        "for index, part in zip(indices, parts, strict=True):",
-        "for index, part in list(zip(indices, parts, strict=True))[1:]:",
+        "pair = jnp.stack(cube[x][y], axis=-1)",
+        "pair = jnp.stack([cube[x][y][0], cube[x][y][1] * x], axis=-1)",
         (DIFFERENCES,),
     ),
     Mutation(

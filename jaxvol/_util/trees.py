@@ -16,6 +16,11 @@ def floats(tree: PyTree) -> PyTree:
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
+def zeros_of(tree: PyTree) -> PyTree:
+    """Zeros for the leaves that can have a gradient."""
+    return jax.tree.map(jnp.zeros_like, floats(tree))
+
+
 def strong(tree: PyTree) -> PyTree:
     """The tree with leaves of weak type, which come from Python numbers, as plain arrays: `jax.custom_vjp`
     loses the gradients of weak ones."""
@@ -27,5 +32,5 @@ def strong(tree: PyTree) -> PyTree:
 
 
 def added(a: PyTree, b: PyTree) -> PyTree:
-    """Sum of two trees, leaf by leaf."""
-    return jax.tree.map(jnp.add, a, b)
+    """Sum of two trees, leaf by leaf. None if the first is None, whose sum is not asked for."""
+    return None if a is None else jax.tree.map(jnp.add, a, b)

@@ -4,7 +4,7 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -17,6 +17,9 @@ from .xla import gather
 
 Cube: TypeAlias = list[list[list[Scalar]]]
 """Eight voxels, [x][y][z]."""
+
+Node: TypeAlias = tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+"""Indices along x, y, z."""
 
 
 class Fetch(eqx.Module):
@@ -41,9 +44,9 @@ class Packed(Fetch):
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         dtype = coordinate[0].dtype
-        (x, y, z), fraction = split(coordinate, data.shape)
+        node, fraction = split(coordinate, data.shape)
         _, ny, nz = data.shape
-        base = (x * ny + y) * nz + z
+        base = flat_index(node, data.shape)
         bits = 8 * data.dtype.itemsize
         signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
 
@@ -69,33 +72,55 @@ class Packed(Fetch):
 
 class Recording(Fetch):
     """Records which voxels are fetched, and adds a value to each, so that the VJP with respect to these
-    values returns one cotangent per fetch.
+    values returns their cotangents.
 
     - `perturbations`: the values, in the order of the fetches; if empty, nothing is added (to count the
       fetches).
-    - `indices`: indices into the flattened voxels, filled while a program is traced.
+    - `bases`: of each cube its first voxel, as an index into the flattened array, filled while a program is
+      traced.
     """
 
-    perturbations: list[Shaped[Array, "..."]]
-    indices: list[Int[Array, "..."]] = eqx.field(static=True)
+    perturbations: list[Cube]
+    bases: list[Int[Array, "..."]] = eqx.field(static=True)
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
-        def voxel(flat: Int[Array, ""]) -> Shaped[Array, ""]:
-            self.indices.append(flat)
-            value = jax.lax.stop_gradient(fetched(data, flat))
-            return value if not self.perturbations else value + self.perturbations[len(self.indices) - 1]
+        number = len(self.bases)
+        cube, fraction = cube_of(
+            lambda flat: jax.lax.stop_gradient(fetched(data, flat)), data.shape, coordinate
+        )
+        node, _ = split(coordinate, data.shape)
+        self.bases.append(flat_index(node, data.shape))
+        if self.perturbations:
+            cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
+        return cube, fraction
 
-        return cube_of(voxel, data.shape, coordinate)
+
+def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
+    """Values to add to the cubes that begin at these voxels, which may be given by their shapes alone."""
+    zeros = (jnp.zeros(base.shape, dtype) for base in bases)
+    return [[[[zero, zero], [zero, zero]], [[zero, zero], [zero, zero]]] for zero in zeros]
+
+
+_PAIRS = jax.lax.ScatterDimensionNumbers(
+    update_window_dims=(1,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
+)
 
 
 def scatter_add(
-    voxels: Float[Array, " voxels"], indices: list[Int[Array, "..."]], parts: list[Shaped[Array, "..."]]
+    voxels: Float[Array, " voxels"],
+    shape: tuple[int, ...],
+    bases: list[Int[Array, "..."]],
+    cubes: list[Cube],
 ) -> Float[Array, " voxels"]:
-    """Add the cotangents `parts` of fetches to the voxels `indices` that they read."""
-    for index, part in zip(indices, parts, strict=True):
-        voxels = voxels.at[index].add(
-            part.astype(voxels.dtype), mode="promise_in_bounds", wrap_negative_indices=False
-        )
+    """Add the cotangents of cubes, which begin at these voxels, to the flattened voxels of an array of this
+    shape."""
+    _, ny, nz = shape
+    for base, cube in zip(bases, cubes, strict=True):
+        for x, y in itertools.product((0, 1), repeat=2):
+            # both voxels of a pair along z at once: XLA adds one update after the other
+            pair = jnp.stack(cube[x][y], axis=-1).reshape(-1, 2).astype(voxels.dtype)
+            index = (base + (x * ny + y) * nz).reshape(-1, 1)
+            voxels = jax.lax.scatter_add(voxels, index, pair, _PAIRS, mode="promise_in_bounds")
     return voxels
 
 
@@ -105,13 +130,20 @@ def cube_of(
     """The eight voxels around a coordinate, each by its index into the flattened array, and the fractional
     position between them."""
     dtype = coordinate[0].dtype
-    (i, j, k), fraction = split(coordinate, shape)
+    node, fraction = split(coordinate, shape)
     _, ny, nz = shape
-    base = (i * ny + j) * nz + k
+    base = flat_index(node, shape)
     cube = [
         [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
     ]
     return cube, fraction
+
+
+def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
+    """The index of a node into the flattened array."""
+    i, j, k = node
+    _, ny, nz = shape
+    return (i * ny + j) * nz + k
 
 
 def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
@@ -126,9 +158,7 @@ def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, "
     return found
 
 
-def split(
-    coordinate: Vec3, shape: tuple[int, ...]
-) -> tuple[tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]], Vec3]:
+def split(coordinate: Vec3, shape: tuple[int, ...]) -> tuple[Node, Vec3]:
     """The node below a coordinate, and the fractions past it; the last node belongs to the cell below."""
     x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
     # the second clip also keeps the index of a NaN inside the array

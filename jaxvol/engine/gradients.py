@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.sharding import varying
-from .._util.trees import PyTree, added, floats
+from .._util.trees import PyTree, added, floats, zeros_of
 from ..lighting.shading import Surroundings
 from ..march import EmptySpaceIndex
 from ..reference import Pipeline
@@ -69,8 +69,7 @@ class _Sums(NamedTuple):
 class _Image(NamedTuple):
     """What the tiles of an image share.
 
-    - `pipeline`: without lighting, since samples are shaded by `shader`.
-    - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
+    `pipeline`: without lighting, since samples are shaded by `shader`.
     """
 
     scene: Scene
@@ -81,7 +80,6 @@ class _Image(NamedTuple):
     fault: Bool[Array, ""]
     tiles: RayTiles
     tiling: Tiling
-    geometric: bool
 
     def pull_tile(
         self,
@@ -103,11 +101,10 @@ class _Image(NamedTuple):
         replay = Replay(
             *(self.pipeline, self.scene, self.words, rays, Cotangents.of(rays, rendering, cotangent)),
             *(sums.total, self.shader, self.tiling),
-            geometric=self.geometric,
         )
         beams = Beams(rays, self.tiles.beam_count, self.tiles.box(source, rays, number), range_)
         _, (_, of_rays, total) = march_rays(self.pipeline, self.empty_space, beams, self.tiling, None, replay)
-        if not self.geometric:
+        if not total.geometric:
             return _Sums(total, sums.source)
         if cotangent.details.depth is not None:
             # depth is measured from the ray's origin, and a sample's from the entry
@@ -129,9 +126,10 @@ def _vjp_by_tiles(
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
-    volume, transfer, source, march, _, lighting = scene
+    volume, source, lighting = scene.volume, scene.source, scene.lighting
     of_voxels = eqx.is_inexact_array(volume.data) and perturbed.volume.data
-    geometric = any(jax.tree.leaves((perturbed.volume, perturbed.source, perturbed.march)))
+    around = without_voxels(perturbed.volume), perturbed.source, perturbed.march
+    geometric = any(jax.tree.leaves(around))
     packed, tiling = acceleration.packed(scene), options.tiling
     tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
     if index is not None and ranges is not None:
@@ -140,12 +138,11 @@ def _vjp_by_tiles(
     shader, pull_shader = None, None
     if lighting is not None:
         shader, pull_shader = _shader_of(scene, packed.volume, voxels=of_voxels)
-    image = _Image(
-        *(scene, pipeline, acceleration.words, index, shader, fault_of(scene), tiles, tiling, geometric)
-    )
+    image = _Image(*(scene, pipeline, acceleration.words, index, shader, fault_of(scene), tiles, tiling))
+    of_transfer = any(jax.tree.leaves(perturbed.transfer))
     sums = _Sums(
-        Total.zeros(volume, transfer, march, shader, voxels=of_voxels),
-        jax.tree.map(jnp.zeros_like, floats(source)),
+        Total.zeros(scene, shader, transfer=of_transfer, geometric=geometric, voxels=of_voxels),
+        zeros_of(source) if geometric else None,
     )
     parts = jax.tree.map(tiles.disassemble, (rendering, cotangent))
     sums, _ = jax.lax.scan(
@@ -159,19 +156,24 @@ def _vjp_by_tiles(
 def _cotangents(
     scene: Scene, total: Total, of_source: PyTree, pull_shader: Callable[[PyTree], Any] | None
 ) -> Any:
-    """The cotangents of a scene's parts."""
-    of_volume, compositing = total.volume, scene.compositing  # which has no leaves
+    """The cotangents of a scene's parts; 0 for those that are not asked for."""
+    volume, transfer, source, march, compositing, _ = scene  # compositing has no leaves
+    parts = without_voxels(volume), transfer, source, march
+    sums = total.volume, total.transfer, of_source, total.march
+    of_volume, of_transfer, of_source, of_march = (
+        zeros_of(part) if found is None else found for part, found in zip(parts, sums, strict=True)
+    )
     if total.voxels is not None:
-        data = scene.volume.data
+        data = volume.data
         of_volume = with_voxels(of_volume, total.voxels.reshape(data.shape).astype(data.dtype))
     if pull_shader is None:
-        return Scene(of_volume, total.transfer, of_source, total.march, compositing, None)
+        return Scene(of_volume, of_transfer, of_source, of_march, compositing, None)
     more_volume, more_transfer, more_march, of_lighting = pull_shader(total.shader)[0]
     return Scene(
         added(of_volume, more_volume),
-        added(total.transfer, more_transfer),
+        added(of_transfer, more_transfer),
         of_source,
-        added(total.march, more_march),
+        added(of_march, more_march),
         compositing,
         of_lighting,
     )

@@ -19,6 +19,7 @@ Where rays leap over empty space, the first march records each ray's first and l
 second one leaps over all others, which saves two fifths of the samples in the head.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,11 +27,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
-from .._util.trees import PyTree, added, floats
+from .._util.trees import PyTree, added, floats, zeros_of
 from .._util.vec3 import Scalar, Vec3, along
-from .._util.voxel_fetch import Recording, scatter_add
+from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..compositing import Weighting
-from ..march import March
 from ..reference import Pipeline, Progress, contained, measure, pieces
 from ..rendering import Rendering
 from ..space import Ray
@@ -78,20 +78,28 @@ class Total(eqx.Module):
     shader: PyTree
     """Of `Shader.leaves`."""
 
+    @property
+    def geometric(self) -> bool:
+        """Whether samples' depths, widths and points have a gradient, not only what they show."""
+        return self.march is not None
+
     @classmethod
     def zeros(
-        cls, volume: Volume, transfer: Transfer, march: March, shader: Shader | None, *, voxels: bool
+        cls, scene: Scene, shader: Shader | None, *, transfer: bool, geometric: bool, voxels: bool
     ) -> "Total":
         """Zeros for these parts."""
-        of_shader = None if shader is None else shader.leaves
-        parts = transfer, march, without_voxels(volume), of_shader
-        transfer, march, volume_, of_shader = (jax.tree.map(jnp.zeros_like, floats(part)) for part in parts)
-        sums = None
+        volume, sums = scene.volume, None
         if voxels:
             # many small parts are summed, which 16 bits would lose
             dtype = volume.data.dtype
             sums = jnp.zeros(volume.data.size, dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32)
-        return cls(transfer, march, volume_, sums, of_shader)
+        return cls(
+            zeros_of(scene.transfer) if transfer else None,
+            zeros_of(scene.march) if geometric else None,
+            zeros_of(without_voxels(volume)) if geometric else None,
+            sums,
+            None if shader is None else zeros_of(shader.leaves),
+        )
 
 
 class Replay(SampleVisitor):
@@ -105,14 +113,12 @@ class Replay(SampleVisitor):
     - `given`: cotangents of the rays.
     - `total`: the gradients so far, to which those of these rays are added.
     - `shader`: what shades the samples.
-    - `geometric`: whether volume, camera, rays or march have a gradient, not only what samples show.
     """
 
     volume: Volume
     words: UInt32[Array, " voxels"] | None
     transfer: Transfer
     pipeline: Pipeline
-    geometric: bool
     shader: Shader | None
     tiling: Tiling
     given: Cotangents
@@ -130,14 +136,12 @@ class Replay(SampleVisitor):
         total: Total,
         shader: Shader | None,
         tiling: Tiling,
-        *,
-        geometric: bool,
     ):
         self.volume, self.words, self.transfer = scene.volume, words, scene.transfer
-        self.pipeline, self.geometric, self.shader = pipeline, geometric, shader
+        self.pipeline, self.shader = pipeline, shader
         self.given, self.total, self.tiling = given, total, tiling
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
-        self.sums = jax.tree.map(jnp.zeros_like, floats(rays)) if geometric else None
+        self.sums = zeros_of(rays) if total.geometric else None
 
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, carry: Scalar, total: Total
@@ -174,43 +178,45 @@ class Replay(SampleVisitor):
             transfer = self.transfer
             pull = transfer.pull_integrated if self.pipeline.march.integrates else transfer.pull
             of_transfer, of_read = pull(measured, of_color[i], of_extinction)
-            total = eqx.tree_at(lambda t: t.transfer, total, added(total.transfer, of_transfer))
+            sum_ = added(total.transfer, of_transfer)
+            total = Total(sum_, total.march, total.volume, total.voxels, total.shader)
             of_measured.append(of_read if shaded is None else added(of_read, shaded[i].of_measured))
-        if not self.geometric:
+        if not total.geometric and total.voxels is None:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_point = [None] * len(depths) if shaded is None else [part.of_point for part in shaded]
-        of_march, of_volume, of_rays, indices, of_voxels = self._geometric_vjp(
+        (of_march, of_volume, of_rays), bases, of_cubes = self._geometric_vjp(
             ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
         )
-        voxels = None if total.voxels is None else scatter_add(total.voxels, indices, of_voxels)
+        voxels = total.voxels
+        if voxels is not None:
+            voxels = scatter_add(voxels, self.volume.shape, bases, of_cubes)
         march, volume = added(total.march, of_march), added(total.volume, of_volume)
         return carry, of_rays, Total(total.transfer, march, volume, voxels, total.shader)
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
-    ) -> tuple[PyTree, PyTree, PyTree, list[Array], list[Array]]:
+    ) -> tuple[tuple[PyTree, PyTree, PyTree], list[Array], list[Cube]]:
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
-        its depth where the loss depends on that, and of its point where it is shaded; then the voxels that
-        were fetched, and their cotangents. The number of samples counts as constant."""
+        its depth where the loss depends on that, and of its point where it is shaded; then where the cubes of
+        voxels begin that were fetched, and their cotangents. The number of samples counts as constant."""
+        parts = self.pipeline.march, without_voxels(self.volume), ray
+        (march, volume, ray), fixed = eqx.partition(parts, eqx.is_inexact_array)
+        _, _, ray_fixed = fixed
         voxels = self.total.voxels is not None
-        march, march_rest = eqx.partition(self.pipeline.march, eqx.is_inexact_array)
-        volume, volume_rest = eqx.partition(without_voxels(self.volume), eqx.is_inexact_array)
-        ray_floats, ray_rest = eqx.partition(ray, eqx.is_inexact_array)
 
         def one(
             march: PyTree,
             volume: PyTree,
             ray: PyTree,
             perturbations: Any,
-            ray_rest: PyTree,
+            ray_fixed: PyTree,
             at: Progress,
             number: Int[Array, ""],
         ) -> tuple[list[Any], list[Array]]:
-            march, ray = eqx.combine(march, march_rest), eqx.combine(ray, ray_rest)
-            whole = with_voxels(eqx.combine(volume, volume_rest), self.volume.data)
-            record = Recording(perturbations or [], [])
+            march, volume, ray = eqx.combine((march, volume, ray), (*fixed[:2], ray_fixed))
+            whole, record = with_voxels(volume, self.volume.data), Recording(perturbations or [], [])
             here = with_fetch(whole, record) if voxels else with_words(whole, self.words)
             found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
@@ -220,29 +226,32 @@ class Replay(SampleVisitor):
                 point = None if self.shader is None else along(ray.entry, ray.direction, depth)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, point))
-            return found, record.indices
+            return found, record.bases
 
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))
         cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
 
-        def all_(march: PyTree, volume: PyTree, ray: PyTree, perturbations: list[Array] | None) -> PyTree:
+        def all_(moving: tuple[PyTree, PyTree, PyTree], perturbations: list[Cube]) -> PyTree:
             each = jnp.arange(number, dtype=at.index.dtype)
-            return cells(march, volume, ray, perturbations, ray_rest, at, each)
+            return cells(*moving, perturbations, ray_fixed, at, each)
 
-        perturbations = []
+        moving, perturbations = (march, volume, ray), []
         if voxels:
-            _, indices = jax.eval_shape(lambda: all_(march, volume, ray_floats, None))
-            if not indices and self.volume.field is not None:
+            _, bases = jax.eval_shape(all_, moving, [])
+            if not bases and self.volume.field is not None:
                 kind = type(self.volume.field).__name__
                 raise ValueError(
                     f"the gradient to the voxels of a volume with the field {kind}, which asks for none by"
                     ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
                     " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
-            perturbations = [jnp.zeros(index.shape, self.volume.data.dtype) for index in indices]
-        _, pull, indices = jax.vjp(all_, march, volume, ray_floats, perturbations, has_aux=True)
-        of_march, of_volume, of_ray, of_perturbations = pull(cotangents)
-        return of_march, of_volume, of_ray, indices, of_perturbations
+            perturbations = cubes_of_zeros(bases, ray.length.dtype)
+        if self.total.geometric:
+            _, pull, bases = jax.vjp(all_, moving, perturbations, has_aux=True)
+            of_moving, of_cubes = pull(cotangents)
+            return of_moving, bases, of_cubes
+        _, pull, bases = jax.vjp(partial(all_, moving), perturbations, has_aux=True)
+        return (None, None, None), bases, *pull(cotangents)
 
     def _slopes(
         self, alphas: list[Scalar], weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from .._util.trees import PyTree, added, floats
 from .._util.vec3 import Scalar, Vec3
-from .._util.voxel_fetch import scatter_add
+from .._util.voxel_fetch import cubes_of_zeros, scatter_add
 from ..lighting.shading import Shading, Surroundings, shade_sample
 from ..reference import Pipeline
 from ..space import Ray
@@ -33,10 +33,11 @@ class Shader(NamedTuple):
 
 
 class ShadingTotal(NamedTuple):
-    """Gradients summed over all samples: of what shades them, of the transfer function, and of the voxels."""
+    """Gradients summed over all samples: of what shades them, of the transfer function, and of the voxels;
+    None for what is not asked for."""
 
     shader: PyTree
-    transfer: PyTree
+    transfer: PyTree | None
     voxels: Float[Array, " voxels"] | None
 
 
@@ -84,13 +85,15 @@ def shading_vjp(
 
         perturbations = None
         if total.voxels is not None:
-            _, fetches = jax.eval_shape(lambda: colors(moving, moving_sample, []))
-            perturbations = [jnp.zeros(each.shape, around.volume.data.dtype) for each in fetches]
-        color, pull, fetches = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
+            _, bases = jax.eval_shape(lambda: colors(moving, moving_sample, []))
+            perturbations = cubes_of_zeros(bases, weights.weight[0].dtype)
+        color, pull, bases = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
         real = indices < size
         cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
-        (of_shader, of_transfer), of_sample, of_perturbations = pull(cotangent)
-        voxels = None if total.voxels is None else scatter_add(total.voxels, fetches, of_perturbations)
+        (of_shader, of_transfer), of_sample, of_cubes = pull(cotangent)
+        voxels = total.voxels
+        if voxels is not None:
+            voxels = scatter_add(voxels, around.volume.shape, bases, of_cubes)
         total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
         part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
         return chosen.put(found, indices, part), total

@@ -163,11 +163,10 @@ def lit_classification(
 def shade_sample(
     shading: Shading, around: Surroundings, sample: Sample, perturbations: Any = None
 ) -> tuple[Vec3, Any]:
-    """The shaded colour of a sample, and the indices of the voxels that its terms fetched.
+    """The shaded colour of a sample, and the first voxels of the cubes that its terms fetched.
 
-    `perturbations`: None, and then no indices are returned; or, for a gradient of the voxels, those of
-    `Recording`. Perturbations and indices are arrays with a leading axis over the terms, one for each fetch.
-    """
+    `perturbations`: None, and then no voxels are returned; or, for a gradient of the voxels, those of
+    `Recording`. Perturbations and voxels are arrays with a leading axis over the terms."""
     shared = shading.about(around, sample)
 
     # The backward pass computes each term again, so that memory holds the intermediate values of one term,
@@ -175,17 +174,17 @@ def shade_sample(
     @jax.checkpoint
     def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
         number, perturbations = each
-        volume, live, indices = around.volume, number >= 0, None
+        volume, live, bases = around.volume, number >= 0, None
         if perturbations is not None:
-            indices, live = [], None
-            volume = with_fetch(volume, Recording(perturbations, indices))
+            bases, live = [], None
+            volume = with_fetch(volume, Recording(perturbations, bases))
         here = Surroundings(volume, around.transfer, around.space, live)
         added = shading.term(here, sample, shared, number)
-        return jax.tree.map(jnp.add, sums, added), indices
+        return jax.tree.map(jnp.add, sums, added), bases
 
     if shading.terms == 0:
         return shading.color(sample, shared, None), None if perturbations is None else []
     term = jax.eval_shape(lambda: shading.term(around, sample, shared, jnp.zeros((), jnp.int32)))
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
-    sums, indices = jax.lax.scan(one, none, (jnp.arange(shading.terms), perturbations))
-    return shading.color(sample, shared, sums), indices
+    sums, bases = jax.lax.scan(one, none, (jnp.arange(shading.terms), perturbations))
+    return shading.color(sample, shared, sums), bases
