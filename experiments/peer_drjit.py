@@ -52,7 +52,8 @@ class Marcher:
 
         # voxels as float32: 8-bit and half-precision textures are slower, by half and by four fifths
         data = np.asarray(volume.data, np.float32).transpose(2, 1, 0)[..., None]
-        self.voxels = mi.Texture3f(mi.TensorXf(np.ascontiguousarray(data)))
+        self.grid = mi.TensorXf(np.ascontiguousarray(data))
+        self.voxels = mi.Texture3f(self.grid)
         self.box: Any = mi.BoundingBox3f(*(corner.tolist() for corner in volume.corners))
         self.origin, self.spacing, self.shape = (
             mi.Vector3f(*axes) for axes in (volume.origin.tolist(), volume.spacing.tolist(), volume.shape)
@@ -84,23 +85,28 @@ class Marcher:
         """An image in Dr.Jit's layout, as a target for `gradient`."""
         return mi.Vector4f(np.asarray(image, np.float32).reshape(-1, 4).T)
 
-    def gradient(self, target: Drjit | float = 0.0) -> Float[np.ndarray, "n 4"]:
-        """March all rays, and return the gradient of `mean((rgba - target)²)` with respect to (r, g, b,
-        extinction) of each of the n points of the transfer function, as made dense here."""
-        dr.enable_grad(self.table)
-        dr.clear_grad(self.table)
-        self.transfer.set_tensor(self.table)
+    def gradient(
+        self, target: Drjit | float = 0.0, of: Literal["transfer", "voxels"] = "transfer"
+    ) -> Float[np.ndarray, "..."]:
+        """March all rays, and return the gradient of `mean((rgba - target)²)`: to (r, g, b, extinction) of
+        each of the n points of the transfer function, as made dense here, (n, 4); or to the voxels, (nx, ny,
+        nz)."""
+        leaf, texture = (self.table, self.transfer) if of == "transfer" else (self.grid, self.voxels)
+        dr.enable_grad(leaf)
+        dr.clear_grad(leaf)
+        texture.set_tensor(leaf)
         self.color, self.left = self._march()
         image = mi.Vector4f(*self.color, 1 - self.left)
         cotangent = 2 * (image - target) / (4 * dr.width(self.rays))
         dr.eval(self.color, self.left, cotangent)
         self._march_again(cotangent)
-        gradient = dr.grad(self.table)
+        gradient = dr.grad(leaf)
         dr.eval(gradient)
         dr.sync_thread()
-        dr.disable_grad(self.table)
-        self.transfer.set_tensor(self.table)
-        return np.array(gradient)
+        dr.disable_grad(leaf)
+        texture.set_tensor(leaf)
+        found = np.array(gradient)
+        return found if of == "transfer" else found[..., 0].transpose(2, 1, 0)
 
     @dr.syntax
     def _march(self) -> tuple[Drjit, Drjit]:

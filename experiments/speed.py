@@ -8,20 +8,21 @@ converged image of ours; VTK's image is compared with that image as VTK's displa
 
 Also measured: the part of a frame that computes the occupancy; the time from the start of a fresh process to
 its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient of every entry of
-a transfer function (256 for 8-bit data), relative to the image alone and to Dr.Jit's replay adjoint, with the
-relative difference of the two gradients.
+a transfer function (256 for 8-bit data), and with that of every voxel as float32, relative to the image alone
+and to Dr.Jit's replay adjoint, with the relative difference of the two gradients.
 
 Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
 JAXVOL_DATA names; without one, only the head phantom is measured.
 """
 
+import itertools
 import os
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -106,33 +107,48 @@ def drjit(scene: Scene) -> Any:
     return peer_drjit.prepare(*scene, opacity_left=LEFT, threads=THREADS)
 
 
-def gradients(scene: Scene, repetitions: int) -> dict[str, Any]:
-    """Time of an image with the gradient of mean(rgba²) to all entries of the transfer function."""
+def gradients(scene: Scene, of: Literal["transfer", "voxels"], repetitions: int) -> dict[str, Any]:
+    """Time of an image with the gradient of mean(rgba²) to all entries of the transfer function, or to all
+    voxels, as float32."""
     scene = scene._replace(transfer=peer_vtk.dense(scene.transfer, scene.volume))
+    volume, transfer = scene.volume, scene.transfer
+    if of == "voxels":
+        volume = eqx.tree_at(lambda v: v.data, volume, jnp.asarray(volume.data, jnp.float32))
+        scene = scene._replace(volume=volume)
+    leaf = volume.data if of == "voxels" else (transfer.colors, transfer.extinction)
     march = fast(scene)
 
-    def loss(transfer: jv.TransferFunction, march: jv.March = march) -> jax.Array:
-        return jnp.mean(common.image(scene._replace(transfer=transfer), march).rgba ** 2)
+    def loss(leaf: Any, march: jv.March = march) -> jax.Array:
+        if of == "voxels":
+            here = scene._replace(volume=eqx.tree_at(lambda v: v.data, volume, leaf))
+        else:
+            changed = eqx.tree_at(lambda t: (t.colors, t.extinction), transfer, leaf)
+            here = scene._replace(transfer=changed)
+        return jnp.mean(common.image(here, march).rgba ** 2)
 
     def entries(march: jv.March) -> np.ndarray:
-        gradient = jax.grad(loss)(scene.transfer, march)
-        return np.column_stack([gradient.colors, gradient.extinction])
+        found = jax.grad(loss)(leaf, march)
+        return np.asarray(found) if of == "voxels" else np.column_stack(found)
 
     # compiled as one program, like the image
     both_of = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
     ours = entries(march)
     programs: dict[str, Any] = {
         "image": lambda: common.image(scene, march),
-        "image and gradient": lambda: both_of(scene.transfer),
+        "image and gradient": lambda: both_of(leaf),
     }
-    found: dict[str, Any] = {"entries": len(ours), "pixels": scene.camera.size[0]}
+    found: dict[str, Any] = {"entries": len(ours) if of == "transfer" else ours.size}
+    found["pixels"] = scene.camera.size[0]
     if peer_drjit:
         marcher = drjit(scene)
-        programs[DRJIT] = marcher.gradient
-        theirs = marcher.gradient()
-        # with leaps, the gradient of an extinction of 0 is left out; without leaps it is computed
-        seen = np.broadcast_to(np.asarray(scene.transfer.extinction > 0)[:, None], ours.shape).copy()
-        seen[:, :3] = True
+        programs[DRJIT] = partial(marcher.gradient, of=of)
+        theirs = marcher.gradient(of=of)
+        # with leaps, the gradient of what has an extinction of 0 is left out; without leaps it is computed
+        seen = np.ones(ours.shape, bool)
+        if of == "transfer":
+            seen[:, 3] = np.asarray(transfer.extinction > 0)
+        else:
+            seen = ours != 0
         plain = entries(jv.March(march.step, (jv.EarlyTermination(LEFT),)))
         size = np.linalg.norm(theirs)
         found["size"] = float(size)
@@ -221,7 +237,7 @@ def main(chosen: Namespace) -> common.Answer:
             rows = volumes[name][str(size)] = images(scene, there, chosen.repetitions)
             print_rows(name, size, rows)
             if chosen.gradients and size == chosen.sizes[0]:
-                slopes[name] = gradients(scene, chosen.repetitions)
+                slopes[name] = {of: gradients(scene, of, chosen.repetitions) for of in ("transfer", "voxels")}
                 print(f"{name:16} {size:4}  {slopes[name]}", flush=True)
     result = {
         "sizes": chosen.sizes,
@@ -235,11 +251,10 @@ def main(chosen: Namespace) -> common.Answer:
         "volumes": volumes,
         "gradients": slopes,
     }
-    if slopes:
-        for key in {"over image", "Dr.Jit over ours"} & set(next(iter(slopes.values()))):
-            result["geometric means"][key] = common.geometric_mean(
-                found[key]["median"] for found in slopes.values()
-            )
+    for of, key in itertools.product(("transfer", "voxels"), ("over image", "Dr.Jit over ours")):
+        ratios = [found[of][key]["median"] for found in slopes.values() if key in found[of]]
+        if ratios:
+            result["geometric means"][f"{of}, {key}"] = common.geometric_mean(ratios)
     print("first image:", result["first image"])
     print(f"times over ours, geometric means: {result['geometric means']}; the goal is {GOAL}")
     return result, partial(draw, result)
