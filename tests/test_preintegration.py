@@ -8,10 +8,14 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.piecewise_means import mean_by_rows, mean_by_spans, span_rows
+from jaxvol.engine.scene import Scene
+from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
+from jaxvol.render import _render
 from jaxvol.transfer import Transfer
 
 from . import oracle
+from .engine.test_gradient_matrix import scene_of
 from .scenes import (
     anisotropic_noise,
     around,
@@ -215,6 +219,46 @@ def test_pieces_that_need_not_be_joined_are_measured_at_both_ends(transforms):
     camera = around(volume)
     rendering, reference = (make(volume, transfer, camera, march) for make in (jv.render, reference_image))
     compare(rendering, reference.rgba, np.asarray(reference.samples), tolerance=2e-5)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", *slow("int16", "uint16", "float32")])
+def test_types_of_voxels_leaps_and_tiles_do_not_show(dtype):
+    """Small types are fetched from their packed copy. One tile of all six beams, or three tiles of two."""
+    volume, transfer, camera, march = scene = scene_of("integrated", "hierarchy", dtype)
+    counted = jv.March(march.step, march.transforms[:-1], march.quadrature, max_samples=128)
+    reference = reference_image(volume, transfer, camera, counted)
+    assert not np.any(reference.exhausted)
+    assert 0.05 < np.mean(reference.rgba[..., 3] > 0) < 0.95
+    whole = jv.render(*scene)
+    tiled = _render(Scene(*scene), "all", "replay", Tiling(batch=4, tile=2))
+    np.testing.assert_allclose(tiled.rgba, whole.rgba, atol=1e-6)
+    np.testing.assert_allclose(whole.rgba, reference.rgba, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_fans_are_integrated_and_programs_vmapped():
+    """In the fan of an ultrasound probe, for two transfer functions at once."""
+    volume, probe = jv.toroidal_phantom("shells", (17, 25, 33), speckle=False)
+    colors, extinction = np.linspace(0, 1, 12).reshape(4, 3), np.array([0.0, 0.0, 0.3, 1.0])
+    low, high = (np.asarray(corner) for corner in probe.corners)
+    away = 2 * (high - low).max() * np.array([0.5, -0.8, 0.3])
+    camera = jv.Camera((low + high) / 2 + away, (low + high) / 2, (0, 0, 1), 30.0, size=(20, 16))
+    step = float((high - low).max()) / 60
+    transforms = probe, jv.EmptySpaceJitter(2), jv.AlphaCorrection(), jv.SpaceLeaping()
+
+    def image(extinction, march):
+        transfer = jv.TransferFunction([0.0, 40.0, 120.0, 255.0], colors, extinction)
+        return jv.render(volume, transfer, camera, march).rgba
+
+    march = jv.March(step, transforms, "preintegrated")
+    both = jnp.stack([jnp.asarray(extinction), jnp.asarray(3 * extinction)])
+    found = jax.vmap(lambda extinction: image(extinction, march))(both)
+    for rgba, each in zip(found, both, strict=True):
+        np.testing.assert_allclose(rgba, image(each, march), atol=1e-6)
+        transfer = jv.TransferFunction([0.0, 40.0, 120.0, 255.0], colors, each)
+        counted = jv.March(step, transforms[:-1], "preintegrated", max_samples=256)
+        reference = reference_image(volume, transfer, camera, counted)
+        np.testing.assert_allclose(rgba, reference.rgba, atol=2e-5)
 
 
 class Own(Transfer):

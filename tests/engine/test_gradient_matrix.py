@@ -295,6 +295,25 @@ def test_gradients_under_jit_are_those_without(method):
     assert_same(leaves, gradient(scene), 1e-4)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [("voxels",), *(pytest.param(asked, marks=slow) for asked in (("extinction", "position"), ("step",)))],
+)
+def test_only_what_is_asked_for_is_computed_and_it_is_the_same(asked):
+    """A program of its own for each set of leaves."""
+    scene = scene_of("aligned", "hierarchy", "float32")
+    leaves = [LEAVES[name](scene) for name in asked]
+
+    def of(leaves):
+        return loss(eqx.tree_at(lambda s: [LEAVES[name](s) for name in asked], scene, leaves))
+
+    expected = gradient(scene)
+    found = dict(zip(asked, jax.grad(of)(leaves), strict=True))
+    if "extinction" in asked:
+        found["extinction"] = jnp.where(scene[1].extinction > 0, found["extinction"], 0)
+    assert_same(found, {name: expected[name] for name in asked}, 1e-5)
+
+
 @slow
 def test_tiles_and_batches_of_rays_do_not_show():
     """1.07 million pixels: two tiles, and tens of batches."""
