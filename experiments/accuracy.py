@@ -17,7 +17,7 @@ middle of what each scene shows: the error of both second-order quadratures, by 
 """
 
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -40,6 +40,8 @@ FINEST_OF = {3e-2: 4, 1e-2: 4, 3e-3: 4, 1e-3: 8}
 """By tolerance, the parts of a voxel that the shortest cells are long."""
 ADAPTIVE = "adaptive"
 FINER = 16
+ERRORS = (1e-2, 5e-3, 2e-3)
+"""At which Dr.Jit is compared."""
 VTK, DRJIT = "VTK", "Dr.Jit"
 STYLES = {
     ADAPTIVE: "C4*-",
@@ -126,9 +128,31 @@ def against_uniform(rows: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dic
     for tolerance, row in rows[ADAPTIVE].items():
         found[tolerance] = {"error over tolerance": row["rmse"] / float(tolerance)}
         for what in ("samples", "seconds"):
-            taken = [at_error(rows[q], row["rmse"], what) for q in QUADRATURES]
-            least = min((t for t in taken if t is not None), default=None)
-            found[tolerance][what] = None if least is None else round(least / row[what], 3)
+            taken = least(rows, QUADRATURES, row["rmse"], what)
+            found[tolerance][what] = None if taken is None else round(taken / row[what], 3)
+    return found
+
+
+def least(
+    rows: dict[str, dict[str, dict[str, Any]]], programs: Sequence[str], error: float, what: str
+) -> Any:
+    """What the best of these programs takes for this error; None where none has it between its settings."""
+    taken = (at_error(rows[name], error, what) for name in programs if name in rows)
+    return min((t for t in taken if t is not None), default=None)
+
+
+def time_to_accuracy(rows: dict[str, dict[str, dict[str, Any]]]) -> dict[str, dict[str, float]]:
+    """By peer and error, how many times longer than ours the peer takes to an image of this error, each by
+    its best setting: VTK at its own error at one voxel; Dr.Jit at three errors, where both reach them."""
+    ours, theirs = (ADAPTIVE, *QUADRATURES), (f"{DRJIT}, left", f"{DRJIT}, midpoint")
+    found: dict[str, dict[str, float]] = {VTK: {}, DRJIT: {}}
+    if VTK in rows:
+        drawn = rows[VTK]["1.0"]
+        found[VTK][f"{drawn['rmse']:.4f}"] = drawn["seconds"] / least(rows, ours, drawn["rmse"], "seconds")
+    for error in ERRORS:
+        our, their = (least(rows, programs, error, "seconds") for programs in (ours, theirs))
+        if our is not None and their is not None:
+            found[DRJIT][f"{error:g}"] = their / our
     return found
 
 
@@ -168,7 +192,11 @@ def summary(scenes: dict[str, Any], peaks: dict[str, Any]) -> dict[str, Any]:
         what: [gain for of in uniform.values() for row in of.values() if (gain := row[what]) is not None]
         for what in ("samples", "seconds")
     }
+    faster = {s: time_to_accuracy(rows) for s, rows in scenes.items()}
+    peers = {peer: [r for of in faster.values() for r in of[peer].values()] for peer in (VTK, DRJIT)}
     return {
+        "time of peers over ours, at the same error": faster,
+        "its geometric means": {p: common.geometric_mean(each) for p, each in peers.items() if each},
         "uniform steps over adaptive sampling, at its error": uniform,
         "geometric means": {what: common.geometric_mean(each) for what, each in gains.items() if each},
         "preintegrated over midpoint, one voxel": ratios,
