@@ -70,6 +70,11 @@ class Run(NamedTuple):
         """Depth of the middle of the run."""
         return self.front + RUN * self.stride / 2 * self.step
 
+    def within(self, length: Scalar) -> Bool[Array, ""]:
+        """Whether the run ends at this depth or before, up to a thousandth of a step: where rays are so many
+        steps long, rounding must not decide."""
+        return self.front + (RUN * self.stride - 1e-3) * self.step <= length
+
 
 class Strides(NamedTuple):
     """The cells of a ray from an index on.
@@ -249,7 +254,7 @@ class March(eqx.Module):
                 raise ValueError(
                     f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
                 )
-            _check_stride(transform)
+            _check_strides(transform)
         if quadrature not in get_args(Quadrature):
             names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
@@ -282,6 +287,12 @@ class March(eqx.Module):
         return bool(self._overriding("shift"))
 
     @property
+    def lengths(self) -> tuple[Array, list[Transform]]:
+        """All on which the number of steps along a ray depends: the step, and transforms that change how long
+        rays are."""
+        return self.step, self._overriding("locate")
+
+    @property
     def looks_ahead(self) -> bool:
         """Whether any transform must know the scene before it is marched."""
         return bool(self._overriding("prepared"))
@@ -304,6 +315,11 @@ class March(eqx.Module):
                 transform = eqx.combine(eqx.filter(transform, eqx.is_inexact_array), prepared)
             known.append(transform)
         return eqx.tree_at(lambda march: march.transforms, self, tuple(known))
+
+    @property
+    def strides_vary(self) -> bool:
+        """Whether any transform overrides `stride_error`."""
+        return bool(self._overriding("stride_error"))
 
     @property
     def longest_stride(self) -> int:
@@ -348,7 +364,11 @@ class March(eqx.Module):
     def divided(self) -> "March":
         """This march with its steps as short as its transforms want them."""
         parts = max((transform.subdivision for transform in self.transforms), default=1)
-        return self if parts == 1 else eqx.tree_at(lambda march: march.step, self, self.step / parts)
+        if parts == 1:
+            return self
+        with jax.ensure_compile_time_eval():  # a step that is known stays so inside `jax.jit`
+            step = self.step / parts
+        return eqx.tree_at(lambda march: march.step, self, step)
 
     def strides(
         self,
@@ -374,13 +394,16 @@ class March(eqx.Module):
             front = (start + (first - phase).astype(start.dtype)) * march.step
             run = Run(front, 1 << level, march.step)
             predicted = [_predicted(transform, ray, run) for transform in march._overriding("stride_error")]
-            error = transmittance * reduce(jnp.maximum, [error for error, _ in predicted])
+            greatest = reduce(jnp.maximum, [error for error, _ in predicted])
+            # what is unknown is infinite, but does not count where nothing of it is seen
+            error = jnp.where(transmittance > 0, transmittance * greatest, 0)
             found = Strides(first - phase, jnp.full_like(index, run.stride), error)
             if chosen is None:
                 # the first of all runs may have begun before the ray's first cell
                 chosen = found._replace(begin=jnp.maximum(found.begin, end - phase))
                 continue
-            fits = first >= end
+            # a cell that reaches past the exit is composited as a whole, unless a transform cuts it
+            fits = (first >= end) & run.within(ray.length)
             for error, tolerated in predicted:
                 fits &= transmittance * error <= tolerated
             chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)
@@ -462,10 +485,11 @@ def _predicted(transform: Transform, ray: Ray, run: Run) -> tuple[Scalar, Scalar
     return answer
 
 
-def _check_stride(transform: Transform) -> None:
+def _check_strides(transform: Transform) -> None:
     name, longest = type(transform).__name__, transform.longest_stride
     if _overrides(transform, "stride_error") != _overrides(transform, "longest_stride"):
         raise ValueError(
             f"transforms: {name} must override both stride_error and longest_stride, or neither."
         )
     power_of_two(f"transforms: {name}.longest_stride", longest, 64)
+    integer(f"transforms: {name}.subdivision", transform.subdivision, 1, 64)

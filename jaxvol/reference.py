@@ -89,7 +89,7 @@ def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Prog
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
     march, _, _, compositing = pipeline
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
-    count, strides = jnp.zeros(ray.length.shape, jnp.int32), march.longest_stride > 1
+    count, strides = jnp.zeros(ray.length.shape, jnp.int32), march.strides_vary
     return Progress(
         index=count,
         offset=march.start(ray),
@@ -116,7 +116,8 @@ def with_stride(
     stats = at.stats
     if stats is not None:
         assert stats.error is not None
-        error = jnp.where(leaves | at.finished | (ray.length <= 0), 0, ahead.error)
+        ended = leaves | at.finished | (ray.length <= 0) | (at.index >= pipeline.march.most_samples)
+        error = jnp.where(ended, 0, ahead.error)
         stats = replace(stats, error=stats.error + error**2)
     return replace(at, stride=stride, stats=stats), begin
 
@@ -232,7 +233,7 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
         after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1])
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     after = move(march, ray, stop(pipeline, after), transparent, stride)
-    if march.longest_stride == 1:  # a scan has as many steps as a ray may take
+    if at.stride is None:  # a scan has as many steps as a ray may take
         return after
     return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
 
@@ -310,8 +311,8 @@ def render_ray_reference(
 
     **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
-    **Raises:** `ValueError` where the march or the spacing is traced and `march.max_samples` is not given:
-    the length of the scan cannot be known.
+    **Raises:** `ValueError` where the step, the spacing or a transform that bends space is traced, and
+    `march.max_samples` is not given: the length of the scan cannot be known.
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
@@ -320,7 +321,7 @@ def render_ray_reference(
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     march = march.divided()
-    space = march.locate(volume)
+    length, space = steps_across(volume, march), march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
@@ -333,7 +334,7 @@ def render_ray_reference(
         return step(pipeline, ray, at), None
 
     start = varying(begin(pipeline, ray), ray)
-    at, _ = jax.lax.scan(one, start, None, length=steps_across(volume, march))
+    at, _ = jax.lax.scan(one, start, None, length=length)
     rendering = end(pipeline, ray, at)
     if not later:
         return rendering
@@ -359,11 +360,11 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 def steps_across(volume: Volume, march: March) -> int:
     """Number of steps that suffices for any ray: across the volume's diagonal, and a few more for
     transforms."""
-    if is_traced(volume.spacing, march):
+    if is_traced(volume.spacing, march.lengths):
         if march.max_samples is not None:
             return march.max_samples
         raise ValueError(
-            "March(max_samples=...) must be given where the march or volume.spacing is traced: "
+            "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
             "the length of a scan must be known before the program is compiled."
         )
     with jax.ensure_compile_time_eval():

@@ -261,15 +261,21 @@ class TransferFunction(Transfer):
         return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        if not self._looks_up_rows:
+            return super().majorant(blocks)
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
         bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def variation(self, windows: Windows) -> Variation:
+        if not self._looks_up_rows:
+            return super().variation(windows)
         points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
         return Variation(*variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        if not self._looks_up_rows:
+            return super().visible(blocks)
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
         return positive_between(values, extinction, blocks.low, blocks.high)
 
@@ -338,7 +344,7 @@ class TransferFunction(Transfer):
         (transfer,) = pull_rows(sums)
         return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
 
-    def span_rows(self) -> Float[Array, "spans 18"]:
+    def span_rows(self) -> Float[Array, "spans 26"]:
         """The table of `piecewise_means.span_rows`."""
         at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         return span_rows(jax.lax.stop_gradient(self.values), at_points)
@@ -382,7 +388,7 @@ class TransferFunction(Transfer):
 
 
 def _span_of(
-    rows: Float[Array, "spans 18"], measured: Measured
+    rows: Float[Array, "spans 26"], measured: Measured
 ) -> tuple[tuple[Scalar, ...], Int[Array, "..."]]:
     """The row of the span in which a value lies, and its index. `measured`: the value, and what
     `TransferFunction.search` finds for it."""

@@ -54,7 +54,8 @@ class Long(jv.Transform):
 
     def stride_error(self, ray, run):
         x, _, _ = ray.path(run.front)
-        return jnp.where(x >= self.beyond, run.stride / self.steps, jnp.inf).astype(x.dtype), jnp.ones_like(x)
+        allowed = (x >= self.beyond) & (run.stride <= self.steps)
+        return jnp.where(allowed, 0, jnp.inf).astype(x.dtype), jnp.ones_like(x)
 
 
 class Unlimited(jv.Transform):
@@ -66,6 +67,12 @@ class Three(Long):
     @property
     def longest_stride(self):
         return 3
+
+
+class NoParts(jv.Transform):
+    @property
+    def subdivision(self):
+        return 0
 
 
 class Moved(jv.Transform):
@@ -130,21 +137,22 @@ def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, 
 @pytest.mark.parametrize(
     ("transforms", "length", "samples"),
     [
-        ((Long(1),), 2.1, 7),
-        ((Long(2),), 2.4, 4),  # at 0, 0.6, 1.2, 1.8
-        ((Long(3),), 2.4, 4),  # no power of two
-        ((Long(4),), 2.4, 2),  # at 0, 1.2
-        ((Long(50),), 2.4, 2),  # no longer than the longest stride
-        ((Long(0.1),), 2.1, 7),  # one step is always allowed
-        ((Long(4, 1.7),), 2.1, 7),  # the second run begins behind 1.7, but only one of one step may be there
-        ((Shift(), Long(4)), 2.4, 2),  # at 0.15, 1.35
-        ((Halves(), Long(4)), 2.4, 4),  # half cells
-        ((jv.AlphaCorrection(), Long(4)), 2.0, 2),
+        ((Long(1),), 2.04, 34),
+        ((Long(2),), 2.04, 18),  # four runs of eight steps; two more would reach past the exit
+        ((Long(3),), 2.04, 18),  # no power of two
+        ((Long(4),), 2.04, 10),  # two runs of sixteen steps
+        ((Long(50),), 2.04, 10),  # no longer than the longest stride
+        ((Long(0.1),), 2.04, 34),  # one step is always allowed
+        ((Long(4, 1.7),), 2.04, 22),  # the second run of sixteen begins behind 1.7, but only that
+        ((Shift(), Long(4)), 1.98, 9),  # half a step later
+        ((Halves(), Long(4)), 2.01, 19),  # half cells
+        ((jv.AlphaCorrection(), Long(4)), 2.0, 10),
     ],
 )
 def test_stride_lengthens_cells(transforms, length, samples):
-    assert opacity(transforms)[:2] == (seen(length), samples)
-    march = jv.March(0.3, transforms)
+    """On a ray of 33.3 steps."""
+    assert opacity(transforms, step=0.06)[:2] == (seen(length), samples)
+    march = jv.March(0.06, transforms)
     reference = jv.render_ray_reference(
         BOX, uniform_transfer(1.0), jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march
     )
@@ -152,19 +160,19 @@ def test_stride_lengthens_cells(transforms, length, samples):
     assert int(reference.samples) == samples
 
 
-@pytest.mark.parametrize(("limit", "cells"), [(5, 2), *slow((1, 1), (4, 1), (8, 2))])
+@pytest.mark.parametrize(("limit", "cells"), [(5, 2), *slow((1, 1), (4, 1), (8, 2), (33, 9), (34, 10))])
 def test_cells_of_several_steps_begin_within_the_limit(limit, cells):
-    """On a ray of seven steps, in all engines."""
-    march, box = jv.March(0.3, (Long(4),), max_samples=limit), (BOX, uniform_transfer(1.0))
+    """Eight cells of four steps, and two of one, in all engines."""
+    march, box = jv.March(0.06, (Long(4),), max_samples=limit), (BOX, uniform_transfer(1.0))
     found = [jv.render_rays(*box, *RAY, march, adjoint=adjoint) for adjoint in ("replay", "direct")]
     found.append(
-        jv.render_rays(*box, *RAY, jv.March(0.3, (*march.transforms, jv.SpaceLeaping()), max_samples=limit))
+        jv.render_rays(*box, *RAY, jv.March(0.06, (*march.transforms, jv.SpaceLeaping()), max_samples=limit))
     )
     alone = jv.render_ray_reference(*box, jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march)
     for rendering in (*(jax.tree.map(lambda leaf: leaf[0], each) for each in found), alone):
-        assert float(rendering.rgba[3]) == seen(cells * 1.2)
+        assert float(rendering.rgba[3]) == seen(0.24 * min(cells, 8) + 0.06 * max(cells - 8, 0))
         assert int(rendering.samples) == cells
-        assert bool(rendering.exhausted) == (cells == 1)
+        assert bool(rendering.exhausted) == (cells < 10)
 
 
 def test_locate_replaces_the_space():
@@ -225,6 +233,10 @@ BAD = {
     "a stride of three": (
         lambda: jv.March(0.1, (Three(1),)),
         "Three.longest_stride must be a power of two; got 3",
+    ),
+    "steps in no parts": (
+        lambda: jv.March(0.1, (NoParts(),)),
+        "NoParts.subdivision must be an integer from 1 to 64; got 0",
     ),
     "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
     "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),

@@ -135,6 +135,22 @@ def test_the_vjp_of_integrals_is_that_of_jax(points):
             np.testing.assert_allclose(part, want, atol=1e-6 * scale)
 
 
+@pytest.mark.parametrize("dense", [1e3, 1e6])
+def test_what_is_dense_elsewhere_does_not_show(dense):
+    """Beside values of this extinction, thin ones: sums over the former must not round the latter away."""
+    values = np.linspace(0, 1, 256).astype(np.float32)
+    extinction = np.where(values < 0.5, dense, 0.02 + 0.01 * np.sin(40 * values)).astype(np.float32)
+    colors = np.random.default_rng(0).random((256, 3)).astype(np.float32)
+    front, back = np.random.default_rng(1).uniform(0.55, 0.99, (2, 500)).astype(np.float32)
+    apart = abs(front - back) > 0.01
+    (r, g, b), found = means_by_rows(values, colors, extinction, front, back)
+    rgb, sigma = oracle.mean_between(
+        *(part.astype(np.float64) for part in (front, back, values, colors, extinction))
+    )
+    np.testing.assert_allclose(found[apart], sigma[apart], rtol=1e-4)
+    np.testing.assert_allclose(np.stack([r, g, b], axis=1)[apart], rgb[apart], atol=1e-4)
+
+
 # -- images ---------------------------------------------------------------------------------------------
 
 

@@ -123,27 +123,55 @@ def variation_between(
     extinction: Float[Array, " n"],
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
-) -> tuple[Float[Array, "*blocks"], Float[Array, "*blocks"]]:
-    """Upper bounds of how much the extinction, and its product with any colour channel, change in total from
-    `low` to `high`; and of how much their slopes change at the control points between."""
-    gap, rise, shift = jnp.diff(values), jnp.diff(extinction), jnp.diff(colors, axis=0)
+) -> tuple[Float[Array, "*blocks"], Float[Array, "*blocks"], Float[Array, "*blocks"]]:
+    """What `variation.Variation` holds, for values from `low` to `high`: upper bounds, but for rounding."""
+    gap, rise, shift = jnp.diff(values), jnp.diff(extinction), jnp.abs(jnp.diff(colors, axis=0))
     brightness = jnp.maximum(jnp.max(jnp.abs(colors), axis=1), 1)
-    brighter = jnp.maximum(brightness[1:], brightness[:-1])
-    densest = jnp.maximum(extinction[1:], extinction[:-1])
-    changes = jnp.abs(rise) * brighter + densest * jnp.max(jnp.abs(shift), axis=1)
-    # a step is a slope, too, but one whose sums are finite
-    gap = jnp.maximum(gap, 1e-6 * (values[-1] - values[0]))
-    slopes = jnp.pad(jnp.concatenate([rise[:, None], shift], axis=1) / gap[:, None], ((1, 1), (0, 0)))
-    turns = jnp.abs(jnp.diff(slopes, axis=0))
-    turns = turns[:, 0] * brightness + extinction * jnp.max(turns[:, 1:], axis=1)
-    total, turned = (
-        jnp.concatenate([jnp.zeros_like(each[:1]), jnp.cumsum(each)]) for each in (changes, turns)
+    brighter, densest = (jnp.maximum(each[1:], each[:-1]) for each in (brightness, extinction))
+    shift = jnp.max(shift, axis=1)
+    hidden = densest * shift
+    total = jnp.abs(rise) * brighter + hidden
+    # steps, the sum of whose slopes would swallow all others, are counted instead
+    steps = gap <= 1e-4 * (values[-1] - values[0])
+    inverse = jnp.where(steps, 0, 1 / jnp.where(steps, 1, gap))
+    # emission, a product of two linear functions, bends between points, too
+    bends = 2 * jnp.abs(rise) * shift * inverse
+    slopes = jnp.pad(jnp.stack([rise, shift]) * inverse[None], ((0, 0), (1, 1)))
+    # a change of colour has three channels, of which any may change its sign
+    turns = jnp.abs(slopes[0, 1:] - slopes[0, :-1]) * brightness + extinction * (
+        slopes[1, 1:] + slopes[1, :-1]
     )
+
     low, high = low.astype(values.dtype), high.astype(values.dtype)
-    first, last = (jnp.interp(end, values, total) for end in (low, high))
-    passed, reached = points_below(values, low), points_below(values, high, strictly=True)
-    inside = gather(turned, reached) - gather(turned, passed)
-    return jnp.maximum(last - first, 0), jnp.maximum(inside, 0)
+    passed, reached = points_below(values, low), points_below(values, high)
+    ends = [_interval(values, end, below) for end, below in ((low, passed), (high, reached))]
+
+    def between(changes: Array) -> Array:
+        """Sum of what changes along the intervals, in proportion where only a part of one lies within."""
+        whole = jnp.cumsum(changes) - changes
+        first, last = (gather(whole, i) + part * gather(changes, i) for i, part in ends)
+        return jnp.maximum(last - first, 0)
+
+    def inside(at_points: Array, end: Array) -> Array:
+        """Sum over the points above `low`, up to so many."""
+        whole = jnp.pad(jnp.cumsum(at_points), (1, 0))
+        return jnp.maximum(gather(whole, end) - gather(whole, passed), 0)
+
+    # what lies at a step is above it; a slope that changes at `high` has not been passed
+    stepped = inside(jnp.pad(steps, (0, 1)).astype(jnp.int32), reached) > 0
+    turned = inside(turns, points_below(values, high, strictly=True)) + between(bends)
+    return between(total), jnp.where(stepped, jnp.inf, turned), between(hidden)
+
+
+def _interval(
+    values: Float[Array, " n"], value: Float[Array, "*batch"], below: Int[Array, "*batch"]
+) -> tuple[Int[Array, "*batch"], Float[Array, "*batch"]]:
+    """In which interval a value lies that has so many points at or below it, and which part of it."""
+    i = jnp.clip(below - 1, 0, values.shape[0] - 2)
+    start, end = gather(values, i), gather(values, i + 1)
+    gap = end - start
+    part = jnp.clip((value - start) / jnp.where(gap > 0, gap, 1), 0, 1)
+    return i, jnp.where(gap > 0, part, (value >= start).astype(part.dtype))
 
 
 def _maximum_of_range(

@@ -21,7 +21,9 @@ class Span(NamedTuple):
 
     - `start`, `end`: values between which it lies. The first and the last span reach farther.
     - `from_start`: colour (r, g, b) and extinction at its start. `slopes`: how they grow with the value.
-    - `to_start`, `to_end`: integrals of emission and extinction over the value, from the first point on.
+    - `to_start`, `to_end`: integrals of emission and extinction over the value, from the first point on; and
+      the part of each that is lost when it is rounded, so that differences are exact however dense it is in
+      front of the two spans.
     """
 
     start: Scalar
@@ -33,7 +35,7 @@ class Span(NamedTuple):
 
     @classmethod
     def of(cls, row: Row) -> "Span":
-        return cls(row[0], row[1], row[2:6], row[6:10], row[10:14], row[14:18])
+        return cls(row[0], row[1], row[2:6], row[6:10], row[10:18], row[18:26])
 
     def at(self, value: Scalar) -> Row:
         """Colour and extinction of a value."""
@@ -41,13 +43,13 @@ class Span(NamedTuple):
         return tuple(at + past * slope for at, slope in zip(self.from_start, self.slopes, strict=True))
 
 
-def span_rows(values: Float[Array, " n"], at_points: Float[Array, "n 4"]) -> Float[Array, "spans 18"]:
+def span_rows(values: Float[Array, " n"], at_points: Float[Array, "n 4"]) -> Float[Array, "spans 26"]:
     """A table with one row for each span. `at_points`: colour (r, g, b) and extinction at the points."""
     gap = (values[1:] - values[:-1])[:, None]
     rise, middle = at_points[1:] - at_points[:-1], (at_points[1:] + at_points[:-1]) / 2
     slopes = jnp.pad(jnp.where(gap > 0, rise / jnp.where(gap > 0, gap, 1), 0), ((1, 1), (0, 0)))
     whole = gap * jnp.stack(_linear_means(tuple(middle.T), tuple(rise.T)), axis=-1)
-    integrals = jnp.pad(jnp.cumsum(whole, axis=0), ((1, 0), (0, 0)))
+    integrals = jnp.pad(_exact_sums(whole), ((1, 0), (0, 0)))
     points = jnp.concatenate([values[:, None], at_points, integrals], axis=1)
     start, end = jnp.concatenate([points[:1], points]), jnp.concatenate([points, points[-1:]])
     return jnp.concatenate(
@@ -55,7 +57,24 @@ def span_rows(values: Float[Array, " n"], at_points: Float[Array, "n 4"]) -> Flo
     )
 
 
-def span_index(rows: Float[Array, "spans 18"], value: Array) -> Int[Array, "..."]:
+def _exact_sums(terms: Float[Array, "n 4"]) -> Float[Array, "n 8"]:
+    """Cumulative sums, and behind them what is lost when they are rounded."""
+
+    def add(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+        (high, low), (more, rest) = a, b
+        total = high + more
+        part = total - high
+        lost = (high - (total - part)) + (more - part) + low + rest
+        whole = total + lost
+        return whole, lost - (whole - total)
+
+    fixed = jax.lax.stop_gradient(terms)
+    high, low = jax.lax.associative_scan(add, (fixed, jnp.zeros_like(fixed)))
+    plain = jnp.cumsum(terms, axis=0)  # it has the derivatives
+    return jnp.concatenate([high + (plain - jax.lax.stop_gradient(plain)), low], axis=1)
+
+
+def span_index(rows: Float[Array, "spans 26"], value: Array) -> Int[Array, "..."]:
     """The span in which a value lies, by comparison with all."""
     index = jnp.zeros(jnp.shape(value), jnp.int32)
     for start in rows[1:, 0]:
@@ -69,7 +88,7 @@ def mean_by_rows(
     """Mean colour and extinction between two values, of which either may be the larger. `a`, `b`: the rows of
     their spans. `same`: whether these are one.
 
-    Rounding: relative to the extinctions of the spans that lie between, 6e-8 times the number of all."""
+    Rounding: relative to the greatest extinction between the two, some 1e-7 times the number of spans."""
     here, there = Span.of(a), Span.of(b)
     at_front, at_back = here.at(front), there.at(back)
     rise = tuple(v - u for u, v in zip(at_front, at_back, strict=True))
@@ -81,12 +100,13 @@ def mean_by_rows(
     before, behind = (tuple(slope * d for slope in span.slopes) for span, d in ((here, first), (there, last)))
     head = _linear_means(tuple(u + d / 2 for u, d in zip(at_front, before, strict=True)), before)
     tail = _linear_means(tuple(v - d / 2 for v, d in zip(at_back, behind, strict=True)), behind)
-    between = (
+    sums = [
         jnp.where(up, to_start - to_end, to_end_there - to_start_here)
         for to_start, to_end, to_end_there, to_start_here in zip(
             there.to_start, here.to_end, there.to_end, here.to_start, strict=True
         )
-    )
+    ]
+    between = (high + low for high, low in zip(sums[:4], sums[4:], strict=True))
     whole = jnp.where(same, 1, back - front)
     # weights of neighbouring spans sum to 1 whatever is rounded: see `mean_by_spans`
     part, rest = first / whole, last / whole
@@ -97,7 +117,7 @@ def mean_by_rows(
 
 
 @jax.custom_jvp
-def mean_by_spans(rows: Float[Array, "spans 18"], front: Scalar, back: Scalar) -> tuple[Vec3, Scalar]:
+def mean_by_spans(rows: Float[Array, "spans 26"], front: Scalar, back: Scalar) -> tuple[Vec3, Scalar]:
     """The same, by a sum over all spans, which takes less time while there are few. Its derivatives are those
     of `mean_by_rows`, which do not divide by the difference of values where these are near each other."""
     spans = [Span.of(tuple(row)) for row in rows]

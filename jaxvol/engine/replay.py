@@ -180,7 +180,10 @@ class Replay(SampleVisitor):
             of_transfer, of_read = pull(measured, of_color[i], of_extinction)
             sum_ = added(total.transfer, of_transfer)
             total = Total(sum_, total.march, total.volume, total.voxels, total.shader)
-            of_measured.append(of_read if shaded is None else added(of_read, shaded[i].of_measured))
+            if shaded is not None:
+                of_value, *rest = of_read
+                of_read = (of_value + shaded[i].of_value, *rest)
+            of_measured.append(of_read)
         if not total.geometric and total.voxels is None:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.trees import PyTree, added, floats
+from .._util.trees import PyTree, added
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxel_fetch import cubes_of_zeros, scatter_add
 from ..lighting.shading import Shading, Surroundings, shade_sample
@@ -43,12 +43,12 @@ class ShadingTotal(NamedTuple):
 
 class ShadingVjp(NamedTuple):
     """Shaded colours of samples, arrays (cells, rays); and the cotangents of their unshaded colour,
-    extinction, measured values and world points. 0 for invisible samples."""
+    extinction, value and world points. 0 for invisible samples."""
 
     color: Vec3
     of_color: Vec3
     of_extinction: Scalar
-    of_measured: PyTree
+    of_value: Scalar
     of_point: Vec3
 
 
@@ -95,12 +95,13 @@ def shading_vjp(
         if voxels is not None:
             voxels = scatter_add(voxels, around.volume.shape, bases, of_cubes)
         total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
-        part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured, of_sample.point)
+        part = ShadingVjp(
+            color, of_sample.color, of_sample.extinction, of_sample.measured[0], of_sample.point
+        )
         return chosen.put(found, indices, part), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
-    measured = jax.tree.map(lambda _: zero, floats(samples.measured[0]))
     zeros = zero, zero, zero
-    start = ShadingVjp(zeros, zeros, zero, measured, zeros)
+    start = ShadingVjp(zeros, zeros, zero, zero, zeros)
     found, total = chosen.fold(one, (start, total))
     return chosen.split(found, len(weights.weight)), total

@@ -27,7 +27,8 @@ class Sample(NamedTuple):
     """A sample to be shaded.
 
     - `point`: in the world. `direction`: of the ray, a unit vector.
-    - `measured`, `color`, `extinction`: from the volume and the transfer function.
+    - `measured`, `color`, `extinction`: from the volume and the transfer function. Of what was measured, only
+      the value, `measured[0]`, has a gradient.
     - `transmittance`: between the sample and the camera.
     - `pixel`: (column, row), which keys random numbers.
     """

@@ -21,6 +21,9 @@ SHARE = 1 / 20
 """What a block's predicted error is worth in the image: errors of a ray's cells have either sign, and most
 are much smaller than predicted. Measured: `experiments.adaptive_error`."""
 
+HIDDEN = 1 / 4
+"""The same of what the front of a cell hides of its back, which has one sign along a ray."""
+
 FARTHEST = 8
 """Blocks around its own that a run may touch: it is at most 68 voxels long."""
 
@@ -149,13 +152,16 @@ def _errors(
         if not march.integrates:
             sampled = width * variation.total / 2
             if march.quadrature == "midpoint":
+                # NaN where there is a step, but no spread
                 turned = variation.turns * (spread / length) * width**2 / 24
-                sampled = jnp.minimum(turned, sampled)
+                sampled = jnp.where(turned < sampled, turned, sampled)
             error = error + sampled
         # a window exceeds its block by half of one, and each block around it by one more
         reach = jnp.max(RUN * width / 2 / length)
         rounds = jnp.maximum(jnp.ceil(reach - MARGIN / BLOCK), 0)
-        code = _coded(SHARE * error)
+        # a cell's front hides its back
+        error = jnp.maximum(SHARE * error, HIDDEN * width * variation.hidden / 8)
+        code = _coded(error)
         code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
         levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
     return jnp.stack(levels)

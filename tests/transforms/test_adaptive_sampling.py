@@ -22,7 +22,7 @@ from jaxvol.transforms.adaptive_sampling import _coded, _decoded, _node_distance
 from jaxvol.variation import MARGIN, Windows
 
 from ..engine.test_gradient_matrix import CAMERAS, TOPS, assert_same, gradient
-from ..scenes import counting, slow
+from ..scenes import around, counting, slow
 from ..test_agreement import compare, reference_image
 
 
@@ -81,15 +81,28 @@ def test_the_variation_bounds_every_change_of_extinction_and_emission(seed, poin
     low, high = np.sort(random.uniform(-0.2, 1.2, (2, 30)), axis=0)
     windows = Windows(*(jnp.asarray(a, jnp.float32).reshape(30, 1, 1) for a in (low, high, 0 * low)))
     found = transfer.variation(windows)
-    for bound, turns, a, b in zip(*(np.ravel(part) for part in found), low, high, strict=True):
+    for bound, turns, hidden, a, b in zip(*(np.ravel(part) for part in found), low, high, strict=True):
         at = np.linspace(a, b, 2001)
         extinction = np.interp(at, values, np.asarray(transfer.extinction))
         channels = [extinction * np.interp(at, values, c) for c in np.asarray(transfer.colors).T]
         total = max(np.abs(np.diff(each)).sum() for each in (extinction, *channels))
         assert total <= bound * (1 + 1e-4) + 1e-4
-        inside = (a < values) & (values < b)
-        slopes = np.diff(np.asarray(transfer.extinction, float)) / np.diff(np.asarray(values, float))
-        assert np.abs(np.diff([0, *slopes, 0]))[inside].sum() <= turns * (1 + 1e-3) + 1e-3
+        assert hidden <= bound
+        turned = max(np.abs(np.diff(each, 2)).sum() / (at[1] - at[0]) for each in (extinction, *channels))
+        assert turned <= turns * (1 + 1e-3) + 1e-3
+
+
+def test_a_hard_step_does_not_swallow_what_turns_elsewhere():
+    """Neither its own slope, in a sum with the others, nor where it lies in the range."""
+    for height in (1.0, 1e3, 1e6):
+        points, extinction = [0.0, 0.1, 0.1, 0.5, 0.55, 0.6, 1.0], [height, height, 0.0, 0.0, 2.0, 0.0, 0.0]
+        transfer = jv.TransferFunction(points, np.ones((7, 3)), extinction)
+        low, high = (
+            jnp.asarray(ends, jnp.float32).reshape(4, 1, 1)
+            for ends in ((0.3, 0.05, 0.05, 0.1), (0.8, 0.2, 0.1, 0.3))
+        )
+        turns = np.ravel(transfer.variation(Windows(low, high, 0 * low)).turns)
+        np.testing.assert_allclose(turns, [160.0, np.inf, np.inf, 0.0], rtol=1e-5)
 
 
 # -- what is predicted -----------------------------------------------------------------------------------
@@ -265,6 +278,37 @@ def test_the_estimated_error_is_that_of_the_reference():
     assert found.max() > 0
 
 
+def test_samples_that_run_out_end_the_estimate():
+    """It must not grow while other rays of a batch are marched."""
+    scene = changed(scene_of(), without=[jv.SpaceLeaping], max_samples=40)
+    reference = reference_image(*scene)
+    assert 0.1 < np.mean(reference.exhausted) < 1
+    np.testing.assert_allclose(jv.render(*scene).error, reference.error, rtol=1e-4, atol=1e-9)
+
+
+def test_cells_that_are_all_one_step_long_have_an_estimate_too():
+    volume, transfer, camera, march = scene_of()
+    uniform = jv.March(march.step, (jv.AlphaCorrection(),), "midpoint")
+    sampling = jv.March(march.step, (jv.AlphaCorrection(), jv.AdaptiveSampling(0.03, 1)), "midpoint")
+    found, expected = (jv.render(volume, transfer, camera, m) for m in (sampling, uniform))
+    np.testing.assert_allclose(found.rgba, expected.rgba, atol=1e-6)
+    np.testing.assert_array_equal(found.samples, expected.samples)
+    assert 0 < found.error.max() < 1
+
+
+def test_the_reference_needs_no_limit_of_samples_inside_jit():
+    volume, transfer, camera, march = scene_of()
+    origins, directions = (part[10, 18] for part in camera.rays())
+    for finest in (1, 2):
+        sampling = jv.March(march.step, (jv.AdaptiveSampling(0.03, 2, finest),), "midpoint")
+
+        def inside(origin, direction, sampling=sampling):
+            return jv.render_ray_reference(volume, transfer, origin, direction, sampling).rgba
+
+        expected = jax.jit(inside)(origins, directions)
+        np.testing.assert_allclose(inside(origins, directions), expected, atol=1e-6)
+
+
 def test_the_estimated_error_is_infinite_where_nothing_is_known_and_missing_where_nothing_is_estimated():
     volume, transfer, camera, march = scene_of()
     nearest = jv.render(volume, transfer, camera, march, compositing=jv.FirstVisible())
@@ -273,6 +317,59 @@ def test_the_estimated_error_is_infinite_where_nothing_is_known_and_missing_wher
     uniform = jv.render(*changed((volume, transfer, camera, march), without=[jv.AdaptiveSampling]))
     with pytest.raises(AttributeError, match="error is not part of this rendering: give the march Adaptive"):
         _ = uniform.error
+
+
+def within_tolerance(volume, transfer, tolerance, sampling, quadrature="midpoint", step=0.25, cut=True):
+    """Whether it holds, and by how many samples a ray, adaptive and uniform; and the root mean square of what
+    was estimated."""
+    camera, cuts = around(volume, (24, 24)), (jv.AlphaCorrection(),)
+    base = cuts if cut else ()
+    truth = jv.render(volume, transfer, camera, jv.March(step / 16, cuts, "midpoint")).rgba
+    found, uniform = (
+        jv.render(volume, transfer, camera, jv.March(step, (*base, *more), quadrature))
+        for more in ((sampling,), ())
+    )
+    # nothing is better than what is one step long
+    error, floor = (rmse(each.rgba, truth) for each in (found, uniform))
+    samples = [float(each.samples.mean()) for each in (found, uniform)]
+    return error <= max(tolerance, 1.01 * floor), *samples, float(np.sqrt(np.mean(found.error**2)))
+
+
+def line(n=33):
+    """Values from 0 to 1 along x."""
+    x = np.linspace(0, 1, n, dtype=np.float32)
+    return jv.Volume(np.broadcast_to(x[:, None, None], (n, n, n)).copy())
+
+
+@pytest.mark.parametrize("quadrature", ["midpoint", *slow("left", "preintegrated")])
+def test_long_cells_do_not_reach_past_the_exit(quadrature):
+    """In a constant, where all cells may be long, and which no `AlphaCorrection` cuts."""
+    volume = jv.Volume(np.full((33, 33, 33), 0.5, np.float32))
+    transfer = jv.TransferFunction([0.0, 1.0], [(1.0, 0.5, 0.2)] * 2, [0.02, 0.02])
+    held, samples, uniform, _ = within_tolerance(
+        volume, transfer, 1e-6, jv.AdaptiveSampling(1e-3, 64), quadrature, cut=False
+    )
+    assert held
+    assert samples < uniform / 3
+
+
+@pytest.mark.parametrize(
+    ("colors", "extinction"),
+    [
+        ([(1, 0, 0), (0, 0, 1)], (2.0, 2.0)),
+        *slow(([(0, 0, 0), (1, 1, 1)], (0.0, 0.2)), ([(1, 0, 0), (0, 0, 1)], (0.1, 0.1))),
+    ],
+)
+def test_colours_that_hide_each_other_and_products_that_bend_are_heeded(colors, extinction):
+    """The value is linear, and so are colour and extinction: no cell errs by anything else."""
+    transfer = jv.TransferFunction([0.0, 1.0], colors, extinction)
+    for tolerance in (1e-3, 1e-4):
+        held, samples, uniform, estimate = within_tolerance(
+            line(), transfer, tolerance, jv.AdaptiveSampling(tolerance, 16)
+        )
+        assert held, tolerance
+        assert estimate > tolerance / 100
+    assert samples <= uniform
 
 
 def test_finest_divides_the_steps_of_the_march():
@@ -339,7 +436,7 @@ def changed(scene, tolerance=0.03, without=(), max_samples=None):
 @pytest.mark.parametrize("dtype", ["uint8", *slow("uint16", "int16", "float32")])
 def test_both_engines_choose_the_same_cells(dtype, camera):
     scene = scene_of(dtype, camera)
-    leapt, plain = (jv.render(*changed(scene, without=[t])) for t in (jv.ToroidalMap, jv.AdaptiveSampling))
+    leapt, plain = (jv.render(*changed(scene, without=none)) for none in ([], [jv.AdaptiveSampling]))
     assert int(leapt.samples.sum()) < 0.8 * int(plain.samples.sum())
     unleapt = jv.render(*changed(scene, without=[jv.SpaceLeaping]))
     np.testing.assert_allclose(leapt.rgba, unleapt.rgba, atol=1e-6)
@@ -351,7 +448,7 @@ def test_both_engines_choose_the_same_cells(dtype, camera):
 @pytest.mark.slow
 def test_leaping_does_not_change_its_gradients():
     scene = scene_of()
-    found, expected = (gradient(changed(scene, without=[t])) for t in (jv.ToroidalMap, jv.SpaceLeaping))
+    found, expected = (gradient(changed(scene, without=none)) for none in ([], [jv.SpaceLeaping]))
     assert_same(found, expected, 1e-4)
 
 
