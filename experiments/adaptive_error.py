@@ -2,7 +2,7 @@
 break wood grain?
 
 Five scenes, each from outside and from inside (the camera stands in the widest empty place of the volume's
-middle), at four tolerances. Compared with an image of 32 steps a voxel without early termination are the RMSE
+middle), at five tolerances. Compared with an image of 32 steps a voxel without early termination are the RMSE
 over white, relative to the tolerance, and each pixel's error (root mean square of its channels), relative to
 `Rendering.error`: in four classes of equally many pixels by estimate, and the share of pixels whose error is
 at most the estimate. Strides change from ray to ray: the energy of what is periodic in the error

@@ -85,12 +85,10 @@ class Marcher:
         """An image in Dr.Jit's layout, as a target for `gradient`."""
         return mi.Vector4f(np.asarray(image, np.float32).reshape(-1, 4).T)
 
-    def gradient(
+    def differentiate(
         self, target: Drjit | float = 0.0, of: Literal["transfer", "voxels"] = "transfer"
-    ) -> Float[np.ndarray, "..."]:
-        """March all rays, and return the gradient of `mean((rgba - target)²)`: to (r, g, b, extinction) of
-        each of the n points of the transfer function, as made dense here, (n, 4); or to the voxels, (nx, ny,
-        nz)."""
+    ) -> Drjit:
+        """March all rays, and wait for the gradient of `mean((rgba - target)²)`, in Dr.Jit's layout."""
         leaf, texture = (self.table, self.transfer) if of == "transfer" else (self.grid, self.voxels)
         dr.enable_grad(leaf)
         dr.clear_grad(leaf)
@@ -105,7 +103,14 @@ class Marcher:
         dr.sync_thread()
         dr.disable_grad(leaf)
         texture.set_tensor(leaf)
-        found = np.array(gradient)
+        return gradient
+
+    def gradient(
+        self, target: Drjit | float = 0.0, of: Literal["transfer", "voxels"] = "transfer"
+    ) -> Float[np.ndarray, "..."]:
+        """The same: to (r, g, b, extinction) of each of the n points of the transfer function, as made dense
+        here, (n, 4); or to the voxels, (nx, ny, nz)."""
+        found = np.array(self.differentiate(target, of))
         return found if of == "transfer" else found[..., 0].transpose(2, 1, 0)
 
     @dr.syntax

@@ -103,13 +103,14 @@ def occupancy(scene: Scene) -> Any:
 
 def drjit(scene: Scene) -> Any:
     assert peer_drjit is not None
-    scene = scene._replace(transfer=peer_vtk.dense(scene.transfer, scene.volume))
     return peer_drjit.prepare(*scene, opacity_left=LEFT, threads=THREADS)
 
 
 def gradients(scene: Scene, of: Literal["transfer", "voxels"], repetitions: int) -> dict[str, Any]:
     """Time of an image with the gradient of mean(rgba²) to all entries of the transfer function, or to all
-    voxels, as float32."""
+    voxels, as float32. (8-bit values lie on points of the transfer function, where its slope jumps: there
+    gradients of voxels differ between programs.) Voxels that are differentiated are new in each call, so that
+    their ranges, too, are computed again, which an image alone has kept."""
     scene = scene._replace(transfer=peer_vtk.dense(scene.transfer, scene.volume))
     volume, transfer = scene.volume, scene.transfer
     if of == "voxels":
@@ -141,14 +142,12 @@ def gradients(scene: Scene, of: Literal["transfer", "voxels"], repetitions: int)
     found["pixels"] = scene.camera.size[0]
     if peer_drjit:
         marcher = drjit(scene)
-        programs[DRJIT] = partial(marcher.gradient, of=of)
+        programs[DRJIT] = partial(marcher.differentiate, of=of)
         theirs = marcher.gradient(of=of)
         # with leaps, the gradient of what has an extinction of 0 is left out; without leaps it is computed
         seen = np.ones(ours.shape, bool)
         if of == "transfer":
             seen[:, 3] = np.asarray(transfer.extinction > 0)
-        else:
-            seen = ours != 0
         plain = entries(jv.March(march.step, (jv.EarlyTermination(LEFT),)))
         size = np.linalg.norm(theirs)
         found["size"] = float(size)
