@@ -1,12 +1,12 @@
 """What does accuracy cost? Time against error, for steps and quadratures, compared with VTK and Dr.Jit.
 
 Five scenes, steps of a quarter of a voxel to four, and three quadratures: at the front of a cell ("left"),
-in its middle ("midpoint"), and integrated between the values at its ends ("preintegrated"). Adaptive sampling,
-at tolerances of 0.1 to 0.001: cells of a quarter of a voxel to four (at 0.001, of an eighth on), sampled in
-their middle. Ours skips empty space, cuts the last cell at the exit, and ends rays early. The peers are those
-of `speed`, at steps of half a voxel to four; Dr.Jit takes samples at the front of cells, or in the middle.
-Error is the RMSE over white against one converged image of ours, by the midpoint rule; VTK's image is compared
-with that image as VTK's display would show it.
+in its middle ("midpoint"), and integrated between the values at its ends ("preintegrated"). Adaptive
+sampling, at tolerances of 0.1 to 0.001: cells of a quarter of a voxel to four (at 0.001, of an eighth on),
+sampled in their middle. Ours skips empty space, cuts the last cell at the exit, and ends rays early. The
+peers are those of `speed`, at steps of half a voxel to four; Dr.Jit takes samples at the front of cells, or
+in the middle. Error is the RMSE over white against one converged image of ours, by the midpoint rule; VTK's
+image is compared with that image as VTK's display would show it.
 
 Programs are run in turn. Times are those of one machine; ratios are what counts. Adaptive sampling is
 compared with uniform steps at its own error, which lies between those of two steps: number of samples and

@@ -180,9 +180,10 @@ class Transform(eqx.Module):
         Both depend on the ray and the run alone. A run is allowed if its error, times the transmittance in
         front of it, is at most what is tolerated (if several transforms override this, by each), and always
         if its stride is 1. A run of stride s begins at a multiple of RUN s steps, from `March.phase` steps
-        before the ray's first cell on. Of those that hold a cell and are allowed, a march takes the longest
-        one that holds no cell taken before. So leaps, which only cross what is transparent, do not change
-        it. Gradients take strides as given; the image jumps where one changes."""
+        before the ray's first cell on. Where a run ends, a march takes the longest one that is allowed and
+        begins there (and ends before the exit, unless cells are cut there). Of two runs that meet one holds
+        the other, so that leaps, which only cross what is transparent, do not change which ones are taken.
+        Gradients take strides as given; the image jumps where one changes."""
         unknown = jnp.full(jnp.shape(run.front), jnp.inf, ray.length.dtype)
         return unknown, jnp.zeros_like(unknown)
 
@@ -195,6 +196,9 @@ class Transform(eqx.Module):
     """Of a transform that overrides `cut`: whether each piece begins where the one in front of it ends, also
     from cell to cell, unless it lies past the exit. Pieces that are integrated (`quadrature="preintegrated"`)
     then share what is measured where they meet."""
+
+    ends_at_exit: ClassVar[bool] = False
+    """Whether `cut` ends at the exit what reaches past it."""
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
         """Whether the ray is finished, given the answer of the transforms before this one."""
@@ -214,8 +218,10 @@ class March(eqx.Module):
       along it, the colour weighted by the extinction. The error falls with d², too, and a narrow peak of the
       transfer function counts wherever the two values lie on either side of it. A mean does not know that
       what is in front in a cell hides what is behind: for a cell of opacity α and optical depth τ, this errs
-      by at most α τ / 8 times the difference of its colours. It takes one fetch for each cell and one more
-      for each segment, or two for each piece where a transform's pieces are not joined (`Transform.joins`).
+      by at most α τ / 8 times the difference of its colours. Where the transfer function is neither steep nor
+      has narrow peaks, `"midpoint"` may be more accurate, and takes half the time. It takes one fetch for
+      each cell and one more for each segment, or two for each piece where a transform's pieces are not joined
+      (`Transform.joins`).
       Of a labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take
       it there, too, and light is computed there.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
@@ -351,8 +357,8 @@ class March(eqx.Module):
 
     def phase(self, ray: Ray) -> Int[Array, ""] | None:
         """How many steps before a ray's first cell the first of all runs begins, less than the longest one:
-        at random where `start` or `shift` are. These move samples by less than a step, which would leave the
-        wood grain of longer cells, and of the runs themselves. None if 0 for all rays."""
+        at random where `start` or `shift` are. These alone move samples by less than a step, too little to
+        break the wood grain of longer cells, and of the runs themselves. None if 0 for all rays."""
         if not self._overriding("start") and not self.may_shift:
             return None
         part = jax.lax.stop_gradient(self.start(ray) - self.shift(ray))
@@ -402,8 +408,9 @@ class March(eqx.Module):
                 # the first of all runs may have begun before the ray's first cell
                 chosen = found._replace(begin=jnp.maximum(found.begin, end - phase))
                 continue
-            # a cell that reaches past the exit is composited as a whole, unless a transform cuts it
-            fits = (first >= end) & run.within(ray.length)
+            fits = first >= end
+            if not self.ends_at_exit:
+                fits &= run.within(ray.length)
             for error, tolerated in predicted:
                 fits &= transmittance * error <= tolerated
             chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)
@@ -433,6 +440,11 @@ class March(eqx.Module):
     def joins(self) -> bool:
         """Whether each piece of a cell begins where the one in front of it ends."""
         return all(transform.joins for transform in self._overriding("cut"))
+
+    @property
+    def ends_at_exit(self) -> bool:
+        """Whether a transform cuts cells that reach past the exit; otherwise they count as a whole."""
+        return any(transform.ends_at_exit for transform in self.transforms)
 
     def sample(self, cell: Cell) -> Scalar:
         """Depth at which a cell is sampled; of one that is integrated, its middle."""

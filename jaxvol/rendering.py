@@ -37,10 +37,11 @@ class Rendering(eqx.Module):
     - `samples`: number of samples evaluated, one for each piece of a cell.
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
-
     - `error`: under `AdaptiveSampling`, a cautious estimate of how far a pixel's colour is wrong because of
-      the distance of its samples; more than the true error in 97 % of the pixels or more
-      (`experiments.adaptive_error`). Infinite where nothing can be predicted.
+      the distance of its samples, without a gradient. In the scenes of `experiments.adaptive_error`, rays
+      that end in `AlphaCorrection`, it is more than the true error in 97 % of the pixels or more, and several
+      times as large. Infinite where nothing can be predicted. What is leapt over adds nothing to it, so that
+      it may be somewhat smaller where rays leap.
 
     The last four raise `AttributeError` where they were not asked for (`outputs="rgba"`), and `error` without
     `AdaptiveSampling`.

@@ -51,18 +51,20 @@ class Variation(NamedTuple):
     - `total`: while the value passes through the range once, 1/length.
     - `turns`: the sum of all changes of slope by the value, 1/length for each unit of the value. Infinite
       where there is a step.
-    - `hidden`: the part of `total` that is due to changes of colour, 1/length.
+    - `colored`: the part of `total` that is due to changes of colour, 1/length; and `hidden`: that, times the
+      extinction, 1/length².
 
     Of the four, extinction and three channels of emission, the one that changes most counts."""
 
     total: Float[Array, "bx by bz"]
     turns: Float[Array, "bx by bz"]
+    colored: Float[Array, "bx by bz"]
     hidden: Float[Array, "bx by bz"]
 
     @classmethod
     def unknown(cls, windows: Windows) -> "Variation":
         """Infinite: nothing is known."""
-        return cls(*[jnp.full(windows.low.shape, jnp.inf)] * 3)
+        return cls(*[jnp.full(windows.low.shape, jnp.inf)] * 4)
 
 
 @jax.jit

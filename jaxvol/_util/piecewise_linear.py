@@ -123,25 +123,22 @@ def variation_between(
     extinction: Float[Array, " n"],
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
-) -> tuple[Float[Array, "*blocks"], Float[Array, "*blocks"], Float[Array, "*blocks"]]:
+) -> tuple[Float[Array, "*blocks"], ...]:
     """What `variation.Variation` holds, for values from `low` to `high`: upper bounds, but for rounding."""
-    gap, rise, shift = jnp.diff(values), jnp.diff(extinction), jnp.abs(jnp.diff(colors, axis=0))
+    gap, rise, shifts = jnp.diff(values), jnp.diff(extinction), jnp.diff(colors, axis=0)
     brightness = jnp.maximum(jnp.max(jnp.abs(colors), axis=1), 1)
     brighter, densest = (jnp.maximum(each[1:], each[:-1]) for each in (brightness, extinction))
-    shift = jnp.max(shift, axis=1)
-    hidden = densest * shift
-    total = jnp.abs(rise) * brighter + hidden
+    shift = jnp.max(jnp.abs(shifts), axis=1)
+    colored = densest * shift
+    total = jnp.abs(rise) * brighter + colored
     # steps, the sum of whose slopes would swallow all others, are counted instead
     steps = gap <= 1e-4 * (values[-1] - values[0])
     inverse = jnp.where(steps, 0, 1 / jnp.where(steps, 1, gap))
     # emission, a product of two linear functions, bends between points, too
     bends = 2 * jnp.abs(rise) * shift * inverse
-    slopes = jnp.pad(jnp.stack([rise, shift]) * inverse[None], ((0, 0), (1, 1)))
-    # a change of colour has three channels, of which any may change its sign
-    turns = jnp.abs(slopes[0, 1:] - slopes[0, :-1]) * brightness + extinction * (
-        slopes[1, 1:] + slopes[1, :-1]
-    )
-
+    slopes = jnp.concatenate([rise[:, None], shifts], axis=1) * inverse[:, None]
+    turns = jnp.abs(jnp.diff(jnp.pad(slopes, ((1, 1), (0, 0))), axis=0))
+    turns = turns[:, 0] * brightness + extinction * jnp.max(turns[:, 1:], axis=1)
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     passed, reached = points_below(values, low), points_below(values, high)
     ends = [_interval(values, end, below) for end, below in ((low, passed), (high, reached))]
@@ -160,7 +157,8 @@ def variation_between(
     # what lies at a step is above it; a slope that changes at `high` has not been passed
     stepped = inside(jnp.pad(steps, (0, 1)).astype(jnp.int32), reached) > 0
     turned = inside(turns, points_below(values, high, strictly=True)) + between(bends)
-    return between(total), jnp.where(stepped, jnp.inf, turned), between(hidden)
+    turned = jnp.where(stepped, jnp.inf, turned)
+    return between(total), turned, between(colored), between(densest * colored)
 
 
 def _interval(

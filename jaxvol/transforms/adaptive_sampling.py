@@ -34,29 +34,33 @@ class AdaptiveSampling(Transform):
     Where the value bends little between nodes, or the transfer function changes little with it, a long cell
     is as good as several short ones; and so it is behind what hides most of it. Take a block of 4³ voxels, of
     side ℓ, whose values, with those up to two nodes around it, range over R, with second differences of at
-    most H (per length²). Between the ends of a cell of width w the value leaves the straight line by at most
-    δ = H w² / 8. While it runs through R once, extinction and emission change by V in total, and their slopes
-    by K (`variation.Variation`). Then the optical depth of a stretch as long as the block is wrong by about
+    most H (per length²). Between the ends of a cell of width w the value leaves the straight line by about
+    δ = H w² / 8 (along a diagonal up to three times as much, and more in cells shorter than a voxel that
+    cross a face between voxels). While the value passes through R once, extinction and emission change by V
+    in total, C of it by the colour, and their slopes by K; C times the extinction is D
+    (`variation.Variation`). Then the optical depth of a stretch as long as the block is wrong by about
 
         e = ℓ V min(1, δ / R) + q
 
     where q is what the quadrature errs by where the value is linear: 0 for `"preintegrated"`; V w / 2 for
-    `"left"`; and for `"midpoint"` K (R / ℓ) w² / 24, since it errs where a cell crosses a control point, or
-    V w / 2 where that is less. Cells come in runs of four that are equally long: as long as T e / 20 is at
-    most `tolerance`, with the largest e of the blocks that may hold a part of the run, and T the
-    transmittance in front of it (`Transform.stride_error`).
+    `"left"`; and for `"midpoint"` K (R / ℓ) w² / 24, since it errs where emission bends, or V w / 2 where
+    that is less. The front of a cell hides of its back, in colour, at most h = min(C, D w) w / 8. Cells come
+    in runs of four that are equally long: as long as T max(e / 20, h / 4) is at most `tolerance`, with the
+    largest e and h of the blocks that may hold a part of the run, and T the transmittance in front of it
+    (`Transform.stride_error`). Without `AlphaCorrection`, only cells of one step reach past the exit.
 
     **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes, from
     outside and inside (`experiments.adaptive_error`). It does not know how light varies along a cell, nor
     can cells be shorter than the shortest that it is given: an eighth of a voxel suits tolerances of 0.001, a
-    quarter larger ones. `Rendering.error` holds the root of the summed squares of T e / 20 of a ray's runs.
+    quarter larger ones; `quadrature="left"` needs a half or a quarter of that. `Rendering.error`, the root of
+    the summed squares of a ray's runs, is greater than the tolerance in many pixels where cells are too long.
 
-    It takes 1.7 times fewer samples for the same error (five scenes, `experiments.accuracy`). On CPU that
-    saves time only where rays take many samples, or samples are expensive: each run of four must be looked
-    up.
+    For what it saves, in samples and in time, see `experiments/results/README.md`: on CPU it is faster where
+    rays take many samples, or samples are expensive, since each run of four must be looked up.
 
-    For modes that do not composite "over", and for transfer functions that do not say how they vary, all
-    cells are one step long, and `Rendering.error` is infinite.
+    All cells are one step long, and `Rendering.error` is infinite, where nothing is known: for modes that do
+    not composite "over", and for transfer functions that do not say how they vary, such as
+    `LabelTransferFunction`.
 
     **Arguments:**
 
@@ -70,8 +74,9 @@ class AdaptiveSampling(Transform):
     otherwise long cells, and runs, would leave a wood grain of their own.
 
     What is known of the voxels is computed once for each array of them. Which cells may be long follows from
-    the transfer function in each image, inside `jax.jit`, too. Strides are constants to derivatives; the
-    image jumps where one changes.
+    the transfer function in each image, inside `jax.jit`, too. Strides are constants to derivatives, and so
+    is `Rendering.error`; the image jumps where one changes. So compare gradients with finite differences
+    without this transform, and search along lines with care.
 
     **Raises:** `ValueError` for another tolerance, `longest` or `finest`.
 
@@ -160,8 +165,8 @@ def _errors(
         reach = jnp.max(RUN * width / 2 / length)
         rounds = jnp.maximum(jnp.ceil(reach - MARGIN / BLOCK), 0)
         # a cell's front hides its back
-        error = jnp.maximum(SHARE * error, HIDDEN * width * variation.hidden / 8)
-        code = _coded(error)
+        hidden = jnp.minimum(variation.hidden * width, variation.colored) * width / 8
+        code = _coded(jnp.maximum(SHARE * error, HIDDEN * hidden))
         code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
         levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
     return jnp.stack(levels)

@@ -36,7 +36,7 @@ class AlphaCorrection(Transform):
     `1 - (1 - α)^(e/d)`. A volume of constant extinction is rendered exactly at any step.
 
     Where a ray may leave the volume and re-enter it, as under `ToroidalMap`, the faces of such gaps are
-    found by bisection and cells are cut there, too; a gap shorter than a quarter of a step may be missed.
+    found by bisection and cells are cut there, too; a gap shorter than a quarter of a cell may be missed.
 
     With this transform, the image is continuous in the camera and in everything else that moves the exit,
     and its gradient is complete. Without it, the image jumps when a sample crosses the exit, and the
@@ -47,7 +47,7 @@ class AlphaCorrection(Transform):
     - `labels`: also cut cells where the volume's label changes between two samples; the face is found by
       bisection. The part before it is classified at the sample, the part behind it at the face: each by
       its own label, so that the faces of a segmentation stay smooth under jitter. A label that lasts less
-      than a step may be missed. Costs a label fetch per bisection, and a second sample per cell.
+      than a cell may be missed. Costs a label fetch per bisection, and a second sample per cell.
 
     Gradients treat the faces of labels and gaps as fixed in space: with respect to the camera, they miss
     how such a face moves along a ray. The motion of the exit is included.
@@ -60,6 +60,7 @@ class AlphaCorrection(Transform):
     """
 
     joins: ClassVar[bool] = True
+    ends_at_exit: ClassVar[bool] = True
 
     labels: bool = eqx.field(static=True, default=False)
 

@@ -1,5 +1,7 @@
 """Cells of several steps: the fast engine against the reference, leaping against none, and gradients."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,56 +39,66 @@ class Table(jv.Transform):
     behind less than that all of them."""
 
     allowed: jax.Array
+    phase: jax.Array
 
     @property
     def longest_stride(self):
         return 16
 
     def stride_error(self, ray, run):
-        number = jnp.round(run.front / run.step / (RUN * run.stride)).astype(jnp.int32)
+        number = jnp.round((run.front / run.step + self.phase) / (RUN * run.stride)).astype(jnp.int32)
         fits = self.allowed[run.stride.bit_length() - 1, number]
         return jnp.where(fits, 1.0, 4.0).astype(ray.length.dtype), jnp.ones_like(run.front)
 
 
+@eqx.filter_jit
+def _strides(march, ray, phase, index, stride, target, transmittance):
+    index, stride, target = (jnp.asarray(i, jnp.int32) for i in (index, stride, target))
+    return march.strides(ray, index, stride, target, jnp.asarray(transmittance, jnp.float32), phase)
+
+
 @settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**16), share=st.sampled_from([0.1, 0.3, 0.5]))
-def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share):
-    """By steps or by leaps, from where a run begins or from within it."""
+@given(
+    seed=st.integers(0, 2**16),
+    share=st.sampled_from([0.1, 0.3, 0.5]),
+    first=st.one_of(st.just(0), st.integers(0, 16 * RUN - 1)),
+)
+def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share, first):
+    """By steps or by leaps, from where a run begins or from within it. The first of all runs begins so many
+    steps before the ray."""
     random, steps = np.random.default_rng(seed), 16 * RUN * 4
     allowed = random.random((5, steps // RUN)) < share
-    march = jv.March(0.5, (Table(jnp.asarray(allowed)),))
+    march = jv.March(0.5, (Table(jnp.asarray(allowed), jnp.asarray(first)),))
     box, zero = Affine(jv.Volume(np.zeros((3, 3, 3)), (200.0, 200.0, 200.0))), jnp.float32(0)
     line = (zero + 1, zero + 1, zero + 1), (zero + 1, zero, zero)
     ray = enter(box, *line, (jnp.int32(0), jnp.int32(0)))
-
-    @jax.jit
-    def strides(index, stride, target, transmittance):
-        index, stride, target = (jnp.asarray(i, jnp.int32) for i in (index, stride, target))
-        transmittance = jnp.asarray(transmittance, jnp.float32)
-        return march.strides(ray, index, stride, target, transmittance, march.phase(ray))
+    strides = partial(_strides, march, ray, jnp.asarray(first, jnp.int32))
 
     runs, index, stride = [], 0, 1
-    while index < steps:
+    while index < steps - first:
         begin, stride, error = (int(each) for each in strides(index, stride, index, 1.0))
-        level = stride.bit_length() - 1
+        level, since = stride.bit_length() - 1, index + first
         assert begin == index
-        assert index % (RUN * stride) == 0
-        assert stride == 1 or allowed[level, index // (RUN * stride)]
-        assert error == (1 if allowed[level, index // (RUN * stride)] else 4)
+        assert since % (RUN * stride) == 0 or (index == 0 and stride == 1)
+        assert stride == 1 or allowed[level, since // (RUN * stride)]
+        assert error == (1 if allowed[level, since // (RUN * stride)] else 4)
         runs.append((index, stride))
-        index += RUN * stride
-    for target in random.integers(0, steps, 30):
-        (begin, stride), *_ = [run for run in runs if run[0] <= target < run[0] + RUN * run[1]]
+        index = (since // (RUN * stride) + 1) * RUN * stride - first
+    ends = [index for index, _ in runs[1:]] + [index]
+    for target in random.integers(0, steps - first, 30):
+        begin, stride = runs[np.searchsorted(ends, target, side="right")]
         since = runs[random.integers(0, runs.index((begin, stride)) + 1)]
         before = runs[max(runs.index(since) - 1, 0)][1]
         found = strides(since[0], before, target, 1.0)
         assert (int(found.begin), int(found.stride)) == (begin, stride)
         within = since[0] + since[1] * random.integers(1, RUN)
-        if within <= target:
+        if within <= target and within < ends[runs.index(since)]:
             found = strides(within, since[1], target, 1.0)
             ahead = within if since == (begin, stride) else begin
             assert (int(found.begin), int(found.stride)) == (ahead, stride)
-    assert int(strides(0, 1, 0, 0.25).stride) == 16
+    assert int(strides(0, 1, 0, 0.25).stride) == max(
+        2**k for k in range(5) if first % (RUN << k) == 0 or k == 0
+    )
     for index, _ in runs:  # what became allowed behind something does not reach before it
         assert int(strides(index, 1, index, 0.25).begin) == index
 
