@@ -454,6 +454,66 @@ MUTATIONS = [
         "fits = first >= 0",
         ("engine/test_strides.py::test_runs_are_the_same_however_a_ray_comes_to_them",),
     ),
+    Mutation(
+        "stride: long cells reach past the exit",
+        "march.py",
+        "fits &= run.within(ray.length)",
+        "fits &= run.within(ray.length + 1e6)",
+        ("transforms/test_adaptive_sampling.py::test_long_cells_do_not_reach_past_the_exit",),
+    ),
+    Mutation(
+        "stride: the estimate grows where samples have run out",
+        "reference.py",
+        " | (at.index >= pipeline.march.most_samples)\n        error",
+        "\n        error",
+        ("transforms/test_adaptive_sampling.py::test_samples_that_run_out_end_the_estimate",),
+    ),
+    Mutation(
+        "adaptive: what a cell hides of itself is left out",
+        "transforms/adaptive_sampling.py",
+        "HIDDEN * hidden",
+        "0 * hidden",
+        (
+            "transforms/test_adaptive_sampling.py::test_colours_that_hide_each_other_and_products_that_bend_are_heeded",
+        ),
+    ),
+    Mutation(
+        "variation: emission does not bend between points",
+        "_util/piecewise_linear.py",
+        " + between(bends)",
+        "",
+        (
+            "transforms/test_adaptive_sampling.py::test_the_variation_bounds_every_change_of_extinction_and_emission",
+        ),
+    ),
+    Mutation(
+        "variation: a step is as steep as its height",
+        "_util/piecewise_linear.py",
+        "jnp.where(stepped, jnp.inf, turned)",
+        "turned",
+        ("transforms/test_adaptive_sampling.py::test_a_hard_step_does_not_swallow_what_turns_elsewhere",),
+    ),
+    Mutation(
+        "preintegrated: what rounding loses is left out",
+        "_util/piecewise_means.py",
+        "between = (high + low for high",
+        "between = (high for high",
+        ("test_preintegration.py::test_what_is_dense_elsewhere_does_not_show",),
+    ),
+    Mutation(
+        "transfer: a classifier of one's own is not asked",
+        "transfer.py",
+        "        if not self._looks_up_rows:\n            return super().visible(blocks)\n",
+        "",
+        ("test_transfer.py::test_nothing_is_proven_of_a_classifier_of_ones_own",),
+    ),
+    Mutation(
+        "replay: a leaf alone has another gradient",
+        "engine/replay.py",
+        "if not total.geometric and total.voxels is None:",
+        "if not total.geometric:",
+        ("engine/test_gradient_matrix.py::test_only_what_is_asked_for_is_computed_and_it_is_the_same",),
+    ),
     # fetching, transfer functions, lighting, path tracing
     Mutation(
         "packing: sign of int16 and int8 lost",

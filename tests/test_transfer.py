@@ -8,6 +8,8 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.piecewise_linear import points_below, positive_between
+from jaxvol.occupancy import Blocks
+from jaxvol.variation import Windows
 
 
 def evaluate(transfer, values):
@@ -330,6 +332,20 @@ class Gained(jv.TransferFunction):
             return color, self.gain * extinction
 
         return gained
+
+
+def test_nothing_is_proven_of_a_classifier_of_ones_own():
+    """It may show what the points do not."""
+    points = np.linspace(0, 1, 4), np.full((4, 3), 0.5), np.zeros(4)
+    volume = jv.Volume(np.random.default_rng(0).random((9, 9, 9), np.float32))
+    blocks, windows = Blocks.of(volume), Windows.of(volume)
+    plain, gained = jv.TransferFunction(*points), Gained(*points)
+    assert not np.any(plain.visible(blocks))
+    assert not np.any(plain.majorant(blocks))
+    assert np.all(plain.variation(windows).total == 0)
+    assert np.all(gained.visible(blocks))
+    assert np.all(np.isinf(gained.majorant(blocks)))
+    assert np.all(np.isinf(gained.variation(windows).total))
 
 
 def test_vjp_of_a_custom_transfer_function_matches_its_look_up():
