@@ -87,6 +87,19 @@ def _root(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+def structured(scenes: dict[str, Any]) -> dict[str, Any]:
+    """Of the images in which more than a hundredth of the error is structured: how many there are, and the
+    largest part of it that jitter leaves."""
+    parts = []
+    for views in scenes.values():
+        for of in views.values():
+            for tolerance, row in of.items():
+                energy = 3 * (row["rmse over tolerance"] * float(tolerance)) ** 2
+                if row["structured energy"] > energy / 100:
+                    parts.append(row["structured energy, jittered"] / row["structured energy"])
+    return {"images with structured errors": len(parts), "of which jitter leaves at most": max(parts)}
+
+
 def grain(resolution: int, size: int) -> dict[str, dict[str, float]]:
     """By march and length of cells, in steps: the energy of their rings."""
     scene = jitter_accuracy.cut_block(resolution, size)
@@ -166,9 +179,7 @@ def main(chosen: Namespace) -> common.Answer:
             "smallest share of pixels below the estimate": min(
                 row["share below the estimate"] for row in rows
             ),
-            "largest part of structured energy that jitter leaves": max(
-                row["structured energy, jittered"] / row["structured energy"] for row in rows
-            ),
+            **structured(scenes),
         },
         "scenes": scenes,
         "wood grain": grain(*block),
