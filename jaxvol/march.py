@@ -219,9 +219,9 @@ class March(eqx.Module):
       transfer function counts wherever the two values lie on either side of it. A mean does not know that
       what is in front in a cell hides what is behind: for a cell of opacity α and optical depth τ, this errs
       by at most α τ / 8 times the difference of its colours. Where the transfer function is neither steep nor
-      has narrow peaks, `"midpoint"` may be more accurate, and takes half the time. It takes one fetch for
-      each cell and one more for each segment, or two for each piece where a transform's pieces are not joined
-      (`Transform.joins`).
+      has narrow peaks, `"midpoint"` may be more accurate, in half to two thirds of the time. It takes one
+      fetch for each cell and one more for each segment, or two for each piece where a transform's pieces are
+      not joined (`Transform.joins`).
       Of a labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take
       it there, too, and light is computed there.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to

@@ -22,7 +22,8 @@ SHARE = 1 / 20
 are much smaller than predicted. Measured: `experiments.adaptive_error`."""
 
 HIDDEN = 1 / 4
-"""The same of what the front of a cell hides of its back, which has one sign along a ray."""
+"""The same of what the front of a cell hides of its back: more, since that has one sign along a ray. With it,
+volumes of linear and of wavy values stay within their tolerance."""
 
 FARTHEST = 8
 """Blocks around its own that a run may touch: it is at most 68 voxels long."""
@@ -52,11 +53,12 @@ class AdaptiveSampling(Transform):
     **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes, from
     outside and inside (`experiments.adaptive_error`). It does not know how light varies along a cell, nor
     can cells be shorter than the shortest that it is given: an eighth of a voxel suits tolerances of 0.001, a
-    quarter larger ones; `quadrature="left"` needs a half or a quarter of that. `Rendering.error`, the root of
-    the summed squares of a ray's runs, is greater than the tolerance in many pixels where cells are too long.
+    quarter larger ones; `quadrature="left"` may need less (an eighth erred by 0.0017 in a chest).
+    `Rendering.error` is the root of the summed squares of a ray's runs; where cells are too long, it is
+    greater than the tolerance.
 
-    For what it saves, in samples and in time, see `experiments/results/README.md`: on CPU it is faster where
-    rays take many samples, or samples are expensive, since each run of four must be looked up.
+    For what it saves, in samples and in time, see `experiments/results/README.md`: on CPU it is faster only
+    where rays take many samples, since each run of four must be looked up. Under light it was not measured.
 
     All cells are one step long, and `Rendering.error` is infinite, where nothing is known: for modes that do
     not composite "over", and for transfer functions that do not say how they vary, such as
