@@ -47,6 +47,7 @@ from .phantoms import (
     phantom as phantom,
     toroidal_phantom as toroidal_phantom,
 )
+from .planning import Plan as Plan, plan as plan
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays

@@ -27,7 +27,11 @@ EXPECTED: dict[str, tuple[tuple[type, ...], str, str]] = {
         "a jaxvol Camera",
         "Pass jv.Camera.looking_at(volume) or jv.Camera(position, focal_point).",
     ),
-    "march": ((March,), "a jaxvol March", "Pass jv.March(step) or jv.March(step, transforms)."),
+    "march": (
+        (March,),
+        "a jaxvol March",
+        'Pass jv.March(step) or jv.March(step, transforms), or "auto" to jv.render.',
+    ),
     "lighting": (
         (Lighting, NoneType),
         "None or a Lighting, such as ScattererTemplates",

@@ -1,4 +1,4 @@
-"""What does the command `jaxvol` do? It renders volume files, and fits transfer functions to images."""
+"""What does the command `jaxvol` do? It renders volume files, plans how to, and fits transfer functions."""
 
 import argparse
 import os
@@ -19,8 +19,9 @@ from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, w
 from .formats import load
 from .march import March
 from .phantoms import phantom
+from .planning import plan
 from .presets import PRESETS, colormap, preset
-from .render import render
+from .render import PLANNED, render
 from .transfer import TransferFunction
 from .transforms.alpha_correction import AlphaCorrection
 from .transforms.early_termination import EarlyTermination
@@ -35,6 +36,7 @@ examples:
   jaxvol render engine_256x256x128_uint8.raw.gz --preset engine -o engine.png
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
+  jaxvol plan engine_256x256x128_uint8.raw.gz --preset engine --tolerance 0.001
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
   jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
   jaxvol render engine_256x256x128_uint8.raw.gz --transfer transfer.json --transparent --depth depth.npy
@@ -105,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="cache of compiled programs (default: %(default)s)",
     )
-    scene = _scene_options()
+    scene, view = _scene_options(), _view_options()
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     demo_command = commands.add_parser(
@@ -120,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
 
     render_command = commands.add_parser(
         "render",
-        parents=[shared, scene],
+        parents=[shared, scene, view],
         help="render a volume file to an image",
         description="Render a volume file to an image.",
         epilog=EXAMPLES,
@@ -146,53 +148,16 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="also write depth, the mean distance to what is visible, else infinite: .npy or .tif, float32",
     )
-    render_command.add_argument(
-        "--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels"
-    )
-
-    appearance = render_command.add_argument_group("appearance")
-    kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
-    transfer = appearance.add_mutually_exclusive_group()
-    transfer.add_argument("--preset", metavar="NAME", help=kinds)
-    transfer.add_argument(
-        "--cmap", metavar="NAME", help="a matplotlib colormap, or a colour, over --clim (default: gray)"
-    )
-    transfer.add_argument(
-        "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"
-    )
-    appearance.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
-    appearance.add_argument(
-        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values that it covers"
-    )
-    appearance.add_argument(
-        "--unit-distance", type=float, help="length to which opacities refer (default: 1)"
-    )
-
-    camera = render_command.add_argument_group("camera")
-    camera.add_argument(
-        "--camera",
-        type=float,
-        nargs=6,
-        metavar=("X", "Y", "Z", "FX", "FY", "FZ"),
-        help="position and focal point in the world; the camera may be inside the volume",
-    )
-    camera.add_argument(
-        "--direction",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)",
-    )
-    camera.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
-    camera.add_argument(
-        "--view-angle",
-        type=float,
-        default=30,
-        help="degrees from the lower to the upper edge of the image (default: 30)",
-    )
-    camera.add_argument("--parallel", action="store_true", help="orthographic camera; use with --direction")
-    camera.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
     render_command.set_defaults(run=_render)
+
+    plan_command = commands.add_parser(
+        "plan",
+        parents=[shared, scene, view],
+        help="show the cheapest way to render a volume file within a tolerance, and why",
+        description="Show the cheapest way to render a volume file within a tolerance, and why. The command "
+        "`render` uses it.",
+    )
+    plan_command.set_defaults(run=_plan)
 
     fit_command = commands.add_parser(
         "fit",
@@ -242,6 +207,62 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _view_options() -> argparse.ArgumentParser:
+    """Options shared by all commands that look at a volume through a camera."""
+    view = argparse.ArgumentParser(add_help=False)
+    view.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
+
+    appearance = view.add_argument_group("appearance")
+    kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
+    transfer = appearance.add_mutually_exclusive_group()
+    transfer.add_argument("--preset", metavar="NAME", help=kinds)
+    transfer.add_argument(
+        "--cmap", metavar="NAME", help="a matplotlib colormap, or a colour, over --clim (default: gray)"
+    )
+    transfer.add_argument(
+        "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"
+    )
+    appearance.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
+    appearance.add_argument(
+        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values that it covers"
+    )
+    appearance.add_argument(
+        "--unit-distance", type=float, help="length to which opacities refer (default: 1)"
+    )
+
+    camera = view.add_argument_group("camera")
+    camera.add_argument(
+        "--camera",
+        type=float,
+        nargs=6,
+        metavar=("X", "Y", "Z", "FX", "FY", "FZ"),
+        help="position and focal point in the world; the camera may be inside the volume",
+    )
+    camera.add_argument(
+        "--direction",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)",
+    )
+    camera.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
+    camera.add_argument(
+        "--view-angle",
+        type=float,
+        default=30,
+        help="degrees from the lower to the upper edge of the image (default: 30)",
+    )
+    camera.add_argument("--parallel", action="store_true", help="orthographic camera; use with --direction")
+    camera.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
+    view.add_argument(
+        "--tolerance",
+        type=float,
+        help="RMSE of the image's linear colours, by which step and transforms are chosen "
+        "(default: 1/255; not with --step)",
+    )
+    return view
+
+
 def _scene_options() -> argparse.ArgumentParser:
     """Options shared by all commands that render a volume file."""
     scene = argparse.ArgumentParser(add_help=False)
@@ -249,7 +270,9 @@ def _scene_options() -> argparse.ArgumentParser:
         "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
     )
     scene.add_argument(
-        "--step", type=float, help="distance between samples, world length (default: half a voxel)"
+        "--step",
+        type=float,
+        help="distance between samples, world length (default: half a voxel for fit; as planned for render)",
     )
     scene.add_argument(
         "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
@@ -303,7 +326,22 @@ def _render(options: argparse.Namespace) -> None:
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
-    volume, march = _scene(options)
+    volume, transfer, camera = _view(options)
+    background = None if options.transparent else options.background
+    march = _march(options, volume, transfer, camera)
+    _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
+
+
+def _plan(options: argparse.Namespace) -> None:
+    if options.step is not None:
+        raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
+    volume, transfer, camera = _view(options)
+    print(plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance))
+
+
+def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera]:
+    """What is looked at, and from where."""
+    volume = _volume(options)
     transfer = _look(options, volume)
     view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
     if options.camera and options.parallel:
@@ -317,9 +355,19 @@ def _render(options: argparse.Namespace) -> None:
     else:
         side = options.direction or (0.5, -1, 0.4)
         camera = Camera.looking_at(volume, side, parallel=options.parallel, **view)
-    background = None if options.transparent else options.background
-    camera = camera.zoom(options.zoom)
-    _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
+    return volume, transfer, camera.zoom(options.zoom)
+
+
+def _march(options: argparse.Namespace, volume: Volume, transfer: TransferFunction, camera: Camera) -> March:
+    """Of the given step; without one, as planned."""
+    if options.step is None:
+        found = plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance)
+        if not found.within:
+            print(f"RMSE {found.error:.2g} rather than {found.tolerance:.2g}; jaxvol plan tells more")
+        return found.march
+    if options.tolerance is not None:
+        raise ValueError("--tolerance finds a step; leave out --step.")
+    return March(options.step, FAST, "midpoint")
 
 
 def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
@@ -342,7 +390,10 @@ def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
 
 def _fit(options: argparse.Namespace) -> None:
     output_file("--output", options.output)
-    volume, march = _scene(options)
+    volume = _volume(options)
+    # half a voxel
+    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
+    march = March(step, FAST, "midpoint")
     views = read_views(options.images, options.cameras)
     file = options.start
     start = read_transfer(file) if file else flat_grey(volume, options.points, options.clim)
@@ -360,11 +411,9 @@ def _fit(options: argparse.Namespace) -> None:
     print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")
 
 
-def _scene(options: argparse.Namespace) -> tuple[Volume, March]:
-    """The volume in the file, and its march."""
-    volume = load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
-    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
-    return volume, March(step, FAST, "midpoint")
+def _volume(options: argparse.Namespace) -> Volume:
+    """The volume in the file."""
+    return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
 
 
 def _picture(

@@ -2,43 +2,39 @@
 engine."""
 
 import math
-from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._util.checks import Arrayable, finite_array, require
-from ._util.sharding import shard_number, varying
-from ._util.trees import strong
+from ._util.checks import Arrayable, described, finite_array, require
+from ._util.sharding import shard_number
 from .arguments import check_arguments
 from .camera import Camera
-from .compositing import Compositing, Mode, Selection, compositing_of
-from .engine.acceleration import VolumeAcceleration
-from .engine.adjoints import AbstractAdjoint, Adjoint, adjoint_of
-from .engine.image import RenderOptions
+from .compositing import Compositing, Mode, compositing_of
+from .engine.adjoints import Adjoint
+from .engine.driver import Asked, render_scene
 from .engine.rays import OwnRays
 from .engine.scene import Scene
-from .engine.tiling import Tiling
 from .lighting.shading import Lighting
 from .march import March
-from .reference import resolves
-from .rendering import Details, Rendering
+from .planning import plan
+from .rendering import Rendering
 from .transfer import Transfer
 from .volume import Volume
 
 
-Asked = Literal["all", "rgba"]
-"""What a caller may ask for. Of the engine's outputs, the depth alone is for lightings that shade pixels."""
+PLANNED = 1 / 255
+"""Tolerance of `march="auto"`: one level of an 8-bit image."""
 
 
 def render(
     volume: Volume | Any,
     transfer: Transfer | Any,
     camera: Camera | Any,
-    march: March | Any,
+    march: March | Literal["auto"] | Any,
     *,
+    tolerance: float | Any | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
@@ -50,7 +46,8 @@ def render(
 
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
-    - `march`: step and transforms.
+    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image.
+    - `tolerance`: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
     - `compositing`: how the cells of a ray become a pixel: `"over"`, or a `Weighting` or `Selection`. Where
       a `Selection` chooses a depth, no adjoint marches again: JAX differentiates what is computed there.
     - `lighting`: how samples are shaded, such as `lighting.ScattererTemplates`. Without, colours are those of
@@ -75,7 +72,8 @@ def render(
 
     **Raises:** `ValueError`, naming the argument, for an argument of another kind (an array for a `Volume`, a
     camera in the march's place), for unknown outputs or an unknown adjoint, and for `"direct"` where the
-    march or the spacing is traced and `march.max_samples` is not given. Under the wrong mode of
+    march or the spacing is traced and `march.max_samples` is not given. For `"auto"` where arrays are
+    traced, and for a tolerance without it. Under the wrong mode of
     differentiation, naming the adjoint to pass (except `jax.jvp` of a `jax.jit` under `"replay"`, which is
     JAX's `TypeError`).
 
@@ -83,9 +81,16 @@ def render(
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
     order = "render(volume, transfer, camera, march)"
+    if isinstance(march, str) and march == "auto":
+        given = PLANNED if tolerance is None else tolerance
+        found = plan(volume, transfer, camera, given, compositing=compositing, lighting=lighting)
+        volume, march, lighting = found.volume, found.march, found.lighting
+    elif tolerance is not None:
+        raise ValueError(f'tolerance goes with march="auto"; got {tolerance!r} with {described(march)}.')
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
+    assert isinstance(march, March)
     scene = Scene(volume, transfer, camera, march, compositing_of(compositing), lighting)
-    return _render(scene, outputs, adjoint)
+    return render_scene(scene, outputs, adjoint)
 
 
 def render_rays(
@@ -130,40 +135,7 @@ def render_rays(
     first = shard_number(origins, directions) * count
     source = OwnRays(origins, directions, _pixels(pixels, origins), first)
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
-    return _render(scene, outputs, adjoint)
-
-
-def _render(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None) -> Rendering:
-    """The image of a scene whose parts are what they should be. `tiling`: by default that of the backend."""
-    for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
-        if given not in get_args(known):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
-    scene = strong(scene._replace(march=scene.march.divided()))
-    volume, transfer, _, march, _, lighting = scene
-    how = adjoint_of(adjoint, volume, march)
-    if lighting is not None:
-        lighting = lighting.prepared(volume, transfer, march)
-    options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
-    acceleration = VolumeAcceleration.of(volume, march)
-    scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
-    if resolves(scene.compositing, lighting):
-        return _resolved(scene, options, how, acceleration)
-    return how.render(scene, options, acceleration)
-
-
-def _resolved(
-    scene: Scene, options: RenderOptions, how: AbstractAdjoint, acceleration: VolumeAcceleration
-) -> Rendering:
-    """The rays are marched without light, and pixels computed from what that found."""
-    all_ = options.outputs == "all"
-    unlit, options = scene._replace(lighting=None), replace(options, outputs="all" if all_ else "depth")
-    if isinstance(scene.compositing, Selection):  # the choice is a constant
-        unlit = jax.lax.stop_gradient(unlit)
-    rendering = how.render(unlit, options, acceleration)
-    details = rendering.details
-    pixels = how.resolve(scene, options, acceleration, (rendering.rgba, rendering.depth, details.selected))
-    details = details._replace(depth=pixels[..., 4], selected=None) if all_ else Details()
-    return Rendering(pixels[..., :4], rendering.exhausted, details)
+    return render_scene(scene, outputs, adjoint)
 
 
 def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:

@@ -11,7 +11,7 @@ from typing import ClassVar, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ._util.vec3 import Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
@@ -182,6 +182,17 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
     near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
     far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
     return near, far
+
+
+def node_distance(space: Space, shape: tuple[int, ...]) -> Float[Array, "bx by bz"]:
+    """By block, the least world distance between neighbouring nodes, in its middle."""
+    middle = [BLOCK * (jnp.arange(n, dtype=space.middle[0].dtype) + 0.5) for n in shape]
+
+    def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+        along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
+        return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))
+
+    return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))
 
 
 def world_gradient(

@@ -36,6 +36,7 @@ ORDER = [
     "arguments",
     "reference",
     "engine",
+    "planning",
     "render",
     "path_tracing",
     "metrics",

@@ -8,10 +8,10 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.piecewise_means import mean_by_rows, mean_by_spans, span_rows
+from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
-from jaxvol.render import _render
 from jaxvol.transfer import Transfer
 
 from . import oracle
@@ -241,7 +241,7 @@ def test_pieces_that_need_not_be_joined_are_measured_at_both_ends(transforms):
 def test_types_of_voxels_leaps_and_tiles_do_not_show(dtype):
     """Small types are fetched from their packed copy; three tiles of two beams."""
     scene = scene_of("integrated", "hierarchy", dtype)
-    rgba = _render(Scene(*scene), "all", "replay", Tiling(batch=4, tile=2)).rgba
+    rgba = render_scene(Scene(*scene), "all", "replay", Tiling(batch=4, tile=2)).rgba
     assert 0.05 < np.mean(rgba[..., 3] > 0) < 0.95
     expected, _ = oracle_image(*scene)
     np.testing.assert_allclose(rgba, expected, atol=2e-5)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
-from jaxvol.render import _render
 
 from .scenes import CAMERAS, anisotropic_noise, around, in_float64, slow, soft_transfer, uniform_transfer
 
@@ -197,7 +197,7 @@ def test_more_tiles_than_one_show_nothing():
     camera = around(NOISE, (37, 50))
     scene = NOISE, soft_transfer(), camera, jv.March(0.11, (jv.SpaceLeaping(),))
     whole = jv.render(*scene, compositing=Maximum())
-    small = _render(Scene(*scene, Maximum()), "all", "replay", Tiling(tile=6, batch=5))
+    small = render_scene(Scene(*scene, Maximum()), "all", "replay", Tiling(tile=6, batch=5))
     np.testing.assert_array_equal(whole.rgba, small.rgba)
     np.testing.assert_array_equal(whole.depth, small.depth)
 

@@ -14,7 +14,7 @@ from ..march import March
 from ..space import Line, Space
 from ..transfer import Classification, Transfer
 from ..volume import Volume
-from .shading import Lighting, Sample, Shading, Surroundings
+from .shading import Lighting, Sample, Shading, Simpler, Surroundings
 
 
 class Deferred(Lighting):
@@ -47,6 +47,14 @@ class Deferred(Lighting):
         if not isinstance(lighting, Lighting):
             raise ValueError(f"lighting must be a Lighting, such as ScattererTemplates; got {lighting!r}.")
         self.lighting = lighting
+
+    @property
+    def smooth(self) -> Lighting:
+        return self.lighting.smooth
+
+    @property
+    def simpler(self) -> tuple[Simpler, ...]:
+        return tuple(each for each in self.lighting.simpler if isinstance(each.lighting, Deferred))
 
     def shading(self, around: Surroundings) -> Shading:
         return self.lighting.shading(around)

@@ -26,9 +26,10 @@ from ..march import March, Transform
 from ..transfer import Transfer
 from ..volume import Volume, without_voxels
 from .baked import BakedLighting, bake, nodes_for
+from .deferred import Deferred
 from .lights import ConstantLight, Light, LocatedLight, lights_of
 from .materials import Material, Optics, materials_of, shares, smoothstep, step
-from .shading import Lighting, Sample, Shading, Surroundings
+from .shading import Lighting, Sample, Shading, Simpler, Surroundings
 from .template import (
     Energy,
     ScattererTemplate,
@@ -237,6 +238,45 @@ class ScattererTemplates(Lighting):
         if blend:
             templates = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
         return templates.brightest(self.photons * (self.templates if blend else 1))
+
+    @property
+    def smooth(self) -> Lighting:
+        return self._with(blend=True, photons=None, baked=False)
+
+    @property
+    def simpler(self) -> tuple[Simpler, ...]:
+        baked = self._with(baked=self.baked or True)
+        grid = f"computed on a grid of {baked.baked} nodes"
+        few = self._with(templates=min(2, self.templates), blend=True, photons=8, baked=False)
+        return (
+            Simpler(
+                Deferred(baked), f"computed on a grid of {baked.baked} nodes, fetched once per ray", False
+            ),
+            Simpler(Deferred(few), "two templates of eight photons, once per ray"),
+            Simpler(baked, grid, False),
+            Simpler(self._with(photons=4, baked=False), "four photons"),
+        )
+
+    def _with(self, **changes: Any) -> "ScattererTemplates":
+        """This lighting with other options."""
+        packets, threshold, energy, levels = self.growth
+        own = {
+            "templates": self.templates,
+            "blend": self.blend,
+            "photons": self.photons,
+            "occlusion": self.occlusion,
+            "reach": self.reach,
+            "cutoff": 0.0 if self.cutoff is None else self.cutoff,
+            "seed": self.seed,
+            "baked": self.baked or False,
+            "packets": packets,
+            "threshold": threshold,
+            "energy": energy,
+            "critical_angle": self.critical_angle,
+            "levels": levels,
+            "given": self.given,
+        }
+        return ScattererTemplates(self.materials, self.lights, **(own | changes))
 
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
         if not self.baked:

@@ -131,6 +131,16 @@ class Lighting(eqx.Module):
     def shading(self, around: Surroundings) -> Shading:
         """The shading of one image. What does not depend on the sample is computed here, once."""
 
+    @property
+    def smooth(self) -> "Lighting":
+        """This lighting without its noise and savings: what others are compared with. By default itself."""
+        return self
+
+    @property
+    def simpler(self) -> tuple["Simpler", ...]:
+        """Lightings that cost less and may look nearly the same, the cheapest first. By default none."""
+        return ()
+
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> "Lighting":
         """This lighting with what is worth computing once for several images, where nothing is traced."""
         return self
@@ -146,6 +156,14 @@ class Lighting(eqx.Module):
         """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
         depth. `classification.light` shades samples. Not called unless overridden."""
         return rgba
+
+
+class Simpler(NamedTuple):
+    """A lighting in place of another one, what it is, and whether it has gradients."""
+
+    lighting: Lighting
+    what: str
+    has_gradient: bool = True
 
 
 def lit_classification(

@@ -13,7 +13,7 @@ from .._util.vec3 import Scalar, Vec3
 from .._util.xla import gather, in_memory
 from ..march import RUN, March, Run, Transform
 from ..occupancy import BLOCK
-from ..space import Ray, Space
+from ..space import Ray, Space, node_distance
 from ..variation import MARGIN, Variation, Windows
 
 
@@ -149,7 +149,7 @@ def _errors(
     """By stride and block, the coded error of a run with its middle there."""
     dtype = march.step.dtype
     windows, variation = jax.tree.map(lambda leaf: leaf.astype(dtype), (windows, variation))
-    distance = _node_distance(space, windows.low.shape).astype(dtype)
+    distance = node_distance(space, windows.low.shape).astype(dtype)
     spread, length = windows.high - windows.low, BLOCK * distance
     levels = []
     for stride in (2**k for k in range(longest.bit_length())):
@@ -182,14 +182,3 @@ def _dilated(_: Any, codes: Int32[Array, "bx by bz"]) -> Int32[Array, "bx by bz"
         for first in (0, 2):
             codes = jnp.maximum(codes, jax.lax.slice_in_dim(padded, first, first + n, axis=axis))
     return codes
-
-
-def _node_distance(space: Space, shape: tuple[int, ...]) -> Float[Array, "bx by bz"]:
-    """By block, the least world distance between neighbouring nodes, in its middle."""
-    middle = [BLOCK * (jnp.arange(n, dtype=space.middle[0].dtype) + 0.5) for n in shape]
-
-    def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
-        along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
-        return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))
-
-    return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))

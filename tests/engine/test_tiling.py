@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
-from jaxvol.render import _render
 
 from ..scenes import anisotropic_noise, around, counting, in_float64, soft_transfer, to_float64
 
@@ -38,7 +38,7 @@ def test_tiles_do_not_show(size):
     assert whole.depth.shape == whole.samples.shape == (size[1], size[0])
     Other = counting()  # another type, hence another program
     scene = Scene(volume, Other(*jax.tree.leaves(soft_transfer())), camera, MARCH)
-    assert_same(whole, _render(scene, "all", "replay", Tiling(tile=4)))
+    assert_same(whole, render_scene(scene, "all", "replay", Tiling(tile=4)))
     assert Other.traces == 1
 
 
@@ -185,7 +185,7 @@ def test_unknown_outputs_are_named():
 def test_an_unknown_adjoint_is_named():
     # not through `render`, since the tests' type checker rejects its argument first
     with pytest.raises(ValueError, match="adjoint must be one of replay, forward, direct; got 'reverse'"):
-        _render(
+        render_scene(
             Scene(anisotropic_noise(), soft_transfer(), around(anisotropic_noise()), MARCH), "all", "reverse"
         )
 

@@ -17,8 +17,8 @@ from experiments import jitter_accuracy, scenes as real_scenes
 from jaxvol.march import RUN, Run
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import BLOCK
-from jaxvol.space import Affine, enter
-from jaxvol.transforms.adaptive_sampling import _coded, _decoded, _node_distance
+from jaxvol.space import Affine, enter, node_distance
+from jaxvol.transforms.adaptive_sampling import _coded, _decoded
 from jaxvol.variation import MARGIN, Windows
 
 from ..engine.test_gradient_matrix import CAMERAS, TOPS, assert_same, gradient
@@ -481,7 +481,7 @@ def test_tolerances_may_be_vmapped_over():
 def test_the_distance_of_nodes_in_a_fan_grows_with_that_from_the_probe():
     volume, probe = jv.toroidal_phantom("shells", (17, 25, 33), speckle=False)
     space = probe.locate(Affine(volume), volume)
-    found = np.asarray(_node_distance(space, (4, 6, 8)))
+    found = np.asarray(node_distance(space, (4, 6, 8)))
     assert (np.diff(found, axis=2) > 0).any()
     for block in ((0, 0, 0), (2, 3, 4), (3, 5, 7)):
         middle = BLOCK * (np.array(block) + 0.5)

@@ -11,10 +11,10 @@ import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol._util.voxel_fetch import Packed
 from jaxvol.engine import packing
+from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.phantoms import toroidal_phantom
-from jaxvol.render import _render
 
 from ..scenes import (
     CAMERAS,
@@ -211,7 +211,7 @@ def test_tilings_do_not_show(tiling):
     whole = jv.render(volume, table(1, 1.0), camera, march)
     assert float(whole.rgba[..., 3].max()) > 0.1
     before = Counting.traces
-    other = _render(Scene(volume, table(1, 1.0), camera, march), "all", "replay", tiling)
+    other = render_scene(Scene(volume, table(1, 1.0), camera, march), "all", "replay", tiling)
     assert Counting.traces > before
     assert_same(other, whole, fewer=False)
 
@@ -227,7 +227,7 @@ def test_tiling_does_not_show_under_jitter_and_termination(name, size, method):
     march = jv.March(0.013, leaping(MOVING, method))
     whole = jv.render(volume, table(1, 255), camera, march)
     tiling = Tiling()._replace(**{name: size})
-    other = _render(Scene(volume, table(1, 255), camera, march), "all", "replay", tiling)
+    other = render_scene(Scene(volume, table(1, 255), camera, march), "all", "replay", tiling)
     assert_same(other, whole, fewer=False)
 
 

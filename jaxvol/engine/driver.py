@@ -1,0 +1,58 @@
+"""How does a scene become an image? The march is made ready, and an adjoint renders."""
+
+from dataclasses import replace
+from typing import Any, Literal, get_args
+
+import jax
+
+from .._util.sharding import varying
+from .._util.trees import strong
+from ..compositing import Selection
+from ..reference import resolves
+from ..rendering import Details, Rendering
+from .acceleration import VolumeAcceleration
+from .adjoints import AbstractAdjoint, Adjoint, adjoint_of
+from .image import RenderOptions
+from .scene import Scene
+from .tiling import Tiling
+
+
+Asked = Literal["all", "rgba"]
+"""What a caller may ask for. Of the engine's outputs, the depth alone is for lightings that shade pixels."""
+
+
+def render_scene(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None) -> Rendering:
+    """The image of a scene whose parts are what they should be.
+
+    `outputs`, `adjoint`: as for `render`. `tiling`: by default that of the backend.
+
+    **Raises:** `ValueError` for unknown outputs or an unknown adjoint."""
+    for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
+        if given not in get_args(known):
+            raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
+    scene = strong(scene._replace(march=scene.march.divided()))
+    volume, transfer, _, march, _, lighting = scene
+    how = adjoint_of(adjoint, volume, march)
+    if lighting is not None:
+        lighting = lighting.prepared(volume, transfer, march)
+    options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
+    acceleration = VolumeAcceleration.of(volume, march)
+    scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
+    if resolves(scene.compositing, lighting):
+        return _resolved(scene, options, how, acceleration)
+    return how.render(scene, options, acceleration)
+
+
+def _resolved(
+    scene: Scene, options: RenderOptions, how: AbstractAdjoint, acceleration: VolumeAcceleration
+) -> Rendering:
+    """The rays are marched without light, and pixels computed from what that found."""
+    all_ = options.outputs == "all"
+    unlit, options = scene._replace(lighting=None), replace(options, outputs="all" if all_ else "depth")
+    if isinstance(scene.compositing, Selection):  # the choice is a constant
+        unlit = jax.lax.stop_gradient(unlit)
+    rendering = how.render(unlit, options, acceleration)
+    details = rendering.details
+    pixels = how.resolve(scene, options, acceleration, (rendering.rgba, rendering.depth, details.selected))
+    details = details._replace(depth=pixels[..., 4], selected=None) if all_ else Details()
+    return Rendering(pixels[..., :4], rendering.exhausted, details)

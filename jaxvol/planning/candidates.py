@@ -1,0 +1,175 @@
+"""Which steps, quadratures and strides are within a tolerance, and what do they cost?"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from ..compositing import Over
+from ..march import March, Quadrature, Transform
+from ..rendering import Rendering
+from ..transforms import AdaptiveSampling
+from ..variation import Windows
+from .probe import Probe, Setting, Truth
+
+
+SAMPLE = {"midpoint": 1.0, "preintegrated": 2.5, "adaptive": 2.1}
+"""What a sample costs, as a multiple of one by the midpoint rule."""
+
+RAY = 22.0
+"""What a pixel costs beside its samples, in samples by the midpoint rule: cells that are computed and not
+used, leaps, the ray. Fitted, like `SAMPLE`, to the times of `experiments.accuracy` (five scenes, two CPU
+cores), whose ratios they predict within 9 % in the mean, 28 % at most."""
+
+COARSEST, FINE, FINEST = 2.0, 1 / 32, 1 / 256
+"""Voxels of the longest step that is tried, and of the shortest: with the midpoint rule where cells can be
+integrated, too, and otherwise."""
+
+LONGEST = 8
+"""Steps of the longest cell under adaptive sampling, the shortest of which are half as long as uniform
+ones."""
+
+
+class Candidate(NamedTuple):
+    """A march, the error of its image, samples for each pixel, and a key of `SAMPLE`."""
+
+    march: March
+    error: float
+    samples: float
+    kind: str
+
+    @property
+    def cost(self) -> float:
+        """Of a pixel, in samples by the midpoint rule."""
+        return RAY + SAMPLE[self.kind] * self.samples
+
+
+class Trials:
+    """Marches of one scene that have been tried.
+
+    - `goal`: the error that they may have.
+    - `voxel`: world length that steps are counted in. `transforms`: of all marches.
+    """
+
+    def __init__(
+        self,
+        probe: Probe,
+        setting: Setting,
+        goal: float,
+        voxel: float,
+        transforms: tuple[Transform, ...],
+    ):
+        self.probe, self.setting, self.goal = probe, setting, goal
+        self.voxel, self.transforms = voxel, transforms
+        self._images: dict[tuple[Quadrature, float], Rendering] = {}
+
+    def march(self, step: float, quadrature: Quadrature = "midpoint", *more: Transform) -> March:
+        """A march with this step, in voxels."""
+        return March(step * self.voxel, (*self.transforms, *more), quadrature)
+
+    def image(self, step: float, quadrature: Quadrature) -> Rendering:
+        """Of steps of this length, in voxels."""
+        if (quadrature, step) not in self._images:
+            march = self.march(step, quadrature)
+            self._images[quadrature, step] = self.probe.render(self.setting, march)
+        return self._images[quadrature, step]
+
+    def steps(self, quadrature: Quadrature) -> tuple[float, float]:
+        """The shortest and the longest step that was tried, in voxels."""
+        tried = [step for of, step in self._images if of == quadrature]
+        return min(tried), max(tried)
+
+    @property
+    def integrable(self) -> bool:
+        """Whether cells can be integrated between their ends."""
+        integrator = self.setting.transfer.integrator()
+        return integrator is not None and isinstance(self.setting.compositing, Over)
+
+    def uniform(self) -> tuple[Candidate, Truth]:
+        """The longest steps within the goal: by the midpoint rule; or integrated, where that would take more
+        than 32 steps for a voxel. And what they were compared with."""
+        found, truth = self._longest("midpoint", FINE if self.integrable else FINEST)
+        if found.error > self.goal and self.integrable and math.isfinite(found.error):
+            found, truth = self._longest("preintegrated", FINEST)
+        return found, truth
+
+    def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Candidate, Truth]:
+        """The longest steps within the goal, compared with steps of a quarter of them or less. If there are
+        none, the finest."""
+        steps = [COARSEST, COARSEST / 2, COARSEST / 4]
+        while True:
+            truth = Truth.of(self.probe, [self.image(step, quadrature) for step in steps])
+            best = steps[-3]
+            error = truth.error(self.image(best, quadrature))
+            if error <= self.goal or steps[-1] <= finest or not math.isfinite(error):
+                break
+            steps.append(steps[-1] / 2)
+        if error > self.goal and math.isfinite(error):
+            best, error = steps[-1], truth.own
+            # its error is not known well enough to be within the goal
+            error = max(error, math.nextafter(self.goal, math.inf))
+        elif best < COARSEST:
+            best, error = self._between(best, error, truth, quadrature)
+        samples = self.probe.samples(self.image(best, quadrature))
+        return Candidate(self.march(best, quadrature), error, samples, quadrature), truth
+
+    def _between(
+        self, step: float, error: float, truth: Truth, quadrature: Quadrature
+    ) -> tuple[float, float]:
+        """A longer step within the goal, below twice this one, which is not: where it should lie if the error
+        is a power of the step; if that fails, halfway."""
+        low, high = (step, error), (2 * step, truth.error(self.image(2 * step, quadrature)))
+        for attempt in range(3):
+            if low[1] <= 0 or not math.isfinite(high[1]) or high[1] <= low[1]:
+                break
+            power = math.log(high[1] / low[1]) / math.log(high[0] / low[0])
+            longer = low[0] * (0.97 * self.goal / low[1]) ** (1 / power)
+            if attempt == 2 and low[0] == step:
+                longer = math.sqrt(low[0] * high[0])
+            if not 1.05 * low[0] < longer < high[0]:
+                break
+            tried = longer, truth.error(self.image(longer, quadrature))
+            low, high = (tried, high) if tried[1] <= self.goal else (low, tried)
+        return low
+
+    def _tried(self, march: March, kind: str, truth: Truth) -> Candidate:
+        """A march, rendered."""
+        image = self.probe.render(self.setting, march)
+        return Candidate(march, truth.error(image), self.probe.samples(image), kind)
+
+    def integrated(self, step: float, truth: Truth) -> Candidate | None:
+        """Pre-integration with the longest steps within the goal; None unless that is faster than the
+        midpoint rule with this `step`, in voxels, or where cells cannot be integrated."""
+        if not self.integrable:
+            return None
+        found, longer = None, step * SAMPLE["preintegrated"]
+        while longer <= 2 * COARSEST:
+            candidate = self._tried(self.march(longer, "preintegrated"), "preintegrated", truth)
+            if candidate.error > self.goal:
+                break
+            found, longer = candidate, longer * 1.5
+        return found
+
+    def adaptive(self, step: float, truth: Truth) -> Candidate | None:
+        """Adaptive sampling, with cells from half this step on, and the largest tolerance of its own that
+        keeps the goal; None if none does, or nothing can be predicted."""
+        windows = Windows.of(self.setting.volume)
+        varies = self.setting.compositing.variation(self.setting.transfer, windows)
+        if not bool(jnp.any(jnp.isfinite(varies.total))):
+            return None
+        found, tolerance = None, 2 * self.goal
+        for _ in range(4):
+            march = self.march(step / 2, "midpoint", AdaptiveSampling(tolerance, LONGEST))
+            candidate = self._tried(march, "adaptive", truth)
+            if candidate.error <= self.goal:
+                if found is not None and candidate.samples >= found.samples:
+                    break
+                found = candidate
+                if candidate.error > 0.7 * self.goal:
+                    break
+                tolerance *= min((0.9 * self.goal / max(candidate.error, 1e-12)) ** 1.5, 8)
+            elif found is not None:
+                break
+            else:
+                tolerance /= 4
+        return found

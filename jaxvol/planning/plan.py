@@ -1,0 +1,340 @@
+"""Which march is the cheapest whose image is accurate enough? No more model than the scene needs."""
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._util.checks import described, integer, is_traced
+from ..arguments import check_arguments
+from ..camera import Camera
+from ..compositing import Compositing, Mode, Over, compositing_of
+from ..lighting.shading import Lighting
+from ..march import March, Transform
+from ..occupancy import Blocks
+from ..space import node_distance
+from ..transfer import Transfer
+from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
+from ..volume import Volume
+from .candidates import Candidate, Trials
+from .probe import Probe, Setting, Truth
+from .storage import stored
+
+
+MARGIN = 0.85
+"""Part of the tolerance that is used."""
+
+ENDS = 1 / 8
+"""Part of it for rays that end early, whose error is at most the transmittance at which they end; and for
+voxels of a smaller type."""
+
+LIT = 1 / 2
+"""Part of what is left that is for light, where there is any."""
+
+GRADIENTS_END = 1e-4
+"""Transmittance at which rays may end where gradients count."""
+
+EMPTY = 0.05
+"""Part of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
+
+OPAQUE = 0.01
+"""Part of the pixels that become opaque, below which there is nothing to end early."""
+
+WORTHWHILE = 24
+"""Samples of a pixel, by the midpoint rule, below which nothing else can be faster by more than some 15 %."""
+
+DECIDED = AdaptiveSampling, EarlyTermination, SpaceLeaping
+"""Transforms that a plan decides on, besides `AlphaCorrection` at the exit."""
+
+
+class Part(NamedTuple):
+    """A part of a plan: what it is, whether it was kept or left out, and why."""
+
+    name: str
+    kept: bool
+    why: str
+
+
+class Plan(NamedTuple):
+    """How to render a scene within a tolerance. `print` shows it.
+
+    - `march`, `volume`, `lighting`: what to pass to `render`.
+    - `tolerance`: what was asked for. `error`: predicted; a bound that is exceeded in one of twenty cases.
+    - `seconds`: predicted for one image on this machine, once compiled. `samples`: predicted for each pixel.
+    - `parts`: what was kept or left out, and why.
+    - `probed`: seconds that planning took, compilation included.
+    """
+
+    march: March
+    volume: Volume
+    lighting: Lighting | None
+    tolerance: float
+    error: float
+    seconds: float
+    samples: float
+    parts: tuple[Part, ...]
+    probed: float
+
+    @property
+    def within(self) -> bool:
+        """Whether the predicted error is within the tolerance."""
+        return self.error <= self.tolerance
+
+    def __str__(self) -> str:
+        transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
+        head = (
+            f"step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}\n"
+            f"RMSE {self.error:.2g} predicted, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a "
+            f"pixel; some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
+        )
+        wide = max(len(part.name) for part in self.parts)
+        lines = [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
+        return "\n".join([head, *lines])
+
+
+def plan(
+    volume: Volume | Any,
+    transfer: Transfer | Any,
+    camera: Camera | Any,
+    tolerance: float | Any,
+    *,
+    transforms: tuple[Transform, ...] | Any = (),
+    compositing: Mode | Compositing[Any] | Any = "over",
+    lighting: Lighting | Any | None = None,
+    gradients: bool = False,
+    seed: int | Any = 0,
+) -> Plan:
+    """Finds the cheapest way to render a scene within a tolerance, by rendering parts of it.
+
+    At most 128 patches of 8 x 8 pixels are rendered by the midpoint rule, with steps of two voxels, one, a
+    half, and so on, until some are within the tolerance, compared with steps of a quarter of theirs. From
+    there:
+
+    - **step**: the longest within the tolerance, between two of these.
+    - **quadrature and strides**: `"preintegrated"` and `AdaptiveSampling` are tried where rays take many
+      samples, and kept where they take so many fewer that they are faster, by what a sample costs on CPU
+      (`planning/candidates.py`: `RAY`, `SAMPLE`).
+    - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image.
+    - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
+      faces.
+    - **`EarlyTermination`**: kept where rays end early, at an eighth of the tolerance, which bounds its error
+      (times the brightest colour, where that is above 1).
+    - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
+      no voxel changes, or the image by less than an eighth of the tolerance; else to float16, on the same
+      terms.
+    - **lighting**: the first of `Lighting.simpler` that is within the tolerance, compared with
+      `Lighting.smooth`; the step is halved as long as that changes the lit image by more than what is left.
+
+    The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
+    estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
+    halvings of the step let expect. `Jitter` and `EmptySpaceJitter` are not chosen: they change the structure
+    of an error, not its size. Plans are for CPUs: on others, the errors hold, but what is cheapest was not
+    measured.
+
+    **Arguments:**
+
+    - `volume`, `transfer`, `camera`: the scene. An image of another camera needs a plan of its own.
+    - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
+    - `transforms`: those that are part of the scene, such as a `ToroidalMap`, or jitter. They are kept.
+    - `compositing`, `lighting`: as for `render`.
+    - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, and lightings
+      without a gradient are left out. The tolerance is that of the image all the same.
+    - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
+      `seconds`.
+
+    **Returns:** a `Plan`. If no step is within the tolerance, down to 1/256 of a voxel, `Plan.within` is
+    False and `Plan.parts` says so.
+
+    **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
+    (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
+    """
+    begun = time.perf_counter()
+    order = "plan(volume, transfer, camera, tolerance)"
+    check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
+    setting = Setting(volume, transfer, compositing_of(compositing))
+    tolerance, given = _checked(tolerance, transforms, (setting, camera, lighting))
+    space = March(1.0, given).locate(volume)
+    probe = Probe.of(camera, space, integer("seed", seed, 0))
+
+    proven, parts = _proven(setting, given)
+    over = isinstance(setting.compositing, Over)
+    ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
+    goal = MARGIN * tolerance - (ends if over else 0)
+    trials = Trials(
+        probe,
+        setting,
+        goal if lighting is None else goal * (1 - LIT),
+        float(jnp.median(node_distance(space, Blocks.of(volume).low.shape))),
+        (*given, *proven, *((EarlyTermination(ends),) if over else ())),
+    )
+    chosen, truth = _marched(trials, parts)
+    lit, light_error, light_seconds = None, 0.0, 0.0
+    if lighting is not None:
+        chosen, lit, light_error, light_seconds = _lit(
+            trials, chosen, lighting, goal, parts, gradients=gradients
+        )
+    march = chosen.march
+    if over:
+        opaque = probe.part(truth.image.rgba[:, 3] >= 1 - ends)
+        why = f"{opaque:.0%} of the pixels become opaque"
+        parts.append(Part(f"EarlyTermination({ends:.2g})", opaque >= OPAQUE, why))
+        if opaque < OPAQUE:
+            march = _without(march, EarlyTermination)
+    setting, rounding, said = stored(probe, setting, chosen.march, tolerance * ENDS)
+    parts += [Part(*each) for each in said]
+    error = chosen.error + light_error + rounding + (ends if over else 0)
+    seconds = _seconds(trials, chosen) + light_seconds
+    taken = time.perf_counter() - begun
+    return Plan(march, setting.volume, lit, tolerance, error, seconds, chosen.samples, tuple(parts), taken)
+
+
+def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[Transform, ...]]:
+    """The tolerance, and the transforms that are part of the scene."""
+    if is_traced(jax.tree.leaves((scene, transforms, tolerance))):
+        raise ValueError(
+            "plan looks at the numbers of a scene, which are traced here: call it outside of jax.jit, "
+            "jax.vmap and jax.grad, and pass the march that it finds to render."
+        )
+    try:
+        number = float(tolerance)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"tolerance must be a number; got {described(tolerance)}.") from fault
+    if isinstance(tolerance, bool) or not 0 < number < 1:
+        raise ValueError(f"tolerance must be above 0 and below 1; got {tolerance!r}.")
+    given = March(1.0, transforms).transforms  # checks them
+    for each in given:
+        if isinstance(each, DECIDED) or (isinstance(each, AlphaCorrection) and not each.labels):
+            raise ValueError(
+                "transforms must be those that are part of the scene, such as a ToroidalMap; got "
+                f"{type(each).__name__}, on which the plan decides."
+            )
+    return number, given
+
+
+def _proven(setting: Setting, given: tuple[Transform, ...]) -> tuple[tuple[Transform, ...], list[Part]]:
+    """Transforms that proofs decide on."""
+    visible = np.asarray(setting.transfer.visible(Blocks.of(setting.volume)))
+    found: list[Transform] = []
+    parts = []
+    faces = sum(bool(np.take(visible, end, axis).any()) for axis in range(3) for end in (0, -1))
+    if any(isinstance(each, AlphaCorrection) for each in given):
+        parts.append(Part("AlphaCorrection", True, "part of the scene"))
+    elif faces:
+        why = f"something may be visible at {faces} of the volume's 6 faces"
+        parts.append(Part("AlphaCorrection", True, why))
+        found.append(AlphaCorrection())
+    else:
+        parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
+    empty = float(1 - visible.mean())
+    leaps = isinstance(setting.compositing, Over) and empty >= EMPTY
+    parts.append(Part("SpaceLeaping", leaps, f"{empty:.0%} of the blocks hold nothing visible"))
+    return (*found, *((SpaceLeaping(),) if leaps else ())), parts
+
+
+def _marched(trials: Trials, parts: list[Part]) -> tuple[Candidate, Truth]:
+    """The cheapest march within the goal, unlit."""
+    uniform, truth = trials.uniform()
+    step, samples = float(uniform.march.step) / trials.voxel, uniform.samples
+    name = f"step {float(uniform.march.step):.4g}"
+    if uniform.error > trials.goal:
+        parts.append(Part(name, True, f"{step:.2g} voxels, the shortest tried: not within the tolerance"))
+        return uniform, truth
+    parts.append(Part(name, True, f"{step:.3g} voxels, {uniform.kind}: RMSE {uniform.error:.2g}"))
+    if uniform.kind == "preintegrated":
+        parts.append(Part("preintegrated", True, "the midpoint rule would take more than 32 steps a voxel"))
+        return uniform, truth
+    if samples <= WORTHWHILE:
+        why = f"{samples:.1f} samples a pixel: too few to save any"
+        parts.append(Part("preintegrated, AdaptiveSampling", False, why))
+        return uniform, truth
+    others = {
+        "preintegrated": trials.integrated(step, truth),
+        "AdaptiveSampling": trials.adaptive(step, truth),
+    }
+    best = min([uniform, *(other for other in others.values() if other)], key=lambda each: each.cost)
+    for name, other in others.items():
+        why = "not within the tolerance where it would be faster"
+        if other is not None:
+            ratio = other.cost / uniform.cost
+            length = float(other.march.step)
+            why = (
+                f"step {length:.4g}, {other.samples:.1f} samples a pixel for {samples:.1f}: cost {ratio:.2f}"
+            )
+        parts.append(Part(name, other is best, why))
+    return best, truth
+
+
+def _lit(
+    trials: Trials, chosen: Candidate, lighting: Lighting, goal: float, parts: list[Part], *, gradients: bool
+) -> tuple[Candidate, Lighting, float, float]:
+    """The march, the cheapest lighting within what is left of the goal, its error, and the seconds that it
+    adds to an image."""
+    probe, setting = trials.probe, trials.setting
+    smooth = probe.render(setting, chosen.march, lighting.smooth)
+    tried = [each for each in lighting.simpler if each.has_gradient or not gradients]
+    left, best = goal - chosen.error, None
+    for other in (*((each.lighting, each.what) for each in tried), (lighting, "as given")):
+        error = probe.distance(probe.render(setting, chosen.march, other[0]), smooth)
+        if best is None or error < best[1]:
+            best = other[0], error
+        parts.append(Part(f"light: {other[1]}", error <= left, f"RMSE {error:.2g}"))
+        if error <= left:
+            break
+    assert best is not None
+    lit, error = best
+    # how light changes along a ray is not known before: shorter steps must not change the image
+    march, change, allowed = chosen.march, math.inf, max(goal - error, goal * (1 - LIT))
+    image = probe.render(setting, march, lit)
+    for _ in range(3):
+        half = March(march.step / 2, march.transforms, march.quadrature)
+        finer = probe.render(setting, half, lit)
+        change = 4 / 3 * probe.distance(image, finer)
+        if change <= allowed:
+            break
+        why = f"with light, twice the step changes the image by {change:.2g}"
+        parts.append(Part(f"step {float(half.step):.4g}", True, why))
+        image, march = finer, half
+    samples = probe.samples(image)
+    marched = Candidate(march, max(chosen.error, change), samples, chosen.kind)
+    unlit, with_light = (_fastest(trials, march, each) for each in (None, lit))
+    pixels = probe.pixels * probe.share / probe.source.origins.shape[0]
+    return marched, lit, error, max(with_light - unlit, 0.0) * pixels
+
+
+def _without(march: March, kind: type[Transform]) -> March:
+    kept = tuple(each for each in march.transforms if not isinstance(each, kind))
+    return March(march.step, kept, march.quadrature)
+
+
+def _fastest(trials: Trials, march: March, lighting: Lighting | None = None) -> float:
+    """Seconds to render the patches, once compiled."""
+
+    def once() -> float:
+        begun = time.perf_counter()
+        jax.block_until_ready(trials.probe.render(trials.setting, march, lighting).rgba)
+        return time.perf_counter() - begun
+
+    once()
+    return min(once() for _ in range(2))
+
+
+def _seconds(trials: Trials, chosen: Candidate) -> float:
+    """Time of an image on this machine. What a sample costs is taken from two steps, so that calls, which
+    take as long for a few pixels as for an image, do not count."""
+    times, samples = [], []
+    for step in trials.steps("midpoint"):
+        times.append(_fastest(trials, trials.march(step)))
+        samples.append(float(np.asarray(trials.image(step, "midpoint").samples, np.float64).sum()))
+    a_sample = max(times[0] - times[1], 0.0) / max(samples[0] - samples[1], 1.0)
+    return a_sample * chosen.cost * trials.probe.pixels
+
+
+def _written(transform: Transform) -> str:
+    """A transform as it is written, with its parameter where that is what matters."""
+    name = type(transform).__name__
+    if isinstance(transform, EarlyTermination):
+        return f"{name}({float(transform.opacity_left):.2g})"
+    return f"{name}({float(transform.tolerance):.2g})" if isinstance(transform, AdaptiveSampling) else name

@@ -1,0 +1,165 @@
+"""Is a plan within its tolerance, and does it hold nothing that the scene does not need?"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.metrics import rmse
+
+from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
+
+
+TOLERANCE = 0.01
+
+
+def camera_of(volume: jv.Volume) -> jv.Camera:
+    return jv.Camera.looking_at(volume, (0.5, -1, 0.4), size=(64, 48))
+
+
+def plan_of(scene, tolerance: float) -> jv.Plan:
+    volume, transfer, camera = scene
+    return jv.plan(volume, transfer, camera, tolerance)
+
+
+def transforms_of(found: jv.Plan) -> set[str]:
+    return {type(each).__name__ for each in found.march.transforms}
+
+
+def error_of(found: jv.Plan, volume, transfer, camera) -> float:
+    """Of the planned image, over black or white: compared with steps of a sixty-fourth of a voxel, without
+    leaps; integrated, since the midpoint rule would miss a narrow peak."""
+    image = jv.render(found.volume, transfer, camera, found.march, lighting=found.lighting)
+    fine = jv.March(float(volume.spacing.min()) / 64, (jv.AlphaCorrection(),), "preintegrated")
+    truth = jv.render(volume, transfer, camera, fine)
+    return max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1)))
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    """A translucent ball in empty space: a volume, a transfer function and a camera."""
+    volume = scaled_phantom("sphere")
+    return volume, soft_transfer(), camera_of(volume)
+
+
+@pytest.fixture(scope="module")
+def planned(sphere):
+    return plan_of(sphere, TOLERANCE)
+
+
+def test_it_is_within_its_tolerance(sphere, planned):
+    assert planned.within
+    assert TOLERANCE / 10 < error_of(planned, *sphere) <= planned.error <= TOLERANCE
+
+
+def test_a_smaller_tolerance_takes_shorter_steps(sphere, planned):
+    finer = plan_of(sphere, TOLERANCE / 8)
+    assert float(finer.march.step) < float(planned.march.step) / 1.5
+    assert finer.samples > 1.5 * planned.samples
+    assert error_of(finer, *sphere) <= TOLERANCE / 8
+
+
+def test_the_same_call_gives_the_same_plan(sphere, planned):
+    again = plan_of(sphere, TOLERANCE)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), planned.march, again.march))
+    assert (again.error, again.samples, again.parts) == (planned.error, planned.samples, planned.parts)
+
+
+def test_empty_space_is_leapt_over_and_empty_faces_are_not_aligned(planned):
+    assert "SpaceLeaping" in transforms_of(planned)
+    assert "AlphaCorrection" not in transforms_of(planned)
+
+
+def test_a_full_volume_is_aligned_and_not_leapt_over(sphere):
+    volume, transfer, camera = sphere
+    full = volume.__class__(0.3 + 0.5 * volume.data, volume.spacing, volume.origin)
+    found = jv.plan(full, transfer, camera, TOLERANCE)
+    assert "AlphaCorrection" in transforms_of(found)
+    assert "SpaceLeaping" not in transforms_of(found)
+    assert error_of(found, full, transfer, camera) <= TOLERANCE
+
+
+def test_rays_end_early_only_where_some_become_opaque(sphere):
+    volume, _, camera = sphere
+    thin, thick = (jv.plan(volume, soft_transfer(d), camera, TOLERANCE) for d in (20.0, 0.05))
+    assert "EarlyTermination" not in transforms_of(thin)
+    assert "EarlyTermination" in transforms_of(thick)
+    assert error_of(thick, volume, soft_transfer(0.05), camera) <= TOLERANCE
+
+
+def test_gradients_let_rays_end_later_only(sphere):
+    volume, _, camera = sphere
+    found = jv.plan(volume, soft_transfer(0.05), camera, TOLERANCE, gradients=True)
+    (ends,) = (each for each in found.march.transforms if isinstance(each, jv.EarlyTermination))
+    assert ends.opacity_left == pytest.approx(1e-4)
+
+
+def test_a_narrow_peak_is_integrated(sphere):
+    volume, _, camera = sphere
+    values = [0.0, 0.395, 0.4, 0.405, 1.0]
+    peak = jv.TransferFunction(values, np.full((5, 3), 0.8), [0.0, 0.0, 300.0, 0.0, 0.0])
+    found = jv.plan(volume, peak, camera, TOLERANCE)
+    assert found.march.quadrature == "preintegrated"
+    assert error_of(found, volume, peak, camera) <= TOLERANCE
+
+
+def test_an_empty_image_is_planned(sphere):
+    volume, _, camera = sphere
+    found = jv.plan(volume, uniform_transfer(0.0), camera, TOLERANCE)
+    assert found.within
+    assert found.error < TOLERANCE / 4
+
+
+def test_what_cannot_be_reached_is_said(sphere):
+    found = plan_of(sphere, 1e-9)  # rounding is greater
+    assert not found.within
+    assert "not within the tolerance" in str(found)
+
+
+def test_transforms_of_the_scene_are_kept():
+    volume, probe = jv.toroidal_phantom("spheres", (24, 20, 16))
+    transfer = jv.preset("mr_head", (0, 255))
+    camera = jv.Camera.looking_at(volume, size=(64, 48))
+    found = jv.plan(volume, transfer, camera, 0.02, transforms=(probe, jv.EmptySpaceJitter(0)))
+    assert {"ToroidalMap", "EmptySpaceJitter"} <= transforms_of(found)
+
+
+def test_it_says_what_it_decided_and_why(planned):
+    said = str(planned)
+    for word in ("AlphaCorrection", "SpaceLeaping", "EarlyTermination", "voxels as", "RMSE", "proven"):
+        assert word in said
+    assert all(part.why for part in planned.parts)
+
+
+def test_the_image_march_auto_is_that_of_the_plan(sphere, planned):
+    volume, transfer, camera = sphere
+    auto = jv.render(volume, transfer, camera, "auto", tolerance=TOLERANCE).rgba
+    given = jv.render(planned.volume, transfer, camera, planned.march).rgba
+    np.testing.assert_array_equal(auto, given)
+
+
+@pytest.mark.parametrize("bad", [0, 1, -1, float("nan"), True, "small", None])
+def test_a_tolerance_out_of_range_is_refused(sphere, bad):
+    with pytest.raises(ValueError, match="tolerance must be"):
+        plan_of(sphere, bad)
+
+
+@pytest.mark.parametrize("kind", [jv.SpaceLeaping(), jv.EarlyTermination(), jv.AlphaCorrection()])
+def test_transforms_that_it_decides_on_are_refused(sphere, kind):
+    with pytest.raises(ValueError, match=type(kind).__name__):
+        plan_of(sphere, TOLERANCE, transforms=(kind,))
+
+
+def test_traced_scenes_are_refused(sphere):
+    volume, transfer, camera = sphere
+    with pytest.raises(ValueError, match="outside of"):
+        jax.jit(lambda t: jv.plan(volume, t, camera, TOLERANCE).march)(transfer)
+    with pytest.raises(ValueError, match="outside of"):
+        jax.grad(lambda t: jv.render(volume, t, camera, "auto").rgba.sum())(transfer)
+
+
+def test_a_tolerance_without_auto_is_refused(sphere):
+    volume, transfer, camera = sphere
+    with pytest.raises(ValueError, match="tolerance goes with"):
+        jv.render(volume, transfer, camera, jv.March(0.1), tolerance=0.1)
