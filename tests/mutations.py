@@ -71,6 +71,49 @@ PACKED = "transforms/test_space_leaping.py::test_packed_voxels_are_the_same_valu
 RENDERED = "test_agreement.py::test_render_agrees_with_the_independent_marcher"
 
 MUTATIONS = [
+    # planning
+    Mutation(
+        "plan: the opacity of an error left out",
+        "planning/probe.py",
+        "for each in (color, color - opacity)]",
+        "for each in (color, color)]",
+        ("planning/test_probe.py",),
+    ),
+    Mutation(
+        "plan: pixels that see nothing counted as if they had the error of the others",
+        "planning/probe.py",
+        "np.sqrt(max(unseen, 0.0))) * self.share)",
+        "np.sqrt(max(unseen, 0.0))))",
+        ("planning/test_probe.py",),
+    ),
+    Mutation(
+        "plan: the error of the most accurate image taken to be 0",
+        "planning/probe.py",
+        "last * ratio / (1 - ratio))",
+        "0 * last * ratio / (1 - ratio))",
+        ("planning/test_probe.py",),
+    ),
+    Mutation(
+        "plan: faces at the far ends not looked at",
+        "planning/plan.py",
+        "for end in (0, -1))",
+        "for end in (1, 1))",
+        ("planning/test_plan.py::test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face",),
+    ),
+    Mutation(
+        "plan: the tolerance ten times as large",
+        "planning/plan.py",
+        "goal = MARGIN * tolerance - (ends if over else 0)",
+        "goal = 10 * MARGIN * tolerance - (ends if over else 0)",
+        ("planning/test_plan.py::test_it_is_within_its_tolerance",),
+    ),
+    Mutation(
+        "plan: rounded voxels kept whatever they change",
+        "planning/storage.py",
+        "if change <= allowed:",
+        "if change <= 1:",
+        ("planning/test_storage.py",),
+    ),
     # adaptive sampling
     Mutation(
         "adaptive sampling: differences across two axes left out",

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.compositing import Over
 from jaxvol.metrics import rmse
+from jaxvol.planning.plan import _proven
+from jaxvol.planning.probe import Setting
 
 from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
 
@@ -18,9 +21,9 @@ def camera_of(volume: jv.Volume) -> jv.Camera:
     return jv.Camera.looking_at(volume, (0.5, -1, 0.4), size=(64, 48))
 
 
-def plan_of(scene, tolerance: float) -> jv.Plan:
+def plan_of(scene, tolerance, **more) -> jv.Plan:
     volume, transfer, camera = scene
-    return jv.plan(volume, transfer, camera, tolerance)
+    return jv.plan(volume, transfer, camera, tolerance, **more)
 
 
 def transforms_of(found: jv.Plan) -> set[str]:
@@ -78,6 +81,17 @@ def test_a_full_volume_is_aligned_and_not_leapt_over(sphere):
     assert "AlphaCorrection" in transforms_of(found)
     assert "SpaceLeaping" not in transforms_of(found)
     assert error_of(found, full, transfer, camera) <= TOLERANCE
+
+
+@pytest.mark.parametrize(("axis", "end"), [(0, 0), (1, -1), (2, -1)])
+def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, axis, end):
+    volume, transfer, _ = sphere
+    data = np.zeros(volume.shape, np.float32)
+    data[8:16, 8:16, 8:16] = 0.5
+    data = np.roll(data, 8 * (1 if end else -1), axis)
+    proven, parts = _proven(Setting(jv.Volume(data, volume.spacing), transfer, Over()), ())
+    assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
+    assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
 
 
 def test_rays_end_early_only_where_some_become_opaque(sphere):

@@ -1,0 +1,301 @@
+"""Does a plan hold its tolerance, and is anything faster within it?
+
+Random scenes: real volumes that nothing was tuned on (nuclear, dental, CT and MR data) and phantoms; random
+transfer functions of three to eight points, some opaque, some with narrow peaks; random cameras, a quarter of
+them inside. Each is planned for three tolerances. The image under the plan is compared with a converged one,
+over black or white, whichever differs more; the converged image is integrated between cells' ends, at a step
+of a sixteenth of a voxel, and its own error is estimated from one at twice that step.
+
+Of some scenes, all of a table of marches are rendered and timed, in turn with the planned one: three
+quadratures and adaptive sampling, at steps from an eighth of a voxel to four, with leaps and without. The
+fastest within the tolerance is what the plan's time is compared with.
+
+Last, what planning itself takes, programs being compiled, in images of 512 x 512 pixels under the plan.
+"""
+
+import time
+from argparse import Namespace
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.metrics import rmse
+
+from . import common, timing
+from .common import plt
+
+
+TOLERANCES = (1e-2, 3e-3, 1e-3)
+FILES = {
+    "fuel": ("fuel_64x64x64_uint8.raw", 1.0),
+    "nucleon": ("nucleon_41x41x41_uint8.raw", 1.0),
+    "tooth": ("tooth_103x94x161_uint8.raw", 1.0),
+    "cthead": ("cthead_256x256x113_uint16le.raw.gz", (1.0, 1.0, 2.0)),
+    "T1": ("studyforrest_t1_137x192x192_int16le.raw.gz", 1.0),
+}
+PHANTOMS = {"head phantom": ("head", 96), "vessels phantom": ("vessels", 96)}
+CONVERGED = 1 / 16
+STEPS = tuple(2.0 ** (k / 2) for k in range(-6, 5))
+"""Voxels."""
+OWN = tuple(10.0 ** (k / 2) for k in range(-6, -1))
+"""Tolerances of adaptive sampling."""
+
+
+class Scene(NamedTuple):
+    name: str
+    volume: jv.Volume
+    transfer: jv.TransferFunction
+    camera: jv.Camera
+
+    @property
+    def voxel(self) -> float:
+        return float(self.volume.spacing.min())
+
+
+def volumes(folder: Path | None) -> dict[str, jv.Volume]:
+    found = {name: jv.phantom(*which) for name, which in PHANTOMS.items()}
+    for name, (file, spacing) in FILES.items():
+        if folder is not None and (folder / file).is_file():
+            found[name] = jv.load(folder / file, spacing=np.broadcast_to(spacing, 3))
+    return found
+
+
+def scenes(folder: Path | None, count: int, size: int, seed: int) -> Iterator[Scene]:
+    """Random scenes, each volume's in a row."""
+    all_ = volumes(folder)
+    for place, (name, volume) in enumerate(all_.items()):
+        values = np.quantile(np.asarray(volume.data, np.float32), np.linspace(0, 1, 1001))
+        for number in range(place, count, len(all_)):
+            random = np.random.default_rng((seed, number))
+            transfer = transfer_of(random, values, float(volume.spacing.min()))
+            yield Scene(name, volume, transfer, camera_of(random, volume, size))
+
+
+def transfer_of(random: np.random.Generator, values: np.ndarray, voxel: float) -> jv.TransferFunction:
+    """Points anywhere in the range of values, opacities of any kind; below them all is transparent."""
+    n = int(random.integers(3, 9))
+    low, high = float(values[0]), float(values[-1])
+    points = np.sort(random.uniform(0.05, 1, n))
+    extinction = 10 ** random.uniform(-2.5, 0.7, n) / voxel * (random.random(n) < 0.8)
+    kind = random.random()
+    if kind < 0.2:  # opaque from some value on
+        extinction[n // 2 :] = 5 / voxel
+    elif kind < 0.4:  # a peak, 0.5 to 5 % of the range wide
+        wide = 10 ** random.uniform(-2.3, -1.3)
+        points = points[0] + wide * np.linspace(-0.5, 0.5, n)
+        extinction[:] = 0
+        extinction[n // 2] = 10 ** random.uniform(-0.5, 0.7) / voxel
+    extinction[0] = 0
+    if not extinction.any():
+        extinction[-1] = 0.1 / voxel
+    return jv.TransferFunction(low + (high - low) * points, random.random((n, 3)), extinction)
+
+
+def camera_of(random: np.random.Generator, volume: jv.Volume, size: int) -> jv.Camera:
+    """From any side, at any distance; or, one in four, from inside."""
+    direction = random.normal(size=3)
+    if random.random() < 0.25:
+        low, high = (np.asarray(corner) for corner in volume.corners)
+        position = low + (high - low) * random.uniform(0.25, 0.75, 3)
+        view_angle = random.uniform(40, 90)
+        return jv.Camera(position, position + direction, random.normal(size=3), view_angle, size=(size, size))
+    camera = jv.Camera.looking_at(volume, direction, random.normal(size=3), size=(size, size))
+    return camera.zoom(2 ** random.uniform(-0.5, 2))
+
+
+def image(scene: Scene, march: jv.March, volume: jv.Volume | None = None) -> np.ndarray:
+    _, whole, transfer, camera = scene
+    return np.asarray(jv.render(volume or whole, transfer, camera, march, outputs="rgba").rgba, np.float64)
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    """RMSE over black or white, whichever is greater."""
+    over = [(c[..., :3], c[..., :3] + 1 - c[..., 3:]) for c in (a, b)]
+    return max(rmse(*pair) for pair in zip(*over, strict=True))
+
+
+def converged(scene: Scene) -> tuple[np.ndarray, float]:
+    """The image, and its own error, as that with twice the step lets expect for the second order."""
+    fine, coarse = (
+        image(
+            scene,
+            jv.March(s * CONVERGED * scene.voxel, (jv.AlphaCorrection(), jv.SpaceLeaping()), "preintegrated"),
+        )
+        for s in (1, 2)
+    )
+    return fine, distance(fine, coarse) / 3
+
+
+def table(scene: Scene, tolerance: float) -> dict[str, jv.March]:
+    """All marches that a search tries."""
+    found = {}
+    for leaps in (True, False):
+        transforms = (
+            jv.AlphaCorrection(),
+            jv.EarlyTermination(tolerance / 8),
+            *((jv.SpaceLeaping(),) if leaps else ()),
+        )
+        how = "leaps" if leaps else "no leaps"
+        for step in STEPS:
+            for quadrature in ("left", "midpoint", "preintegrated"):
+                march = jv.March(step * scene.voxel, transforms, quadrature)
+                found[f"{quadrature}, step {step:.3g}, {how}"] = march
+        for step in (1 / 8, 1 / 4, 1 / 2):
+            for own in OWN:
+                sampling = jv.AdaptiveSampling(own, 8)
+                march = jv.March(step * scene.voxel, (*transforms, sampling), "midpoint")
+                found[f"adaptive {own:.2g}, step {step:.3g}, {how}"] = march
+    return found
+
+
+def searched(
+    scene: Scene, found: jv.Plan, truth: np.ndarray, tolerance: float, repetitions: int
+) -> dict[str, Any]:
+    """How much longer the planned image takes than the fastest of the table within the tolerance."""
+
+    def seconds(march: jv.March, volume: jv.Volume | None = None) -> float:
+        begun = time.perf_counter()
+        image(scene, march, volume)
+        return time.perf_counter() - begun
+
+    within = {
+        n: m for n, m in table(scene, tolerance).items() if distance(image(scene, m), truth) <= tolerance
+    }
+    if not within:
+        return {"fastest": None}
+    once = {name: min(seconds(march) for _ in range(2)) for name, march in within.items()}
+    best = sorted(once, key=lambda name: once[name])[:3]
+    programs: dict[str, Any] = {name: partial(image, scene, within[name]) for name in best}
+    programs["plan"] = partial(image, scene, found.march, found.volume)
+    times = timing.interleaved(programs, repetitions)
+    fastest = min(best, key=lambda name: float(np.median(times[name])))
+    return {
+        "fastest": fastest,
+        "ratio": timing.ratio(times["plan"], times[fastest])["median"],
+        "planned": str(found).splitlines()[0],
+    }
+
+
+def measure(scene: Scene, number: int, search: bool, repetitions: int) -> dict[str, Any]:
+    truth, own = converged(scene)
+    row: dict[str, Any] = {"volume": scene.name, "own error of the converged image": own, "plans": {}}
+    for tolerance in TOLERANCES:
+        found = jv.plan(scene.volume, scene.transfer, scene.camera, tolerance, seed=number)
+        error = distance(image(scene, found.march, found.volume), truth)
+        each: dict[str, Any] = {
+            "error": error,
+            "predicted": found.error,
+            "within": found.within,
+            "samples": round(found.samples, 2),
+            "march": str(found).splitlines()[0],
+        }
+        if search:
+            each |= searched(scene, found, truth, tolerance, repetitions)
+        row["plans"][f"{tolerance:g}"] = each
+    return row
+
+
+def cost(scene: Scene, size: int) -> dict[str, float]:
+    """What planning takes, in images under the plan."""
+    c = scene.camera
+    camera = jv.Camera(c.position, c.focal_point, c.view_up, c.view_angle, size=(size, size), window=c.window)
+    scene = scene._replace(camera=camera)
+    found = {}
+    for tolerance in TOLERANCES:
+        planned = jv.plan(scene.volume, scene.transfer, camera, tolerance)
+        programs = {
+            "plan": lambda t=tolerance: jv.plan(scene.volume, scene.transfer, camera, t).march.step,
+            "image": lambda p=planned: image(scene, p.march, p.volume),
+        }
+        times = timing.interleaved(programs, 3)
+        found[f"{tolerance:g}"] = float(np.median(times["plan"]) / np.median(times["image"]))
+    return found
+
+
+def summary(rows: list[dict[str, Any]], costs: dict[str, dict[str, float]]) -> dict[str, Any]:
+    by_tolerance = {}
+    for tolerance in TOLERANCES:
+        plans = [row["plans"][f"{tolerance:g}"] for row in rows]
+        held = [each["error"] <= tolerance for each in plans]
+        ratios = [each["ratio"] for each in plans if each.get("fastest")]
+        by_tolerance[f"{tolerance:g}"] = {
+            "scenes": len(plans),
+            "held": sum(held),
+            "share": float(np.mean(held)),
+            "largest error over tolerance": max(each["error"] for each in plans) / tolerance,
+            "said not to be within": sum(not each["within"] for each in plans),
+            "time over the fastest: median": float(np.median(ratios)) if ratios else None,
+            "largest": max(ratios, default=None),
+            "searched": len(ratios),
+        }
+    planning = [each for of in costs.values() for each in of.values()]
+    return {"by tolerance": by_tolerance, "planning, in images: largest": max(planning, default=None)}
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    """Error over tolerance, scene by scene; and time over that of the fastest march found."""
+    figure, (errors, times) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    for column, tolerance in enumerate(TOLERANCES):
+        plans = [row["plans"][f"{tolerance:g}"] for row in result["scenes"]]
+        spread = np.random.default_rng(0).uniform(-0.3, 0.3, len(plans))
+        ratio = [max(each["error"] / tolerance, 1e-3) for each in plans]
+        errors.scatter(column + spread, ratio, s=6, color=f"C{column}")
+        searched_ = [each["ratio"] for each in plans if each.get("fastest")]
+        spread = np.random.default_rng(1).uniform(-0.3, 0.3, len(searched_))
+        times.scatter(column + spread, searched_, s=10, color=f"C{column}")
+    errors.axhline(1, color="0.4", linewidth=0.8)
+    errors.set_yscale("log")
+    errors.set_ylabel("true RMSE / tolerance", fontsize=9)
+    times.axhline(1.5, color="0.4", linewidth=0.8, linestyle=":")
+    times.set_ylabel("time / time of the fastest march within it", fontsize=9)
+    times.text(2.45, 1.52, "goal", fontsize=8, color="0.4", ha="right")
+    for panel in (errors, times):
+        panel.set_xticks(range(len(TOLERANCES)), [f"{t:g}" for t in TOLERANCES])
+        panel.set_xlabel("tolerance", fontsize=9)
+        panel.set_xlim(-0.5, len(TOLERANCES) - 0.5)
+    errors.set_title(f"{len(result['scenes'])} random scenes", fontsize=9)
+    times.set_title("some of them, searched exhaustively", fontsize=9)
+    common.save(figure, path)
+
+
+@common.experiment(
+    "planning",
+    "Does a plan hold its tolerance, and is anything faster within it?",
+    __doc__,
+    scenes=200,
+    size=192,
+    every={"type": int, "default": 14, "help": "search every so many scenes exhaustively"},
+    repetitions=5,
+)
+def main(chosen: Namespace) -> common.Answer:
+    folder, large = common.data(), 512
+    if chosen.quick:
+        folder, chosen.scenes, chosen.size, chosen.every, chosen.repetitions, large = None, 2, 24, 2, 1, 32
+    rows, costs = [], {}
+    for number, scene in enumerate(scenes(folder, chosen.scenes, chosen.size, chosen.seed)):
+        rows.append(measure(scene, number, number % chosen.every == 0, chosen.repetitions))
+        if scene.name not in costs:
+            costs[scene.name] = cost(scene, large)
+        told = "  ".join(
+            f"{t}: {p['error'] / float(t):.2f}{' x' + format(p['ratio'], '.2f') if p.get('fastest') else ''}"
+            for t, p in rows[-1]["plans"].items()
+        )
+        print(f"{number:3} {scene.name:16} {told}", flush=True)
+    result = {
+        "pixels": chosen.size,
+        "summary": summary(rows, costs),
+        "planning, in images": costs,
+        "scenes": rows,
+    }
+    print(result["summary"])
+    jax.clear_caches()
+    return result, partial(draw, result)
+
+
+if __name__ == "__main__":
+    main()
