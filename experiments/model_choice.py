@@ -82,11 +82,11 @@ def materials(resolution: int) -> Problem:
         return volume, jv.LabelTransferFunction(functions), camera, march
 
     def draw(generator: np.random.Generator, candidate: int) -> tuple[jv.Material, ...]:
-        classes = CLASSES[candidate]
+        classes, (low, high) = CLASSES[candidate], np.log(PATHS)
         while True:
-            paths = np.exp(generator.uniform(*np.log(PATHS), max(classes) + 1))
+            paths = np.exp(generator.uniform(low, high, max(classes) + 1))
             if np.all(np.diff(np.sort(np.log(paths))) >= np.log(APART)):
-                return of_paths(paths[list(classes)])
+                return of_paths(list(paths[list(classes)]))
 
     candidates = jv.nested_materials(of_paths([START] * len(CENTERS)), CLASSES)
     return Problem(scene, candidates, draw, [str(max(classes) + 1) for classes in CLASSES])

@@ -130,7 +130,7 @@ class Choice(NamedTuple):
         if self.chosen == len(rows) - 1 > 0:
             notes.append("The largest candidate is chosen: a larger one may be better still.")
         for smaller, row in pairwise(rows):
-            if row.training_loss > (1 + NEARLY) * smaller.training_loss and not smaller.supported:
+            if row.training_loss > (1 + NEARLY) * smaller.training_loss and not row.supported:
                 notes.append(
                     f"{row.name} fits the training views worse than {smaller.name}: it does not hold that "
                     "model, or its fit ended elsewhere than at the minimum."
@@ -160,8 +160,8 @@ def choose(
 
     and the supported one with the fewest parameters is chosen. With δ the difference of the two images and
     r the best residual, L - L_best = |δ|² / 2 + r · δ; its standard error is √ Σ (r · δ)², summed over blocks
-    of pixels. The second condition is for data without noise, where losses of all models that hold the truth
-    differ only in where the solver stopped.
+    of pixels, or √ (mean r² |δ|²), whichever is larger. The second condition is for data without noise, where
+    losses of all models that hold the truth differ only in where the solver stopped.
 
     **Arguments:**
 

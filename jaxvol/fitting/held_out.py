@@ -2,10 +2,12 @@
 
 Noise enters a held-out loss L = |r|² / 2 through every pixel. Of two models, the noise is the same: with r
 the residual of one and r + δ that of the other, the losses differ by |δ|² / 2 + r · δ, where δ, the
-difference of the two images, is free of noise. Only r · δ is uncertain. If r is noise, of mean 0 and
-independent from block to block, its standard error is √ Σ (r · δ)², summed over blocks. So a model that is
-wrong in a few pixels only is recognised, and where nothing is noisy, nothing is uncertain. The scatter of the
-differences of squares would be a larger error, since δ is not the same in all pixels.
+difference of the two images, is free of noise. Only r · δ is uncertain. If r is noise of mean 0, its standard
+error is √ Σ (r · δ)², summed over blocks between which the noise is independent, whatever its variance; or
+√ (mean r² |δ|²), if it is independent and of equal variance in all entries. The first is known badly if δ
+is confined to few blocks, the second is wrong where variances differ: the larger one is used. So a model that
+is wrong in a few pixels only is recognised, and where nothing is noisy, nothing is uncertain. The scatter of
+the differences of squares would be a larger error, since δ is not the same in all pixels.
 """
 
 import math
@@ -84,8 +86,9 @@ class HeldOut:
     ) -> tuple[float, float]:
         """By how much its loss exceeds that of the best one, and the standard error of the difference."""
         change = residual - best
-        uncertain = self._sums(best * change)
-        return float(np.sum(change**2) / 2 + uncertain.sum()), math.sqrt(float(np.sum(uncertain**2)))
+        uncertain, square = self._sums(best * change), float(np.sum(change**2))
+        variance = max(float(np.sum(uncertain**2)), float(np.mean(best**2)) * square)
+        return square / 2 + float(uncertain.sum()), math.sqrt(variance)
 
     def _sums(self, entries: Float64[np.ndarray, " entries"]) -> Float64[np.ndarray, " blocks"]:
         return np.bincount(self.block_of_entry, entries)

@@ -41,12 +41,12 @@ POLYNOMIALS = [
 ]
 
 
-def views_of(truth, noise, seed, views=6, outlier=0.0):
+def views_of(truth, noise, seed):
     """Views of a polynomial of `truth` coefficients, each of order 1."""
     generator = np.random.default_rng([seed, truth])
     coefficients = generator.choice([-1, 1], truth) * generator.uniform(0.5, 1.5, truth)
     found = []
-    for _ in range(views):
+    for _ in range(6):
         x = generator.uniform(-1, 1, 60)
         y = np.polyval(coefficients[::-1], x) + noise * generator.normal(size=60)
         found.append((jnp.asarray(x, float), jnp.asarray(y, float)))
@@ -86,18 +86,20 @@ def test_a_larger_model_has_the_least_held_out_loss_in_some_trial_and_is_not_cho
 
 
 def test_the_share_of_too_large_choices_is_that_of_the_standard_errors():
-    """With `errors=0` the least held-out loss decides, and of two candidates that hold the truth the larger
-    one wins now and then; with 2, in 2.3 % of trials at most."""
-    wins = {0.0: 0, 2.0: 0}
-    trials = 100
-    for errors in wins:
-        for seed in range(trials):
-            views = views_of(2, 0.1, 1000 + seed)
-            choice = jv.choose(polynomial, POLYNOMIALS[:3], views[4:], views=views[:4], errors=errors)
-            assert choice.chosen >= 1
-            wins[errors] += choice.name == "3"
-    assert wins[2.0] <= 0.06 * trials  # three standard errors of a share of 2.3 %
-    assert wins[0.0] >= 0.2 * trials
+    """Of two candidates that hold the truth, the larger one has the smaller held-out loss now and then; by
+    more than two standard errors in 2.3 % of trials at most. With `errors=0` the held-out loss decides."""
+    least, too_large, trials = 0, 0, 60
+    for seed in range(trials):
+        views = views_of(2, 0.1, 1000 + seed)
+        choice = jv.choose(polynomial, POLYNOMIALS[:3], views[4:], views=views[:4])
+        assert choice.chosen >= 1
+        too_large += choice.chosen == 2
+        best = int(np.argmin([row.held_out_loss for row in choice.candidates]))
+        if best == 2 and not least:
+            assert jv.choose(polynomial, POLYNOMIALS[:3], views[4:], views=views[:4], errors=0).chosen == 2
+        least += best == 2
+    assert least >= 0.2 * trials
+    assert too_large <= 5  # of a share of 2.3 %, more have a probability of 0.3 %
 
 
 def test_numbers_of_the_table_are_those_of_their_definitions():
@@ -120,7 +122,9 @@ def test_numbers_of_the_table_are_those_of_their_definitions():
         change = np.asarray(unseen) - residuals(best, views[4:])
         products = np.asarray(residuals(best, views[4:])) * change
         assert row.excess == pytest.approx(row.held_out_loss - best.held_out_loss, abs=1e-6)
-        assert row.excess_error == pytest.approx(np.sqrt(np.sum(products**2)) / 2, rel=1e-3, abs=1e-9)
+        equal = np.mean(np.square(residuals(best, views[4:]))) * np.sum(change**2)
+        expected = np.sqrt(max(np.sum(products**2), equal)) / 2
+        assert row.excess_error == pytest.approx(expected, rel=1e-3, abs=1e-9)
         bic = 240 * np.log(2 * row.training_loss) + row.numbers * np.log(240)
         assert row.bic == pytest.approx(bic, rel=1e-6)
 
@@ -134,7 +138,10 @@ def test_a_misfit_in_few_pixels_counts_and_noise_that_is_shared_does_not():
     wrong[7] = 30.0
     excess, error = judge.excess(noise + wrong, noise)
     assert excess == pytest.approx(450 + 30 * noise[7])
-    assert error == pytest.approx(abs(30 * noise[7]))
+    assert error == pytest.approx(30 * np.sqrt(np.mean(noise**2)))
+    noise[7] *= 5
+    assert judge.excess(noise + wrong, noise)[1] == pytest.approx(abs(30 * noise[7]))
+    noise[7] /= 5
     loss, own = judge.loss(noise)
     assert (loss, own) == (
         pytest.approx(np.sum(noise**2) / 2),
@@ -194,25 +201,31 @@ def extinction(transfer):
 
 
 def test_control_points_are_counted_from_images():
-    """Candidates of 2, 3 and 5 points, with only their extinction free; the truth has 3."""
-    truth = jv.TransferFunction((0, 0.5, 1), np.full((3, 3), 0.5), (0.2, 2.0, 0.5))
-    models = jv.nested_points(PLAIN, (2, 3, 5), where=extinction)
+    """Candidates of 2 and 3 points, with only their extinction free, and a truth of each."""
+    models = jv.nested_points(PLAIN, (2, 3), where=extinction)
     steps = []
-    for noise in (0.02, 0.0):
-        views = images(truth, noise)
-        residual = jv.ImageResidual(scene, views[:2])
-        choice = jv.choose(
-            residual, models, views[2:], max_steps=20, callback=lambda name, *_: steps.append(name)
-        )
-        assert choice.name == "3 points"
-        assert isinstance(choice.parameters, jv.TransferFunction)
-        assert [row.numbers for row in choice.candidates] == [2, 3, 5]
-        # the loss of an image is half its mean square error, and that of several is their mean
-        errors = [jv.render(*scene(choice.parameters, camera)).image() - image for camera, image in views[2:]]
-        row = choice.candidates[choice.chosen]
-        assert row.held_out_loss == pytest.approx(np.mean(np.square(errors)) / 2, rel=1e-3)
-    assert set(steps) == {"2 points", "3 points", "5 points"}
-    np.testing.assert_allclose(choice.parameters.extinction, truth.extinction, rtol=1e-3)
+    for points in ((0.2, 2.0), (0.2, 2.0, 0.5)):
+        values = np.linspace(0, 1, len(points))
+        truth = jv.TransferFunction(values, np.full((len(points), 3), 0.5), points)
+        for noise in (0.02, 0.0):
+            views = images(truth, noise)
+            choice = jv.choose(
+                jv.ImageResidual(scene, views[:2]),
+                *(models, views[2:]),
+                max_steps=20,
+                callback=lambda name, *_: steps.append(name),
+            )
+            assert choice.name == f"{len(points)} points"
+            assert isinstance(choice.parameters, jv.TransferFunction)
+            assert [row.numbers for row in choice.candidates] == [2, 3]
+            # the loss of an image is half its mean square error, and that of several is their mean
+            errors = [
+                jv.render(*scene(choice.parameters, camera)).image() - image for camera, image in views[2:]
+            ]
+            row = choice.candidates[choice.chosen]
+            assert row.held_out_loss == pytest.approx(np.mean(np.square(errors)) / 2, rel=1e-3, abs=1e-10)
+        np.testing.assert_allclose(choice.parameters.extinction, truth.extinction, rtol=1e-3)
+    assert set(steps) == {"2 points", "3 points"}
 
 
 def test_blocks_are_squares_of_pixels_with_all_their_channels():
@@ -236,11 +249,17 @@ def test_a_refined_transfer_function_is_the_same_function():
     finer = jv.refined(transfer, 9)
     assert len(finer.values) == 9
     assert set(values) <= set(np.asarray(finer.values).tolist())
-    for value in np.linspace(-1, 41, 43):
+    for value in (-1.0, 3.0, 9.0, 10.0, 14.0, 27.5, 41.0):
         for one, other in zip(transfer(jnp.asarray(value)), finer(jnp.asarray(value)), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-6)
     even = jv.refined(jv.refined(PLAIN, 3), 9)
     np.testing.assert_allclose(even.values, np.linspace(0, 1, 9), atol=1e-7)
+
+
+def grown_from(candidate, found):
+    assert candidate.start is None
+    assert candidate.grow is not None
+    return candidate.grow(found)
 
 
 def test_materials_share_what_they_have_in_common():
@@ -253,11 +272,11 @@ def test_materials_share_what_they_have_in_common():
 
     assert paths(one.expand(one.start)) == [0.1, 0.1, 0.1]
     moved = (eqx.tree_at(lambda m: m.mean_free_path, one.start[0], jnp.asarray(0.7)),)
-    grown = two.grow(moved)
+    grown = grown_from(two, moved)
     assert paths(grown) == [0.7, 0.7]
     assert paths(two.expand(grown)) == [0.7, 0.7, 0.7]
     split = (grown[0], eqx.tree_at(lambda m: m.mean_free_path, grown[1], jnp.asarray(0.9)))
-    assert paths(two.expand(split)) == paths(three.expand(three.grow(split))) == [0.7, 0.9, 0.9]
+    assert paths(two.expand(split)) == paths(three.expand(grown_from(three, split))) == [0.7, 0.9, 0.9]
     # where a material is, is its own
     assert [material.values.tolist() for material in two.expand(split)] == [[0, 1], [1, 2], [2, 3]]
 
@@ -269,7 +288,8 @@ def test_transfer_functions_of_labels_are_merged_as_a_whole():
     )
     assert one.expand(one.start) == (PLAIN, PLAIN)
     assert len(two.constraints) == 2
-    assert [len(each) for each in two.where(two.grow(one.start))] == [2, 2]
+    assert two.where is not None
+    assert [len(each) for each in two.where(grown_from(two, one.start))] == [2, 2]
 
 
 def test_materials_are_counted():
