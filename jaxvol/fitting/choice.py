@@ -153,6 +153,10 @@ def choose(
 ) -> Choice:
     """Fit nested models and choose the smallest that agrees with held-out views as well as the best does.
 
+        models = jv.nested_points(jv.flat_grey(volume, 2), (2, 4, 8, 16))
+        choice = jv.choose(jv.ImageResidual(scene, views[:4]), models, held_out=views[4:])
+        print(choice)
+
     Each candidate is fitted to the training views by `fit`, in order, and evaluated on the held-out views.
     The best one has the least held-out loss L. A candidate is supported if
 
