@@ -46,6 +46,9 @@ SEEN = 3
 """Number of training views; the others are held out."""
 
 
+LEAST = 1e-16
+"""Smallest loss that the chart shows: where a fit is exact, the loss is 0."""
+
 RULES = ("chosen", "bic", "least")
 """Of each trial: what is chosen by `choose`, by BIC, and by the least held-out loss."""
 
@@ -167,7 +170,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         numbers = [row["numbers"] for row in next(iter(problem["trials"].values()))[0]["candidates"]]
         for axis, (noise, trials) in zip((left, middle), problem["trials"].items(), strict=True):
             for trial in trials:
-                losses = [row["held_out_loss"] for row in trial["candidates"]]
+                losses = [max(row["held_out_loss"], LEAST) for row in trial["candidates"]]
                 color, at = f"C{trial['truth']}", trial["chosen"]
                 axis.plot(losses, f"{color}-", linewidth=0.8, alpha=0.6)
                 axis.plot(at, losses[at], f"{color}o" if at == trial["truth"] else f"{color}X", markersize=6)
@@ -185,9 +188,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
             more = [c["more"] for c in counts.values()]
             truths = [c["truth"] for c in counts.values()]
             right.bar(places, more, width, truths, color="none", edgecolor=f"C{shift + 4}", hatch="////")
-        right.set(xticks=range(len(RULES)), ylabel="trials", title="truth (filled) or more (hatched)")
-        right.set_xticklabels(["`choose`", "BIC", "least held-out loss"], fontsize=8)
-        right.legend(fontsize=7, title="noise", title_fontsize=7, loc="lower right")
+        right.set(xticks=range(len(RULES)), ylabel="trials", title="filled: truth, hatched: more chosen")
+        right.set_xticklabels(["choose", "BIC", "least held-out loss"], fontsize=8)
+        right.set_ylim(0, 1.25 * len(trials))
+        right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)
     common.save(figure, path)
 
 
