@@ -21,6 +21,8 @@ from .display import (
     to_srgb as to_srgb,
 )
 from .fitting import (
+    Candidate as Candidate,
+    Choice as Choice,
     Fit as Fit,
     Fixed as Fixed,
     ImageResidual as ImageResidual,
@@ -28,10 +30,14 @@ from .fitting import (
     Positive as Positive,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
+    choose as choose,
     fit as fit,
     flat_grey as flat_grey,
+    nested_materials as nested_materials,
+    nested_points as nested_points,
     read_transfer as read_transfer,
     read_views as read_views,
+    refined as refined,
     write_transfer as write_transfer,
 )
 from .formats import load as load

@@ -738,6 +738,49 @@ MUTATIONS = [
         "return jax.lax.map(one, [leaf[::-1] for leaf, moves in",
         (VMAP,),
     ),
+    # choices among models
+    Mutation(
+        "choice: the largest candidate, always",
+        "fitting/choice.py",
+        "chosen = [row.supported for row in rows].index(True)",
+        "chosen = len(rows) - 1",
+        ("fitting/test_choice.py::test_the_truth_is_chosen_in_nine_of_ten_noisy_trials",),
+    ),
+    Mutation(
+        "choice: training views in place of held-out ones",
+        "fitting/choice.py",
+        "judge = HeldOut(unseen, block)",
+        "judge = HeldOut([seen], block)",
+        ("fitting/test_choice.py::test_numbers_of_the_table_are_those_of_their_definitions",),
+    ),
+    Mutation(
+        "choice: the least held-out loss",
+        "fitting/choice.py",
+        "within = excess <= errors * excess_error",
+        "within = excess <= 0 * errors * excess_error",
+        ("fitting/test_choice.py::test_the_truth_is_chosen_in_nine_of_ten_noisy_trials",),
+    ),
+    Mutation(
+        "choice: rounding decides where there is no noise",
+        "fitting/choice.py",
+        " or math.sqrt(2 * of_row[0]) <= of_held_out",
+        "",
+        ("fitting/test_choice.py::test_rounding_alone_decides_nothing",),
+    ),
+    Mutation(
+        "choice: larger models start anew",
+        "fitting/candidates.py",
+        "return _firsts(self.coarse(found), self.fine)",
+        "return _firsts(self.coarse.parts, self.fine)",
+        ("fitting/test_choice.py::test_materials_share_what_they_have_in_common",),
+    ),
+    Mutation(
+        "choice: refinement moves points",
+        "fitting/candidates.py",
+        "rows[gap] * (1 - share) + rows[gap + 1] * share",
+        "rows[gap] * share + rows[gap + 1] * (1 - share)",
+        ("fitting/test_choice.py::test_a_refined_transfer_function_is_the_same_function",),
+    ),
 ]
 
 

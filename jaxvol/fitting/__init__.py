@@ -8,6 +8,13 @@ from .bijections import (
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
 )
+from .candidates import (
+    Candidate as Candidate,
+    nested_materials as nested_materials,
+    nested_points as nested_points,
+    refined as refined,
+)
+from .choice import Choice as Choice, Evidence as Evidence, choose as choose
 from .driver import Fit as Fit, Outcome as Outcome, fit as fit
 from .files import (
     read_transfer as read_transfer,
