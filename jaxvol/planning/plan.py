@@ -19,9 +19,9 @@ from ..space import node_distance
 from ..transfer import Transfer
 from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..volume import Volume
-from .candidates import Candidate, Trials
 from .probe import Probe, Setting, Truth
 from .storage import stored
+from .trials import Trial, Trials
 
 
 MARGIN = 0.85
@@ -116,7 +116,7 @@ def plan(
     - **step**: the longest within the tolerance, between two of these.
     - **quadrature and strides**: `"preintegrated"` and `AdaptiveSampling` are tried where rays take many
       samples, and kept where they take so many fewer that they are faster, by what a sample costs on CPU
-      (`planning/candidates.py`: `RAY`, `SAMPLE`).
+      (`planning/trials.py`: `RAY`, `SAMPLE`).
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces.
@@ -234,7 +234,7 @@ def _proven(setting: Setting, given: tuple[Transform, ...]) -> tuple[tuple[Trans
     return (*found, *((SpaceLeaping(),) if leaps else ())), parts
 
 
-def _marched(trials: Trials, parts: list[Part]) -> tuple[Candidate, Truth]:
+def _marched(trials: Trials, parts: list[Part]) -> tuple[Trial, Truth]:
     """The cheapest march within the goal, unlit."""
     uniform, truth = trials.uniform()
     step, samples = float(uniform.march.step) / trials.voxel, uniform.samples
@@ -268,8 +268,8 @@ def _marched(trials: Trials, parts: list[Part]) -> tuple[Candidate, Truth]:
 
 
 def _lit(
-    trials: Trials, chosen: Candidate, lighting: Lighting, goal: float, parts: list[Part], *, gradients: bool
-) -> tuple[Candidate, Lighting, float, float]:
+    trials: Trials, chosen: Trial, lighting: Lighting, goal: float, parts: list[Part], *, gradients: bool
+) -> tuple[Trial, Lighting, float, float]:
     """The march, the cheapest lighting within what is left of the goal, its error, and the seconds that it
     adds to an image."""
     probe, setting = trials.probe, trials.setting
@@ -298,7 +298,7 @@ def _lit(
         parts.append(Part(f"step {float(half.step):.4g}", True, why))
         image, march = finer, half
     samples = probe.samples(image)
-    marched = Candidate(march, max(chosen.error, change), samples, chosen.kind)
+    marched = Trial(march, max(chosen.error, change), samples, chosen.kind)
     unlit, with_light = (_fastest(trials, march, each) for each in (None, lit))
     pixels = probe.pixels * probe.share / probe.source.origins.shape[0]
     return marched, lit, error, max(with_light - unlit, 0.0) * pixels
@@ -321,7 +321,7 @@ def _fastest(trials: Trials, march: March, lighting: Lighting | None = None) -> 
     return min(once() for _ in range(2))
 
 
-def _seconds(trials: Trials, chosen: Candidate) -> float:
+def _seconds(trials: Trials, chosen: Trial) -> float:
     """Time of an image on this machine. What a sample costs is taken from two steps, so that calls, which
     take as long for a few pixels as for an image, do not count."""
     times, samples = [], []

@@ -30,7 +30,7 @@ LONGEST = 8
 ones."""
 
 
-class Candidate(NamedTuple):
+class Trial(NamedTuple):
     """A march, the error of its image, samples for each pixel, and a key of `SAMPLE`."""
 
     march: March
@@ -85,7 +85,7 @@ class Trials:
         integrator = self.setting.transfer.integrator()
         return integrator is not None and isinstance(self.setting.compositing, Over)
 
-    def uniform(self) -> tuple[Candidate, Truth]:
+    def uniform(self) -> tuple[Trial, Truth]:
         """The longest steps within the goal: by the midpoint rule; or integrated, where that would take more
         than 32 steps for a voxel. And what they were compared with."""
         found, truth = self._longest("midpoint", FINE if self.integrable else FINEST)
@@ -93,7 +93,7 @@ class Trials:
             found, truth = self._longest("preintegrated", FINEST)
         return found, truth
 
-    def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Candidate, Truth]:
+    def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Trial, Truth]:
         """The longest steps within the goal, compared with steps of a quarter of them or less. If there are
         none, the finest."""
         steps = [COARSEST, COARSEST / 2, COARSEST / 4]
@@ -111,7 +111,7 @@ class Trials:
         elif best < COARSEST:
             best, error = self._between(best, error, truth, quadrature)
         samples = self.probe.samples(self.image(best, quadrature))
-        return Candidate(self.march(best, quadrature), error, samples, quadrature), truth
+        return Trial(self.march(best, quadrature), error, samples, quadrature), truth
 
     def _between(
         self, step: float, error: float, truth: Truth, quadrature: Quadrature
@@ -132,25 +132,25 @@ class Trials:
             low, high = (tried, high) if tried[1] <= self.goal else (low, tried)
         return low
 
-    def _tried(self, march: March, kind: str, truth: Truth) -> Candidate:
+    def _tried(self, march: March, kind: str, truth: Truth) -> Trial:
         """A march, rendered."""
         image = self.probe.render(self.setting, march)
-        return Candidate(march, truth.error(image), self.probe.samples(image), kind)
+        return Trial(march, truth.error(image), self.probe.samples(image), kind)
 
-    def integrated(self, step: float, truth: Truth) -> Candidate | None:
+    def integrated(self, step: float, truth: Truth) -> Trial | None:
         """Pre-integration with the longest steps within the goal; None unless that is faster than the
         midpoint rule with this `step`, in voxels, or where cells cannot be integrated."""
         if not self.integrable:
             return None
         found, longer = None, step * SAMPLE["preintegrated"]
         while longer <= 2 * COARSEST:
-            candidate = self._tried(self.march(longer, "preintegrated"), "preintegrated", truth)
-            if candidate.error > self.goal:
+            trial = self._tried(self.march(longer, "preintegrated"), "preintegrated", truth)
+            if trial.error > self.goal:
                 break
-            found, longer = candidate, longer * 1.5
+            found, longer = trial, longer * 1.5
         return found
 
-    def adaptive(self, step: float, truth: Truth) -> Candidate | None:
+    def adaptive(self, step: float, truth: Truth) -> Trial | None:
         """Adaptive sampling, with cells from half this step on, and the largest tolerance of its own that
         keeps the goal; None if none does, or nothing can be predicted."""
         windows = Windows.of(self.setting.volume)
@@ -160,14 +160,14 @@ class Trials:
         found, tolerance = None, 2 * self.goal
         for _ in range(4):
             march = self.march(step / 2, "midpoint", AdaptiveSampling(tolerance, LONGEST))
-            candidate = self._tried(march, "adaptive", truth)
-            if candidate.error <= self.goal:
-                if found is not None and candidate.samples >= found.samples:
+            trial = self._tried(march, "adaptive", truth)
+            if trial.error <= self.goal:
+                if found is not None and trial.samples >= found.samples:
                     break
-                found = candidate
-                if candidate.error > 0.7 * self.goal:
+                found = trial
+                if trial.error > 0.7 * self.goal:
                     break
-                tolerance *= min((0.9 * self.goal / max(candidate.error, 1e-12)) ** 1.5, 8)
+                tolerance *= min((0.9 * self.goal / max(trial.error, 1e-12)) ** 1.5, 8)
             elif found is not None:
                 break
             else:
