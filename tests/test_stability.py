@@ -1,0 +1,115 @@
+"""Is the edge of each entry of the failure atlas still where it was? And does the page show all of them?"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from experiments import atlas, record, stability
+from experiments.atlas.entry import Edge, edge, sweep
+from experiments.atlas.page import method
+
+
+ROOT = Path(__file__).parent.parent
+POINTER = re.compile(r"`experiments/stability\.py`,\s+((?:\"[^\"]+\"(?:,|\s|and)*)+)")
+"""How docstrings point to entries."""
+
+
+class Pin(NamedTuple):
+    """A sweep around an edge: which of its values are within the limit, and what is measured there."""
+
+    within: dict[float, float]
+    beyond: dict[float, float]
+    relative: float = 0.1
+    size: int = 64
+
+
+PINS = {
+}
+
+SLOW: set[str] = set()
+"""Entries whose programs take long to compile or to run."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in PINS]
+)
+def test_edge_is_where_it_was(name):
+    entry, pin = atlas.ENTRIES[name], PINS[name]
+    expected = {**pin.within, **pin.beyond}
+    found = sweep(entry, pin.size, list(expected))
+    within = list(pin.within)[-1] if pin.within else None
+    beyond = next(iter(pin.beyond), None)
+    assert found["edge"] == {"within": within, "beyond": beyond}
+    judged = found["curves"][entry.judged]
+    assert judged == pytest.approx(list(expected.values()), rel=pin.relative, abs=1e-6, nan_ok=True)
+    if entry.said is not None:  # jaxvol speaks up beyond the edge, and only there
+        assert found["curves"][entry.said] == [0.0] * len(pin.within) + [1.0] * len(pin.beyond)
+
+
+def test_every_entry_is_pinned_and_on_both_sides_of_its_edge():
+    assert set(PINS) == set(atlas.ENTRIES)
+    for name, pin in PINS.items():
+        entry = atlas.ENTRIES[name]
+        assert pin.within or pin.beyond
+        assert bool(pin.beyond) == (entry.outcome != "bounded"), name
+        if entry.outcome == "detected and said":
+            assert entry.said is not None, name
+
+
+def test_an_edge_is_the_first_value_beyond_the_limit():
+    assert edge([1, 2, 3, 4], [0, 1, 5, 0], 1) == Edge(2, 3)
+    assert edge([1, 2, 3], [0, 1, 1], 1) == Edge(3, None)
+    assert edge([1, 2, 3], [2, 0, 0], 1) == Edge(None, 1)
+    assert edge([1, 2], [0, float("nan")], 1) == Edge(1, 2)
+
+
+def pointers():
+    """Names of entries that docstrings of jaxvol mention, by file."""
+    for path in sorted((ROOT / "jaxvol").rglob("*.py")):
+        for found in POINTER.findall(path.read_text(encoding="utf-8")):
+            for name in re.findall(r'"([^"]+)"', found):
+                yield path.relative_to(ROOT).as_posix(), " ".join(name.split())
+
+
+def test_docstrings_point_to_entries_that_exist_and_each_entry_is_pointed_to():
+    mentioned = list(pointers())
+    assert {name for _, name in mentioned} == set(atlas.ENTRIES)
+    for name, entry in atlas.ENTRIES.items():
+        documented = " ".join((method(entry.method).__doc__ or "").split())
+        assert "experiments/stability.py" in documented, name
+        assert f'"{name}"' in documented, name
+
+
+def test_record_holds_every_entry_with_the_edge_of_its_own_curve():
+    entries = record.read(record.RESULTS / "stability.json")["result"]["entries"]
+    assert list(entries) == list(atlas.ENTRIES)
+    for name, found in entries.items():
+        entry = atlas.ENTRIES[name]
+        assert tuple(found["values"]) == entry.values
+        again = edge(found["values"], found["curves"][entry.judged], entry.limit)
+        assert again._asdict() == found["edge"]
+        assert (found["edge"]["beyond"] is None) == (entry.outcome == "bounded"), name
+        if entry.said is not None:
+            beyond = [not number <= entry.limit for number in found["curves"][entry.judged]]
+            assert [bool(said) for said in found["curves"][entry.said]] == beyond, name
+
+
+def test_page_shows_every_entry_without_scripts_or_other_files():
+    text = (record.RESULTS / "stability.html").read_text(encoding="utf-8")
+    assert len(text) < 3e6
+    for name in atlas.ENTRIES:
+        assert f">{name}</h3>" in text
+    assert "<script" not in text
+    assert re.findall(r'src="(?!data:image/png;base64,)', text) == []
+    assert text.count('src="data:image/png') == 3 * len(atlas.ENTRIES)  # a curve and two pictures each
+    for link in set(re.findall(r'href="(?!#)([^"]+)"', text)):
+        assert (record.RESULTS / link).is_file(), link
+
+
+@pytest.mark.parametrize("name", list(atlas.ENTRIES))
+def test_name_is_a_stable_plain_string(name):
+    assert re.fullmatch(r"[a-z0-9 ,-]+", name)
+    assert atlas.ENTRIES[name].question.endswith("?")
