@@ -1,16 +1,18 @@
 """Where do the methods of jaxvol fail? The entries of the failure atlas, a file for each family of them."""
 
-from . import labels, leaping, opacity, precision, probe, sampling
+from . import adaptive, labels, leaping, light, opacity, precision, probe, sampling
 from .entry import Entry
 
 
 FAMILIES = {
     "jitter and sampling": sampling.ENTRIES,
     "opacity and its gradient": opacity.ENTRIES,
+    "adaptive strides": adaptive.ENTRIES,
     "space leaping": leaping.ENTRIES,
     "float types": precision.ENTRIES,
     "faces of labels": labels.ENTRIES,
     "toroidal maps": probe.ENTRIES,
+    "scatterer templates": light.ENTRIES,
 }
 """All entries, by family. A new method joins by a row."""
 

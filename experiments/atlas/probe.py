@@ -84,7 +84,7 @@ GAPS = Entry(
     measure=gap,
     metric="share of the gap that is taken for material; share of rays",
     judged="share of the gap",
-    limit=0.01,
+    limit=0.05,
     outcome="documented",
     does="AlphaCorrection looks at four depths of each cell, and bisects where the region changes: a gap of a quarter of "
     "a step or more is cut out exactly, a shorter one may be missed.",
