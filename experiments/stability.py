@@ -24,8 +24,8 @@ from .atlas.page import number, page
 from .common import plt
 
 
-SMALL = 64
-"""Pixels along a side, at most, in a quick run."""
+PICTURE, SMALL = 192, 64
+"""Pixels along a side of pictures, in a full run and in a quick one."""
 COLUMNS = 4
 OUTCOMES = {"bounded": "C2", "detected and said": "C0", "documented": "C1", "fails": "C3"}
 
@@ -98,12 +98,12 @@ def main(chosen: Namespace) -> common.Answer:
         chosen.only = [family[0].name for family in FAMILIES.values()]
     for name in chosen.only:
         entry = ENTRIES[name]
-        size = min(entry.size, SMALL) if chosen.quick else entry.size
+        size = SMALL if chosen.quick else PICTURE
         values = [entry.values[0], entry.values[-1]] if chosen.quick else None
-        found = sweep(entry, size, values)
+        found = sweep(entry, entry.size, values)
         pictures[name] = {value: entry.picture(value, size) for value in pictured(entry, found)}
         about = {key: getattr(entry, key) for key in ("question", "method", "regime", "metric", "judged", "limit")}
-        entries[name] = {**about, **found, "outcome": entry.outcome, "does": entry.does, "size": size}
+        entries[name] = {**about, **found, "outcome": entry.outcome, "does": entry.does, "size": entry.size}
         within, beyond = (number(found["edge"][side]) for side in ("within", "beyond"))
         print(f"{name:40} {entry.outcome:18} within {within}, beyond {beyond} ({entry.regime})", flush=True)
     result = {"entries": entries}

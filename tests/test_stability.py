@@ -13,7 +13,7 @@ from experiments.atlas.page import method
 
 
 ROOT = Path(__file__).parent.parent
-POINTER = re.compile(r"`experiments/stability\.py`,\s+((?:\"[^\"]+\"(?:,|\s|and)*)+)")
+POINTER = re.compile(r'`experiments/stability\.py`,\s+((?:"[^"]+",?\s*)+)')
 """How docstrings point to entries."""
 
 

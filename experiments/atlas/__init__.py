@@ -1,6 +1,6 @@
 """Where do the methods of jaxvol fail? The entries of the failure atlas, a file for each family of them."""
 
-from . import adaptive, labels, leaping, light, opacity, precision, probe, sampling
+from . import adaptive, fits, labels, leaping, light, opacity, precision, probe, sampling
 from .entry import Entry
 
 
@@ -13,6 +13,7 @@ FAMILIES = {
     "faces of labels": labels.ENTRIES,
     "toroidal maps": probe.ENTRIES,
     "scatterer templates": light.ENTRIES,
+    "fits": fits.ENTRIES,
 }
 """All entries, by family. A new method joins by a row."""
 

@@ -65,7 +65,7 @@ TOLERANCE = Entry(
     picture=tolerance_picture,
     shows="error of the image with finest=1, ± 0.05 from blue to red",
     pictured=(0.1, 1e-3),
-    size=96,
+    size=32,
 )
 
 
@@ -83,42 +83,49 @@ def lit_image(size: int, path: float, *, transform: jv.Transform | None, lit: bo
     return colors(cube(32), uniform(1.5, (0.9, 0.8, 0.7)), camera, march, lighting=lighting)
 
 
-TOLERATED = 0.003
+PATH = 0.2
+"""Mean free path of the light, a tenth of the side of the cube."""
 
 
-def light(path: float, size: int) -> dict[str, float]:
-    sampling = jv.AdaptiveSampling(TOLERATED, 16)
-    found = {}
-    for name, lit in (("lit", True), ("unlit", False)):
-        truth = lit_image(size, path, transform=None, lit=lit, finer=4)
-        found[name] = rmse(lit_image(size, path, transform=sampling, lit=lit), truth) / TOLERATED
-        if lit:
-            found["lit, cells of one step"] = rmse(lit_image(size, path, transform=None, lit=lit), truth) / TOLERATED
-    return found
+@cache
+def _light_error(size: int, *, lit: bool, tolerance: float | None) -> float:
+    """RMSE of the cube, by adaptive strides or by cells of one step."""
+    transform = None if tolerance is None else jv.AdaptiveSampling(tolerance, 16)
+    truth = lit_image(size, PATH, transform=None, lit=lit, finer=4)
+    return rmse(lit_image(size, PATH, transform=transform, lit=lit), truth)
 
 
-def light_picture(path: float, size: int) -> np.ndarray:
-    sampling = jv.AdaptiveSampling(TOLERATED, 16)
-    truth = lit_image(size, path, transform=None, lit=True, finer=4)
-    return signed(lit_image(size, path, transform=sampling, lit=True) - truth, 0.03)
+def light(tolerance: float, size: int) -> dict[str, float]:
+    return {
+        "lit": _light_error(size, lit=True, tolerance=tolerance) / tolerance,
+        "lit, cells of one step": _light_error(size, lit=True, tolerance=None) / tolerance,
+        "unlit": _light_error(size, lit=False, tolerance=tolerance) / tolerance,
+    }
+
+
+def light_picture(tolerance: float, size: int) -> np.ndarray:
+    sampling = jv.AdaptiveSampling(tolerance, 16)
+    truth = lit_image(size, PATH, transform=None, lit=True, finer=4)
+    return np.abs(lit_image(size, PATH, transform=sampling, lit=True) - truth) / tolerance
 
 
 LIGHT = Entry(
     name="adaptive strides under light",
     question="What does adaptive sampling miss where light varies and values do not?",
     method="jaxvol.AdaptiveSampling",
-    regime="mean free path of light / side of the cube",
-    values=(1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01),
-    measure=lambda path, size: light(2 * path, size),
-    metric=f"RMSE of the image / tolerance ({TOLERATED})",
+    regime="tolerance",
+    values=(0.1, 0.03, 0.01, 0.005, 0.002, 1e-3, 3e-4, 1e-4),
+    measure=light,
+    metric="RMSE of the image / tolerance",
     judged="lit",
     limit=1.0,
     outcome="documented",
-    does="Strides follow from values and transfer function alone. Light that enters within a few cells is sampled once "
-    "for each, so that the lit rim is too wide; nothing says so, and Rendering.error does not count it.",
-    picture=lambda path, size: light_picture(2 * path, size),
-    shows="error of a lit cube, ± 0.03 from blue to red",
-    size=48,
+    does="Strides follow from values and transfer function alone, so that in a cube of one value all cells are as long as "
+    "allowed, whatever the tolerance: without light that is exact, with light it is not. Rendering.error does not count "
+    "it.",
+    picture=lambda tolerance, size: light_picture(tolerance, size // 2),
+    shows="error of a lit cube of one value, over the tolerance",
+    size=24,
 )
 
 ENTRIES = (TOLERANCE, LIGHT)

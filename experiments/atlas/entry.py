@@ -33,7 +33,7 @@ class Entry(NamedTuple):
     - `pictured`: the two values; by default the last one within the limit and the last one of all.
     - `said`: the name of the number by which jaxvol says that it fails (1) or not (0).
     - `scales`: of both axes of the chart, as in Matplotlib.
-    - `size`: pixels along a side of the images that are measured in a full run.
+    - `size`: pixels along a side of the images that are measured; pictures have their own.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Entry(NamedTuple):
     pictured: tuple[float, float] | None = None
     said: str | None = None
     scales: tuple[str, str] = ("log", "log")
-    size: int = 192
+    size: int = 16
 
 
 class Edge(NamedTuple):

@@ -61,7 +61,7 @@ def lost(ratio: float, size: int) -> dict[str, float]:
         x, y, _ = np.moveaxis(np.asarray(_above(ratio * cell, size).rays()[0]), -1, 0)
         sheet = (np.abs(x - TILT * y) < 0.45 * THICK) & (np.maximum(np.abs(x), np.abs(y)) < 1)
         wrong = np.abs(sheet_image(ratio * cell, size, method, cell) - truth).max(axis=-1) > LEVEL
-        found[f"{method}, R = {cell}"] = float(np.sum(wrong & sheet) / np.sum(sheet))
+        found[f"{method}, R = {cell}"] = float(np.sum(wrong & sheet) / max(np.sum(sheet), 1))
     return found
 
 
@@ -86,6 +86,7 @@ LOST = Entry(
     shows="a sheet seen edge-on before a wall, under \"min_distance\" with R = 16",
     pictured=(1.0, 0.5),
     scales=("log", "linear"),
+    size=96,
 )
 
 
@@ -131,7 +132,7 @@ STEEP = Entry(
     shows="the volume above 1/2, with leaping",
     pictured=(2.0**22, 1.0),
     scales=("log", "linear"),
-    size=96,
+    size=48,
 )
 
 

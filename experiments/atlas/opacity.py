@@ -310,7 +310,7 @@ TERMINATION = Entry(
     picture=termination_picture,
     shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
     pictured=(1e-4, 0.1),
-    size=64,
+    size=32,
 )
 
 ENTRIES = (OPAQUE, UNBOUNDED, GRAZING, AT_END, TERMINATION)

@@ -77,6 +77,7 @@ HAZE = Entry(
     picture=haze_picture,
     shows="error of EmptySpaceJitter, ± 0.05 from blue to red",
     scales=("linear", "log"),
+    size=96,
 )
 
 
@@ -134,6 +135,7 @@ CUT = Entry(
     "EmptySpaceJitter, rays on the face are not shifted before they leave the material, and it stays smooth.",
     picture=cut_face_picture,
     shows="the block under Jitter; its left half is the cut face",
+    size=64,
 )
 
 
@@ -187,6 +189,7 @@ LABELS = Entry(
     "the face, and the error is that of rounding.",
     picture=label_face_picture,
     shows="error of the opacity without labels=True, ± 0.2 from blue to red",
+    size=32,
 )
 
 
@@ -242,6 +245,7 @@ SHEETS = Entry(
     picture=sheet_picture,
     shows="opacity of the sheet under Jitter",
     scales=("log", "linear"),
+    size=64,
 )
 
 
@@ -293,6 +297,7 @@ OFFSETS = Entry(
     shows="error of the opacity under Jitter without front residual, ± 0.05 from blue to red",
     pictured=(1.0, 2.0**-24),
     scales=("log", "log"),
+    size=16,
 )
 
 ENTRIES = (HAZE, CUT, LABELS, SHEETS, OFFSETS)
