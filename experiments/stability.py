@@ -1,13 +1,13 @@
 """In which regimes do the methods of jaxvol fail, and what does jaxvol do there?
 
-The failure atlas. An entry (`experiments.atlas`) names a method, sweeps one regime from harmless to harmful, and
-measures an error. Its edge lies between the last value at which the error is within a stated limit and the first
-at which it is not. What jaxvol does beyond: *bounded*, the error cannot occur, so there is no edge in the sweep;
-*detected and said*, an error, a warning or an output of the rendering says so; *documented*, a docstring states
-it; *fails*, none of these.
+The failure atlas. An entry (`experiments.atlas`) names a method, sweeps one regime from harmless to
+harmful, and measures an error. Its edge lies between the last value at which the error is within a stated
+limit and the first at which it is not. What jaxvol does beyond: *bounded*, the error cannot occur, so there
+is no edge in the sweep; *detected and said*, an error, a warning or an output of the rendering says so;
+*documented*, a docstring states it; *fails*, none of these.
 
-Besides the record (`stability.json`) and the chart (`stability.png`) this writes `stability.html`, a page with the
-question, the curve, the edge and pictures on both sides of it for each entry.
+Besides the record (`stability.json`) and the chart (`stability.png`) this writes `stability.html`, a page
+with the question, the curve, the edge and pictures on both sides of it for each entry.
 """
 
 import math
@@ -24,20 +24,22 @@ from .atlas.page import number, page
 from .common import plt
 
 
-PICTURE, SMALL = 192, 64
-"""Pixels along a side of pictures, in a full run and in a quick one."""
+PICTURE, SMALL = 96, 64
+"""Pixels along a side of pictures, in a full run and in a quick one. The page shows each pixel enlarged."""
 COLUMNS = 4
 OUTCOMES = {"bounded": "C2", "detected and said": "C0", "documented": "C1", "fails": "C3"}
 
 
 def chart(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
-    """Metric against regime, with the limit and the edge. What is not finite stands at the top, as a cross."""
+    """Metric against regime, with the limit and the edge. Crosses at the top: not finite."""
     values = found["values"]
     known = [v for curve in found["curves"].values() for v in curve if math.isfinite(v) and v > 0]
     top = 2 * max([entry.limit, *known])
     for name, curve in found["curves"].items():
         style = "k-" if name == entry.judged else "-"
-        (line,) = panel.plot(values, curve, style, marker=".", label=name, linewidth=1.4 if style == "k-" else 1)
+        (line,) = panel.plot(
+            values, curve, style, marker=".", label=name, linewidth=1.4 if style == "k-" else 1
+        )
         lost = [v for v, number in zip(values, curve, strict=True) if not math.isfinite(number)]
         panel.plot(lost, [top] * len(lost), "x", color=line.get_color())
     _scale(panel.set_xscale, entry.scales[0], values)
@@ -79,7 +81,9 @@ def draw(result: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
     handles = [plt.Rectangle((0, 0), 1, 1, color=color, alpha=0.35) for color in OUTCOMES.values()]
     labels = [f"edge; beyond it: {outcome}" for outcome in OUTCOMES if outcome != "bounded"]
     figure.legend(handles[1:], labels, loc="outside lower center", ncols=3, fontsize=8)
-    figure.suptitle("Black: the curve that finds the edge. Dashed: the limit. Crosses: not finite.", fontsize=9)
+    figure.suptitle(
+        "Black: the curve that finds the edge. Dashed: the limit. Crosses: not finite.", fontsize=9
+    )
     common.save(figure, path)
     families = {family: [e for e in row if e.name in entries] for family, row in FAMILIES.items()}
     path.with_suffix(".html").write_text(page(families, entries, pictures, chart), encoding="utf-8")
@@ -102,7 +106,9 @@ def main(chosen: Namespace) -> common.Answer:
         values = [entry.values[0], entry.values[-1]] if chosen.quick else None
         found = sweep(entry, entry.size, values)
         pictures[name] = {value: entry.picture(value, size) for value in pictured(entry, found)}
-        about = {key: getattr(entry, key) for key in ("question", "method", "regime", "metric", "judged", "limit")}
+        about = {
+            key: getattr(entry, key) for key in ("question", "method", "regime", "metric", "judged", "limit")
+        }
         entries[name] = {**about, **found, "outcome": entry.outcome, "does": entry.does, "size": entry.size}
         within, beyond = (number(found["edge"][side]) for side in ("within", "beyond"))
         print(f"{name:40} {entry.outcome:18} within {within}, beyond {beyond} ({entry.regime})", flush=True)

@@ -4,10 +4,9 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 
-from experiments import atlas, record, stability
+from experiments import atlas, record
 from experiments.atlas.entry import Edge, edge, sweep
 from experiments.atlas.page import method
 
@@ -26,8 +25,7 @@ class Pin(NamedTuple):
     size: int = 64
 
 
-PINS = {
-}
+PINS = {}
 
 SLOW: set[str] = set()
 """Entries whose programs take long to compile or to run."""

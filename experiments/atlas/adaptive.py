@@ -1,4 +1,4 @@
-"""Where do adaptive strides fail? Tolerances finer than the finest cell, light, and what no cell is short enough for."""
+"""Where do adaptive strides fail? Tolerances finer than the finest cell, and light."""
 
 from functools import cache
 
@@ -60,8 +60,8 @@ TOLERANCE = Entry(
     judged="finest=1",
     limit=1.0,
     outcome="documented",
-    does="No cell is shorter than step / finest: below the error of an image of such cells the tolerance means nothing. "
-    "A larger finest moves the edge.",
+    does="No cell is shorter than step / finest: below the error of an image of such cells the tolerance "
+    "means nothing. A larger finest moves the edge.",
     picture=tolerance_picture,
     shows="error of the image with finest=1, ± 0.05 from blue to red",
     pictured=(0.1, 1e-3),
@@ -72,11 +72,15 @@ TOLERANCE = Entry(
 # -- light ------------------------------------------------------------------------------------------------
 
 
-def lit_image(size: int, path: float, *, transform: jv.Transform | None, lit: bool, finer: int = 1) -> np.ndarray:
+def lit_image(
+    size: int, path: float, *, transform: jv.Transform | None, lit: bool, finer: int = 1
+) -> np.ndarray:
     """A translucent cube of one value, lit from the side by templates of this mean free path."""
     light = DirectionalLight((1.0, 0.3, 0.2), (3.0, 3.0, 3.0))
     material = jv.Material(0.3, path)
-    lighting = ScattererTemplates(material, light, templates=1, packets=2, photons=6, levels=3) if lit else None
+    lighting = (
+        ScattererTemplates(material, light, templates=1, packets=2, photons=6, levels=3) if lit else None
+    )
     camera = jv.Camera.looking_at(cube(32), (0.4, -1.0, 0.5), size=(size, size)).zoom(1.3)
     transforms = (jv.AlphaCorrection(),) if transform is None else (jv.AlphaCorrection(), transform)
     march = jv.March(1 / 32 / finer, transforms, "midpoint")
@@ -120,9 +124,9 @@ LIGHT = Entry(
     judged="lit",
     limit=1.0,
     outcome="documented",
-    does="Strides follow from values and transfer function alone, so that in a cube of one value all cells are as long as "
-    "allowed, whatever the tolerance: without light that is exact, with light it is not. Rendering.error does not count "
-    "it.",
+    does="Strides follow from values and transfer function alone, so that in a cube of one value all cells "
+    "are as long as allowed, whatever the tolerance: without light that is exact, with light it is "
+    "not. Rendering.error does not count it.",
     picture=lambda tolerance, size: light_picture(tolerance, size // 2),
     shows="error of a lit cube of one value, over the tolerance",
     size=24,

@@ -1,4 +1,4 @@
-"""What is an entry of the failure atlas? A regime that is swept until a method fails, and what is measured there."""
+"""What is an entry of the failure atlas? A regime, swept until a method fails, and what is measured there."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple

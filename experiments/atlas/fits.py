@@ -26,7 +26,7 @@ def _waves() -> jv.Volume:
 
 
 def transfer(beyond: int, extinction: float = 1.0) -> jv.TransferFunction:
-    """Five control points, of which the last so many lie beyond all values of the volume and their neighbour."""
+    """Five control points, the last of which (so many) lie beyond all values of the volume."""
     inside = np.linspace(0, 1, POINTS - beyond)
     values = np.concatenate([inside, 1.5 + np.arange(beyond)])
     return jv.TransferFunction(values.astype(np.float32), TRUTH, np.full(POINTS, extinction, np.float32))
@@ -81,8 +81,8 @@ UNDETERMINED = Entry(
     judged="undetermined",
     limit=0.0,
     outcome="detected and said",
-    does="A warning names the parameters that the images do not determine, and their standard errors are infinite. All "
-    "others are fitted as if these were not there.",
+    does="A warning names the parameters that the images do not determine, and their standard errors are "
+    "infinite. All others are fitted as if these were not there.",
     picture=lambda beyond, size: image(transfer(int(beyond)), size),
     shows="the image that is fitted",
     said="warning",
@@ -115,8 +115,9 @@ STARTS = Entry(
     judged="RMSE after 30 steps",
     limit=0.001,
     outcome="documented",
-    does="A ray that is opaque from its first cell on shows nothing of what lies behind, and has no gradient by it: the fit "
-    "ends in another minimum, or stalls. Start transparent, as jv.flat_grey does.",
+    does="A ray that is opaque from its first cell on shows nothing of what lies behind, and has no "
+    "gradient by it: the fit ends in another minimum, or stalls. Start transparent, as jv.flat_grey "
+    "does.",
     picture=start_picture,
     shows="the image at the start of the fit; that of the truth is the first one",
     pictured=(1.0, 1000.0),
@@ -136,7 +137,9 @@ def noisy(deviation: float, size: int) -> dict[str, float]:
     exact = np.concatenate([np.ravel(start.colors), np.ravel(start.extinction)])
     seen = np.concatenate([np.ravel(found.parameters.colors), np.ravel(found.parameters.extinction)])
     errors = found.uncertainty.standard_errors
-    said = np.array([error for name in (".colors", ".extinction") for key, error in errors.items() if name in key])
+    said = np.array(
+        [error for name in (".colors", ".extinction") for key, error in errors.items() if name in key]
+    )
     stated = float(np.sqrt(np.mean(said**2)))
     return {
         "error": float(np.sqrt(np.mean((seen - exact) ** 2))),
@@ -161,8 +164,9 @@ NOISE = Entry(
     judged="error",
     limit=WRONG,
     outcome="detected and said",
-    does="Fit.uncertainty gives the standard error of each number, to first order in the noise; it is infinite, and a "
-    "warning says so, where a colour that reaches 0 or 1 no longer depends on its free variable.",
+    does="Fit.uncertainty gives the standard error of each number, to first order in the noise; it is "
+    "infinite, and a warning says so, where a colour that reaches 0 or 1 no longer depends on its "
+    "free variable.",
     picture=noisy_picture,
     shows="the image that is fitted",
     said="stated to be beyond",

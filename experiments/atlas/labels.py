@@ -24,7 +24,9 @@ def _opacities(origins: Array, angle: Array, contrast: Array, *, cut: bool, adjo
     directions = jnp.broadcast_to(jnp.stack([jnp.sin(angle), 0 * angle, jnp.cos(angle)]), origins.shape)
     march = jv.March(0.13, (jv.AlphaCorrection(labels=cut),))
     transfer = jv.LabelTransferFunction(functions)
-    rendering = jv.render_rays(halves(), transfer, origins, directions, march, outputs="rgba", adjoint=adjoint)
+    rendering = jv.render_rays(
+        halves(), transfer, origins, directions, march, outputs="rgba", adjoint=adjoint
+    )
     return rendering.rgba[..., 3]
 
 
@@ -76,8 +78,8 @@ FACES = Entry(
     judged="AlphaCorrection(labels=True)",
     limit=0.1,
     outcome="documented",
-    does="Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the exit. Finite "
-    "differences of the same image, whose cells are cut at the face, are right.",
+    does="Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the "
+    "exit. Finite differences of the same image, whose cells are cut at the face, are right.",
     picture=face_picture,
     shows="relative error of the derivative by the angle, ± 1 from blue to red",
     scales=("linear", "log"),

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, grey, signed
+from .entry import Entry, colors, grey
 
 
 LEVEL = 1 / 255
@@ -32,7 +32,9 @@ def _sheet_and_wall() -> jv.Volume:
     x, y, z = np.meshgrid(line, line, line, indexing="ij", sparse=True)
     # 0.2 at the faces, with a slope of one per voxel
     sheet = np.clip(0.2 + (THICK / 2 - np.abs(x - TILT * y)) / SPACING, 0, 1) * ((z > -0.6) & (z < -0.2))
-    return jv.Volume(np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)).astype(np.float32), [SPACING] * 3, [-1.0] * 3)
+    return jv.Volume(
+        np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)).astype(np.float32), [SPACING] * 3, [-1.0] * 3
+    )
 
 
 def sheet_image(width: float, size: int, method: str | None, cell: int = 8) -> np.ndarray:
@@ -71,7 +73,8 @@ def lost_picture(ratio: float, size: int) -> np.ndarray:
 
 LOST = Entry(
     name="sheets thinner than a cell of rays",
-    question="How wide must a structure be, in the image, for a minimum-distance grid with cells of R pixels to see it?",
+    question="How wide must a structure be, in the image, for a minimum-distance grid with cells of R pixels "
+    "to see it?",
     method="jaxvol.SpaceLeaping",
     regime="width of the sheet in pixels / R",
     values=(2.0, 1.5, 1.2, 1.0, 0.9, 0.75, 0.5, 0.25, 0.125),
@@ -80,10 +83,11 @@ LOST = Entry(
     judged="min_distance, R = 16",
     limit=0.001,
     outcome="documented",
-    does="Under \"min_distance\", a sheet that passes between the corners of a cell is leapt over. Choose R no larger than "
-    "the thinnest structure is wide, in pixels, or take \"beam\" or \"hierarchy\", which lose nothing.",
+    does='Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R '
+    'no larger than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which '
+    "lose nothing.",
     picture=lost_picture,
-    shows="a sheet seen edge-on before a wall, under \"min_distance\" with R = 16",
+    shows='a sheet seen edge-on before a wall, under "min_distance" with R = 16',
     pictured=(1.0, 0.5),
     scales=("log", "linear"),
     size=96,
@@ -127,7 +131,8 @@ STEEP = Entry(
     judged="visible above 1/2",
     limit=1e-6,
     outcome="bounded",
-    does="Ranges of blocks are widened by the rounding of interpolation, so that what is called empty is empty.",
+    does="Ranges of blocks are widened by the rounding of interpolation, so that what is called empty is "
+    "empty.",
     picture=lambda ramp, size: steep_image(ramp, size, 0.5, leaps=True),
     shows="the volume above 1/2, with leaping",
     pictured=(2.0**22, 1.0),
@@ -148,7 +153,9 @@ def _gradients(volume: jv.Volume, camera: jv.Camera, extinction: Array) -> tuple
         levels = jnp.stack([extinction, extinction, jnp.full_like(extinction, 3.0)])
         transfer = jv.TransferFunction([0.0, 0.3, 1.0], np.ones((3, 3)), levels)
         march = jv.March(0.1, (*leaps, jv.AlphaCorrection()), max_samples=64)
-        return jnp.sum(jv.render(volume, transfer, camera, march, outputs="rgba", adjoint=adjoint).rgba[..., 3])
+        return jnp.sum(
+            jv.render(volume, transfer, camera, march, outputs="rgba", adjoint=adjoint).rgba[..., 3]
+        )
 
     slope = jax.grad(loss)
     return slope(extinction, (jv.SpaceLeaping(),), "replay"), slope(extinction, (), "direct")
@@ -190,8 +197,9 @@ LEAPT = Entry(
     judged="SpaceLeaping",
     limit=0.05,
     outcome="documented",
-    does="What has any extinction above 0 is marched and has its gradient; what has none is leapt over and has none, "
-    "although it would. A fit that should make invisible regions visible must start above 0, or not leap.",
+    does="What has any extinction above 0 is marched and has its gradient; what has none is leapt over and "
+    "has none, although it would. A fit that should make invisible regions visible must start above "
+    "0, or not leap.",
     picture=leapt_picture,
     shows="derivative of each pixel by the extinction around a sphere; white is 3",
     scales=("symlog", "linear"),

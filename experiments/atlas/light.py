@@ -1,4 +1,4 @@
-"""Where do scatterer templates fail? Energy as printed, few packets, mean free paths far from an object's size."""
+"""Where do scatterer templates fail? Printed energy, few packets, mean free paths far from an object's size."""
 
 from functools import cache
 
@@ -63,8 +63,8 @@ ENERGY = Entry(
     judged="printed, without flights",
     limit=1.0,
     outcome="documented",
-    does="The paper's equations (1) to (3), to the letter, pass on α I where (1 - α) I is left: without the factors of "
-    "flight, energy grows as α / (1 - α). The default, energy=\"conserving\", never exceeds 1.",
+    does="Equations (1) to (3) of the paper, to the letter, pass on α I where (1 - α) I is left: without the "
+    "factors of flight, energy grows as α / (1 - α). The default form, conserving, never exceeds 1.",
     picture=energy_picture,
     shows="photons of a template of the printed form, by intensity, ± 4 mean free paths",
     pictured=(0.45, 0.8),
@@ -78,7 +78,9 @@ ENERGY = Entry(
 def lopsided(packets: float, size: int) -> dict[str, float]:
     templates = scatterer_templates(jv.Material(0.4, 1.0), 0, count=32, packets=int(packets))
     light = np.asarray(templates.intensity, np.float64)
-    middle = np.einsum("mtn,mtnk->mtk", light, np.asarray(templates.offset)) / light.sum(axis=-1, keepdims=True)
+    middle = np.einsum("mtn,mtnk->mtk", light, np.asarray(templates.offset)) / light.sum(
+        axis=-1, keepdims=True
+    )
     return {
         "one template": float(np.mean(np.linalg.norm(middle, axis=-1))),
         "blend of 32": float(np.linalg.norm(middle.mean(axis=1))),
@@ -100,8 +102,9 @@ LOPSIDED = Entry(
     judged="one template",
     limit=1.0,
     outcome="documented",
-    does="One packet goes one way, and so does all that comes of it. By default there are four, spread evenly, which still "
-    "lean by 0.6 mean free paths at an opacity of 0.4; blending templates takes off most of that.",
+    does="One packet goes one way, and so does all that comes of it. By default there are four, spread "
+    "evenly, which still lean by 0.6 mean free paths at an opacity of 0.4; blending templates takes "
+    "off most of that.",
     picture=lopsided_picture,
     shows="photons of one template, by intensity, ± 4 mean free paths",
     pictured=(4.0, 1.0),
@@ -130,7 +133,9 @@ def ball(ratio: float, size: int, *, traced: bool, paths: int = 32) -> np.ndarra
     camera = jv.Camera((0.0, -4.0, 1.0), (0, 0, 0), (0, 0, 1), 26, size=(size, size))
     transfer = jv.TransferFunction([0.4, 0.6], [WHITE, WHITE], [0.0, 1 / path])
     if traced:
-        image = jv.path_trace(_ball(), transfer, camera, LIGHTS, paths=paths, key=0, materials=material).radiance
+        image = jv.path_trace(
+            _ball(), transfer, camera, LIGHTS, paths=paths, key=0, materials=material
+        ).radiance
         return np.asarray(image, np.float64)
     lighting = ScattererTemplates(material, LIGHTS, templates=2, photons=16, levels=4, blend=True)
     march = jv.March(1 / 24, (jv.AlphaCorrection(),), "midpoint")
@@ -157,7 +162,8 @@ def ball_picture(ratio: float, size: int) -> np.ndarray:
 
 LONG = Entry(
     name="long mean free paths",
-    question="How long may a mean free path be, against an object, for templates to light it as path tracing does?",
+    question="How long may a mean free path be, against an object, for templates to light it as path tracing "
+    "does?",
     method="jaxvol.lighting.ScattererTemplates",
     regime="mean free path / diameter of a ball",
     values=(0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0),
@@ -166,8 +172,9 @@ LONG = Entry(
     judged="pixels, scaled alike",
     limit=0.25,
     outcome="documented",
-    does="The sum of all radiance stays near that of path tracing. But photons of a template lie outside a ball that is thin "
-    "against the mean free path, on all sides alike, so that its lit side is no longer where it was.",
+    does="The sum of all radiance stays near that of path tracing. But photons of a template lie outside a "
+    "ball that is thin against the mean free path, on all sides alike, so that its lit side is no "
+    "longer where it was.",
     picture=ball_picture,
     shows="templates, and path tracing beside them, as bright as the brighter of both in the latter",
     size=24,
@@ -175,7 +182,8 @@ LONG = Entry(
 
 SHORT = Entry(
     name="short mean free paths",
-    question="How short may a mean free path be, against an object, for templates to be as bright as path tracing is?",
+    question="How short may a mean free path be, against an object, for templates to be as bright as path "
+    "tracing is?",
     method="jaxvol.lighting.ScattererTemplates",
     regime="mean free path / diameter of a ball",
     values=(1.0, 0.5, 0.2, 0.1, 0.05, 0.03),
@@ -184,8 +192,9 @@ SHORT = Entry(
     judged="total radiance",
     limit=0.35,
     outcome="documented",
-    does="A sphere of white matter is too dark by a quarter to a third, once it is several mean free paths thick: the "
-    "template of a sample near a curved face has more photons outside than on the flat one that set its scale.",
+    does="A sphere of white matter is too dark by a quarter to a third, once it is several mean free paths "
+    "thick: the template of a sample near a curved face has more photons outside than on the flat one "
+    "that set its scale.",
     picture=ball_picture,
     shows="templates, and path tracing beside them, as bright as the brighter of both in the latter",
     size=24,

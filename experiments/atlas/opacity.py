@@ -1,4 +1,4 @@
-"""Where does accumulating opacity fail? Opaque cells, extinction without bound, short cells, early termination."""
+"""Where does accumulating opacity fail? Opaque rays, great extinction, short cells, early termination."""
 
 from functools import cache
 
@@ -71,8 +71,9 @@ OPAQUE = Entry(
     judged="gradient, relative",
     limit=0.1,
     outcome="documented",
-    does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 cannot tell from 0 "
-    "beside an opacity that rounds to 1: a fit that starts this opaque does not move.",
+    does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 "
+    "cannot tell from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not "
+    "move.",
     picture=lambda depth, size: ball_picture(depth, size),
     shows="a ball of this extinction per unit length, radius 1/2",
     scales=("linear", "log"),
@@ -113,8 +114,8 @@ UNBOUNDED = Entry(
     judged="not finite",
     limit=0.0,
     outcome="bounded",
-    does="Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to voxels, "
-    "camera and extinction are finite up to the largest float32.",
+    does="Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to "
+    "voxels, camera and extinction are finite up to the largest float32.",
     picture=ball_picture,
     shows="a ball of this extinction: beyond one opaque cell, its colour no longer changes",
     pictured=(1.0, 1e38),
@@ -157,7 +158,9 @@ def grazing_picture(length: float, size: int) -> np.ndarray:
     origins = np.stack(np.broadcast_arrays(x[None, :], np.float32(-1.5), z[:, None]), axis=-1)
     directions = np.broadcast_to(np.array([1, 1, 0], np.float32), origins.shape)
     march = jv.March(0.25, ALIGNED)
-    rgba = jv.render_rays(cube(), uniform(1.0), origins, directions, march, outputs="rgba", adjoint="forward").rgba
+    rgba = jv.render_rays(
+        cube(), uniform(1.0), origins, directions, march, outputs="rgba", adjoint="forward"
+    ).rgba
     return grey(np.asarray(rgba[..., 3]) / -np.expm1(-length))
 
 
@@ -172,11 +175,12 @@ GRAZING = Entry(
     judged="opacity",
     limit=1e-6,
     outcome="bounded",
-    does="The width of the cut cell is a difference of two distances, so its error is that of rounding them, however "
-    "short it is: some 1e-7 of the volume's size. The relative error of a nearly transparent pixel grows, that of the "
-    "gradient does not.",
+    does="The width of the cut cell is a difference of two distances, so its error is that of rounding "
+    "them, however short it is: some 1e-7 of the volume's size. The relative error of a nearly "
+    "transparent pixel grows, that of the gradient does not.",
     picture=grazing_picture,
-    shows="opacity of a window of this width at an edge of the cube, relative to its largest: exact, it is an even ramp",
+    shows="opacity of a window of this width at an edge of the cube, relative to its largest: exact, it is "
+    "an even ramp",
     pictured=(1e-2, 2e-6),
 )
 
@@ -233,12 +237,13 @@ AT_END = Entry(
     judged="gradient, relative",
     limit=0.01,
     outcome="fails",
-    does="The gradient is exact for any e above 0. Where the exit lies exactly at the end of a cell, the last cell is not "
-    "cut and the one behind it is not marched, so that neither has a derivative: the gradient by the exit is 0. This "
-    "takes a ray whose length is a whole number of steps, as of an orthographic view along an axis with steps of one "
-    "voxel. The image is right.",
+    does="The gradient is exact for any e above 0. Where the exit lies exactly at the end of a cell, the "
+    "last cell is not cut and the one behind it is not marched, so that neither has a derivative: the "
+    "gradient by the exit is 0. This takes a ray whose length is a whole number of steps, as of an "
+    "orthographic view along an axis with steps of one voxel. The image is right.",
     picture=at_end_picture,
-    shows="derivative of each pixel by the spacing, seen along z: it should be the same everywhere on the cube",
+    shows="derivative of each pixel by the spacing, seen along z: it should be the same everywhere on the "
+    "cube",
     pictured=(0.5, 0.0),
     scales=("symlog", "log"),
 )
@@ -305,8 +310,9 @@ TERMINATION = Entry(
     judged="opaque: gradient",
     limit=0.05,
     outcome="documented",
-    does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T log(1/T) of "
-    "every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or none.",
+    does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T "
+    "log(1/T) of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or "
+    "none.",
     picture=termination_picture,
     shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
     pictured=(1e-4, 0.1),

@@ -29,11 +29,11 @@ table { border-collapse: collapse; font-size: 0.85rem } td, th { padding: 0.15re
 tr:nth-child(even) { background: #f3f3f3 } .done { font-weight: bold }
 """
 INTRODUCTION = """
-Each entry sweeps one regime from harmless to harmful and measures an error. The edge lies between the last value
-at which the error is within the stated limit (dashed) and the first at which it is not; the curve that decides is
-black. Beyond the edge the failure is <b>detected and said</b> by an error, a warning or an output of the
-rendering, <b>documented</b> in a docstring, or none of these: it <b>fails</b>. <b>Bounded</b> means that the failure
-does not occur anywhere in the sweep.
+Each entry sweeps one regime from harmless to harmful and measures an error. The edge lies between the last
+value at which the error is within the stated limit (dashed) and the first at which it is not; the curve
+that decides is black. Beyond the edge the failure is <b>detected and said</b> by an error, a warning or an
+output of the rendering, <b>documented</b> in a docstring, or none of these: it <b>fails</b>. <b>Bounded</b>
+means that the failure does not occur anywhere in the sweep.
 """
 
 Chart = Callable[[Any, Entry, dict[str, Any]], None]
@@ -52,7 +52,11 @@ def page(
             body.append(f"<h2>{html.escape(family)}</h2>")
         body += [_entry(e, found[e.name], pictures[e.name], chart) for e in entries]
     head = f'<meta charset="utf-8"><title>jaxvol: failure atlas</title><style>{STYLE}</style>'
-    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(body) + "\n</body></html>\n"
+    return (
+        f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n'
+        + "\n".join(body)
+        + "\n</body></html>\n"
+    )
 
 
 def number(value: float | None) -> str:
@@ -93,7 +97,8 @@ def _entry(entry: Entry, found: dict[str, Any], pictures: dict[float, np.ndarray
         f"Limit: {number(entry.limit)} ({html.escape(entry.metric)}).</p>\n"
         f"<p>{_outcome(entry)}: {html.escape(entry.does)} "
         f'See the docstring of <a href="{SOURCES}{source}">{name}</a>.</p>\n'
-        f'<div class="parts"><figure><img src="{_chart(entry, found, chart)}" alt="curve"></figure>{figures}</div>\n'
+        f'<div class="parts"><figure><img src="{_chart(entry, found, chart)}" alt="curve"></figure>'
+        f"{figures}</div>\n"
         f"<p><small>Pictures: {html.escape(entry.shows)}.</small></p>"
     )
 

@@ -62,9 +62,9 @@ HALVES = Entry(
     judged="bfloat16",
     limit=1 / 255,
     outcome="documented",
-    does="A voxel keeps its type: 8 significant bits in bfloat16, 11 in float16, so that values around 1000 (CT in "
-    "Hounsfield units + 1000) are rounded to multiples of 4 and of 0.5. float16 ends at 65504, and Volume refuses what "
-    "is infinite (crosses). Integers of 16 bits keep all of it.",
+    does="A voxel keeps its type: 8 significant bits in bfloat16, 11 in float16, so that values around "
+    "1000 (CT in Hounsfield units + 1000) are rounded to multiples of 4 and of 0.5. float16 ends at "
+    "65504, and Volume refuses what is infinite (crosses). Integers of 16 bits keep all of it.",
     picture=lambda offset, size: stored(offset, size, jnp.bfloat16),
     shows="the head phantom stored as bfloat16",
     pictured=(0.0, 3000.0),
@@ -126,8 +126,9 @@ LONG = Entry(
     judged="float32",
     limit=1 / 255 / 10,
     outcome="bounded",
-    does="Depths are counted in steps, not summed, so the ten-thousandth sample is as exact as the first. Opacity is "
-    "accumulated in float32; its rounding errors grow more slowly than the number of samples.",
+    does="Depths are counted in steps, not summed, so the ten-thousandth sample is as exact as the first. "
+    "Opacity is accumulated in float32; its rounding errors grow more slowly than the number of "
+    "samples.",
     picture=long_picture,
     shows="error of the opacity of a cube, ± 1e-6 from blue to red",
     pictured=(30.0, 1e3),

@@ -32,13 +32,19 @@ def probe(a: float, b: float, depth: float) -> jv.ToroidalMap:
 
 @jax.jit
 def _through_gap(height: Array, steps: Array) -> Array:
-    """Lengths of rays within the sector, as the march sees them. The rays run along x, each by a step of its own."""
+    """Lengths of rays along x within the sector, as the march sees them, each by a step of its own."""
 
     def one(step: Array) -> Array:
         origin = jnp.stack([jnp.full_like(height, -200.0), jnp.zeros_like(height), height])[None]
         march = jv.March(step, (probe(A, B, 100.0), jv.AlphaCorrection()))
         rendering = jv.render_rays(
-            ones(), uniform(EXTINCTION), origin, jnp.array([[1.0, 0.0, 0.0]]), march, outputs="rgba", adjoint="forward"
+            ones(),
+            uniform(EXTINCTION),
+            origin,
+            jnp.array([[1.0, 0.0, 0.0]]),
+            march,
+            outputs="rgba",
+            adjoint="forward",
         )
         return -jnp.log1p(-rendering.rgba[0, 3]) / EXTINCTION
 
@@ -49,10 +55,15 @@ def gap(ratio: float, size: int) -> dict[str, float]:
     """`ratio`: length of the gap in steps. Rays differ in where the gap lies between samples."""
     steps = np.linspace(0.9 * STEP, 1.1 * STEP, 24).astype(np.float32)
     gap = ratio * STEP
-    height = np.sqrt(B**2 - (gap / 2) ** 2)  # above the apex, where the hollow near side cuts a chord this long
+    height = np.sqrt(
+        B**2 - (gap / 2) ** 2
+    )  # above the apex, where the hollow near side cuts a chord this long
     length = 2 * height * math.tan(FAN) - gap
     seen = np.asarray(_through_gap(jnp.asarray(A + height, jnp.float32), jnp.asarray(steps)), np.float64)
-    return {"share of the gap": float(np.mean((seen - length) / gap)), "rays": float(np.mean(seen - length > gap / 2))}
+    return {
+        "share of the gap": float(np.mean((seen - length) / gap)),
+        "rays": float(np.mean(seen - length > gap / 2)),
+    }
 
 
 def gap_picture(ratio: float, size: int) -> np.ndarray:
@@ -86,11 +97,11 @@ GAPS = Entry(
     judged="share of the gap",
     limit=0.05,
     outcome="documented",
-    does="AlphaCorrection looks at four depths of each cell, and bisects where the region changes: a gap of a quarter of "
-    "a step or more is cut out exactly, a shorter one may be missed.",
+    does="AlphaCorrection looks at four depths of each cell, and bisects where the region changes: a gap "
+    "of a quarter of a step or more is cut out exactly, a shorter one may be missed.",
     picture=gap_picture,
-    shows="error of the length inside the sector over the length of the gap, rows by step, columns by gap, from half to "
-    "1.5 times the stated length; red: missed",
+    shows="error of the length inside the sector over the length of the gap, rows by step, columns by gap, "
+    "from half to 1.5 times the stated length; red: missed",
     scales=("log", "linear"),
 )
 
@@ -133,7 +144,7 @@ def _length(origin: np.ndarray, direction: np.ndarray) -> float:
 def near_axis(offset: float, size: int) -> dict[str, float]:
     opacity, gradient = _near_axis(jnp.asarray(offset, jnp.float32))
     exact = [
-        -np.expm1(-EXTINCTION * _length(np.array(o) + [0, offset, 0], np.array(d)))
+        -np.expm1(-EXTINCTION * _length(np.add(o, (0, offset, 0)), np.array(d)))
         for o, d in (
             ((0.0, 0.0, -60.0), (0.0, 0.0, 1.0)),
             ((0.0, -60.0, -80.0), (0.0, 0.6, 0.8)),
@@ -168,8 +179,8 @@ AXIS = Entry(
     judged="opacity",
     limit=2e-4,
     outcome="bounded",
-    does="On the axis and at the apex, where an angle has no gradient, it is taken as 0. Image and gradients with respect "
-    "to probe, voxels and rays are finite.",
+    does="On the axis and at the apex, where an angle has no gradient, it is taken as 0. Image and "
+    "gradients with respect to probe, voxels and rays are finite.",
     picture=near_axis_picture,
     shows="opacity of a window of this width around the axis, seen along z",
     pictured=(80.0, 1e-3),

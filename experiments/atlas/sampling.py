@@ -1,4 +1,4 @@
-"""Where do jitters fail? Rays without an empty sample, cut faces, label faces, thin sheets, offsets near 1."""
+"""Where do jitters fail? Rays without an empty sample, faces, thin sheets, offsets near 1."""
 
 from functools import cache
 
@@ -43,7 +43,11 @@ def hazy(share: float, size: int, jitter: str) -> np.ndarray:
     if jitter == "converged":
         march = jv.March(STEP / 12, (jv.AlphaCorrection(), jv.EarlyTermination(1e-6)), "midpoint")
     else:
-        kinds = {"ray casting": (), "Jitter": (jv.Jitter(SEED),), "EmptySpaceJitter": (jv.EmptySpaceJitter(SEED),)}
+        kinds = {
+            "ray casting": (),
+            "Jitter": (jv.Jitter(SEED),),
+            "EmptySpaceJitter": (jv.EmptySpaceJitter(SEED),),
+        }
         march = jv.March(STEP, (*kinds[jitter], jv.AlphaCorrection()))
     return colors(volume, transfer, camera, march)
 
@@ -72,8 +76,8 @@ HAZE = Entry(
     judged="EmptySpaceJitter",
     limit=0.1,
     outcome="documented",
-    does="A ray that meets no transparent sample is not shifted: the wood grain that is left is the share of such rays. "
-    "Jitter breaks it there, too.",
+    does="A ray that meets no transparent sample is not shifted: the wood grain that is left is the share "
+    "of such rays. Jitter breaks it there, too.",
     picture=haze_picture,
     shows="error of EmptySpaceJitter, ± 0.05 from blue to red",
     scales=("linear", "log"),
@@ -166,7 +170,9 @@ FAR = 1 - np.exp(-1.125)
 def label_faces(depth: float, size: int) -> dict[str, float]:
     return {
         "AlphaCorrection()": float(np.std(label_face(depth, size, cut=False))),
-        "AlphaCorrection(labels=True)": float(np.sqrt(np.mean((label_face(depth, size, cut=True) - FAR) ** 2))),
+        "AlphaCorrection(labels=True)": float(
+            np.sqrt(np.mean((label_face(depth, size, cut=True) - FAR) ** 2))
+        ),
     }
 
 
@@ -185,8 +191,8 @@ LABELS = Entry(
     judged="AlphaCorrection()",
     limit=LEVEL,
     outcome="documented",
-    does="Without labels=True a structure is as thick as its whole cells, which jitter moves. With it, cells are cut at "
-    "the face, and the error is that of rounding.",
+    does="Without labels=True a structure is as thick as its whole cells, which jitter moves. With it, "
+    "cells are cut at the face, and the error is that of rounding.",
     picture=label_face_picture,
     shows="error of the opacity without labels=True, ± 0.2 from blue to red",
     size=32,
@@ -240,8 +246,9 @@ SHEETS = Entry(
     judged="Jitter",
     limit=0.001,
     outcome="documented",
-    does="A sheet thinner than a step is met by as many rays as it is thick, in steps: as bands without jitter, as "
-    "noise with it. No quadrature sees what lies between two samples alike; a shorter step does.",
+    does="A sheet thinner than a step is met by as many rays as it is thick, in steps: as bands without "
+    "jitter, as noise with it. No quadrature sees what lies between two samples alike; a shorter step "
+    "does.",
     picture=sheet_picture,
     shows="opacity of the sheet under Jitter",
     scales=("log", "linear"),
@@ -253,7 +260,7 @@ SHEETS = Entry(
 
 
 def offset_error(left: float, size: int, transform: jv.Transform) -> np.ndarray:
-    """Error of the opacity of a cube of optical depth 2, in steps of 1/4, at a jitter offset of 1 - `left`."""
+    """Error of the opacity of a cube of optical depth 2, by steps of 1/4, at the offset 1 - `left`."""
     offset = np.float32(1) - np.float32(left)
     camera = jv.Camera((0.1, 0.2, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.5)
     march = jv.March(0.25, (shift_of(transform, offset), jv.AlphaCorrection()))
@@ -291,8 +298,9 @@ OFFSETS = Entry(
     judged="Jitter, front residual",
     limit=1e-5,
     outcome="bounded",
-    does="Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells behind it always "
-    "cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ d.",
+    does="Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells "
+    "behind it always cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ "
+    "d.",
     picture=offset_picture,
     shows="error of the opacity under Jitter without front residual, ± 0.05 from blue to red",
     pictured=(1.0, 2.0**-24),
