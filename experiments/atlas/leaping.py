@@ -90,7 +90,7 @@ LOST = Entry(
     shows='a sheet seen edge-on before a wall, under "min_distance" with R = 16',
     pictured=(1.0, 0.5),
     scales=("log", "linear"),
-    size=96,
+    size=192,
 )
 
 

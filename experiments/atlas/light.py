@@ -1,4 +1,4 @@
-"""Where do scatterer templates fail? Printed energy, few packets, mean free paths far from an object's size."""
+"""Where do scatterer templates fail? Printed energy, few packets, long and short mean free paths."""
 
 from functools import cache
 
@@ -177,7 +177,7 @@ LONG = Entry(
     "longer where it was.",
     picture=ball_picture,
     shows="templates, and path tracing beside them, as bright as the brighter of both in the latter",
-    size=24,
+    size=48,
 )
 
 SHORT = Entry(
@@ -197,7 +197,7 @@ SHORT = Entry(
     "that set its scale.",
     picture=ball_picture,
     shows="templates, and path tracing beside them, as bright as the brighter of both in the latter",
-    size=24,
+    size=32,
 )
 
 ENTRIES = (ENERGY, LOPSIDED, LONG, SHORT)

@@ -69,7 +69,7 @@ HALVES = Entry(
     shows="the head phantom stored as bfloat16",
     pictured=(0.0, 3000.0),
     scales=("symlog", "log"),
-    size=48,
+    size=96,
 )
 
 
