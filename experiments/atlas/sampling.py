@@ -151,7 +151,8 @@ def halves(side: int = 9) -> jv.Volume:
     """Label 1 in the far half of the cube, 0 in the near one; the face between them lies at z = -1/8."""
     labels = np.zeros((side,) * 3, np.uint8)
     labels[:, :, side // 2 :] = 1
-    return jv.Volume(np.ones((side,) * 3, np.float32), [2 / (side - 1)] * 3, [-1.0] * 3, labels)
+    with jax.ensure_compile_time_eval():  # kept, although it may be made inside `jax.jit`
+        return jv.Volume(np.ones((side,) * 3, np.float32), [2 / (side - 1)] * 3, [-1.0] * 3, labels)
 
 
 def label_face(depth: float, size: int, *, cut: bool) -> np.ndarray:
