@@ -11,6 +11,7 @@ with the question, the curve, the edge and pictures on both sides of it for each
 """
 
 import math
+import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -52,7 +53,7 @@ def chart(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
         panel.axvspan(beyond if within is None else within, beyond, color=OUTCOMES[entry.outcome], alpha=0.35)
     panel.set_title(entry.name, fontsize=9)
     panel.set_xlabel(entry.regime, fontsize=7)
-    panel.set_ylabel(entry.metric, fontsize=7)
+    panel.set_ylabel(textwrap.fill(entry.metric, 36), fontsize=7)
     panel.tick_params(labelsize=7)
     panel.legend(fontsize=6, framealpha=0.7)
 
