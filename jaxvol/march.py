@@ -228,6 +228,10 @@ class March(eqx.Module):
       2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
       default 131 072, so that every march ends.
 
+    What is thinner than a step is missed by a part of the rays. Where a march fails, and where not:
+    `experiments/stability.py`, "sheets thinner than a step", "rays of very many samples",
+    "rays that run out of samples".
+
     **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
     transform, for a transform given twice, and for a `max_samples` that is no such integer.
     """

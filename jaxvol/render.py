@@ -70,6 +70,9 @@ def render(
     gradients, as a loop would. `"direct"` renders them side by side, and so does `"forward"` where the image
     is also differentiated, or compiled inside the `jax.vmap`.
 
+    In float32, the gradient by the extinction drowns in rounding along rays of optical depth above 14
+    (`experiments/stability.py`, "gradients of opaque rays").
+
     **Raises:** `ValueError`, naming the argument, for an argument of another kind (an array for a `Volume`, a
     camera in the march's place), for unknown outputs or an unknown adjoint, and for `"direct"` where the
     march or the spacing is traced and `march.max_samples` is not given. For `"auto"` where arrays are

@@ -202,6 +202,8 @@ class TransferFunction(Transfer):
 
     Put a step between values of the data rather than at one: interpolation may round a value to either side.
 
+    Where it fails, and where not: `experiments/stability.py`, "extinction without bound".
+
     **Raises:** `ValueError` for fewer than two points, points that do not increase or of which three are
     equal, negative extinction, NaN or infinity, or lengths that differ.
     """

@@ -49,6 +49,9 @@ class Volume(eqx.Module):
     - `field`: optional `Field` that supplies the values instead of the voxels; the voxel grid then only sets
       the volume's extent.
 
+    bfloat16 keeps 8 significant bits, float16 11: values around 1000 are rounded to multiples of 4 and of 0.5
+    (`experiments/stability.py`, "voxels of 16-bit floats").
+
     **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
     unsupported type, or hold NaN or infinity, even if only after conversion to float32; for integers that no
     type holds exactly; for spacing that is not positive; and for labels of another shape or type, or beyond

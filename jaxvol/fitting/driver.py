@@ -141,6 +141,10 @@ def fit(
     `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
     the residual does not determine.
 
+    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Where fits fail, and where
+    not: `experiments/stability.py`, "fits of what images do not show", "fits from opaque starts",
+    "fits under noise".
+
     **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
     residual that is not finite at the start, a checkpoint of another fit or of an earlier version, and one
     that cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.

@@ -131,6 +131,9 @@ class ScattererTemplates(Lighting):
     At points of extinction 0, the gradient of the extinction lacks the light that the points would show,
     since invisible points are not lit.
 
+    Where it fails, and where not: `experiments/stability.py`, "long mean free paths",
+    "short mean free paths".
+
     **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
     which no photon is above the threshold (if its opacity is traced, the image is NaN), and for templates or
     a grid that do not fit into memory.

@@ -136,6 +136,9 @@ def scatterer_template(
     free path, opacity and refractive index (at an index of 1, where the critical angle has no derivative,
     the derivative used is 0).
 
+    Where it fails, and where not: `experiments/stability.py`, "energy of templates as printed",
+    "lopsided templates".
+
     **Raises:** `ValueError` for numbers out of range, if `levels` are required but missing, for a tree that
     does not fit into memory, and if all photons are below the threshold. If the opacity is traced, the
     intensities are NaN in the last case.

@@ -80,6 +80,9 @@ class AdaptiveSampling(Transform):
     is `Rendering.error`; the image jumps where one changes. So compare gradients with finite differences
     without this transform, and search along lines with care.
 
+    Where it fails, and where not: `experiments/stability.py`, "tolerances finer than the finest cell",
+    "adaptive strides under light".
+
     **Raises:** `ValueError` for another tolerance, `longest` or `finest`.
 
     Source: unpublished.

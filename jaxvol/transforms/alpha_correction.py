@@ -52,6 +52,9 @@ class AlphaCorrection(Transform):
     Gradients treat the faces of labels and gaps as fixed in space: with respect to the camera, they miss
     how such a face moves along a ray. The motion of the exit is included.
 
+    Where it fails, and where not: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
+    "jitter at label faces", "gradients at label faces".
+
     **Raises:** `ValueError` when a volume without labels is rendered with `labels=True`.
 
     Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit. The cuts at faces

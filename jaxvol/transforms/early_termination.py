@@ -27,6 +27,8 @@ class EarlyTermination(Transform):
 
     - `opacity_left`: in (0, 1); 1/255 is one level of an 8-bit image.
 
+    Where it fails, and where not: `experiments/stability.py`, "early termination in gradients".
+
     **Raises:** `ValueError` outside that range.
 
     Source: KISTI report 2005, which tests once per 16 slices, since testing every slice cost more than it

@@ -68,6 +68,8 @@ class Jitter(Transform):
     - `front_residual`: give the part that is left out a narrow cell of its own, from the entry to ξ d,
       sampled at the entry. The noise on cut faces then falls to that of the sample's value.
 
+    Where it fails, and where not: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
+
     **Raises:** `ValueError` for an invalid seed or pattern.
 
     Source: jittered sampling as in Kye 2013, section 2.2.
@@ -108,6 +110,8 @@ class EmptySpaceJitter(Transform):
     The image jumps where a ray's first transparent sample changes; gradients do not include these jumps.
 
     **Arguments:** `seed`, `pattern`: as in `Jitter`; the random numbers are independent of `Jitter`'s.
+
+    Where it fails, and where not: `experiments/stability.py`, "wood grain without empty samples".
 
     Source: Kye 2013, section 3.1.
     """

@@ -59,6 +59,9 @@ class SpaceLeaping(Transform):
     also in front of and behind everything that a ray sees. A fit that should make invisible regions visible
     must start above 0, or not leap.
 
+    Where it fails, and where not: `experiments/stability.py`, "sheets thinner than a cell of rays",
+    "occupancy under steep transfer functions", "gradients of what is leapt over".
+
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
     rendering rays of one's own (`render_rays`).
 

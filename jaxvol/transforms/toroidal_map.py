@@ -57,6 +57,9 @@ class ToroidalMap(Transform):
     All are differentiable. Values and gradients are finite everywhere; where an angle has no gradient, on
     the motor axis (y = z = 0) and at the apex (x = R = 0), it is taken as 0.
 
+    Where it fails, and where not: `experiments/stability.py`, "gaps of rays under a toroidal map",
+    "rays near the motor axis".
+
     **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
 
     Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), which print `atan`; `atan2` is the same where

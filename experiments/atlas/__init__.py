@@ -1,0 +1,20 @@
+"""Where do the methods of jaxvol fail? The entries of the failure atlas, a file for each family of them."""
+
+from . import adaptive, fits, labels, leaping, light, opacity, precision, probe, sampling
+from .entry import Entry
+
+
+FAMILIES = {
+    "jitter and sampling": sampling.ENTRIES,
+    "opacity and its gradient": opacity.ENTRIES,
+    "adaptive strides": adaptive.ENTRIES,
+    "space leaping": leaping.ENTRIES,
+    "float types": precision.ENTRIES,
+    "faces of labels": labels.ENTRIES,
+    "toroidal maps": probe.ENTRIES,
+    "scatterer templates": light.ENTRIES,
+    "fits": fits.ENTRIES,
+}
+"""All entries, by family. A new method joins by a row."""
+
+ENTRIES: dict[str, Entry] = {entry.name: entry for family in FAMILIES.values() for entry in family}

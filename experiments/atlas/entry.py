@@ -1,0 +1,137 @@
+"""What is an entry of the failure atlas? A regime, swept until a method fails, and what is measured there."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvol as jv
+
+
+Outcome = Literal["bounded", "detected and said", "documented", "fails"]
+"""What jaxvol does: the failure cannot occur; or it occurs and jaxvol says so, by an error, a warning or an
+output; or a docstring states it; or none of these."""
+
+Curves = dict[str, float]
+"""Measured numbers at one value of the regime, by name."""
+
+
+class Entry(NamedTuple):
+    """One way in which a method fails.
+
+    - `name`: stable; docstrings point to it.
+    - `question`: that the sweep answers.
+    - `method`: the object whose docstring states the edge, such as `jaxvol.Jitter`.
+    - `regime`: what is swept, with its unit. `values`: from harmless to harmful.
+    - `measure`: from a value and the number of pixels along a side to the measured numbers.
+    - `metric`: what these numbers are. `judged`: the name of the one that finds the edge.
+    - `limit`: up to which that number counts as good; NaN never does.
+    - `outcome`, `does`: what jaxvol does, in a word and in a sentence.
+    - `picture`: linear RGB image at a value, in [0, 1]; `shows`: what it shows.
+    - `pictured`: the two values; by default the last one within the limit and the last one of all.
+    - `said`: the name of the number by which jaxvol says that it fails (1) or not (0).
+    - `scales`: of both axes of the chart, as in Matplotlib.
+    - `size`: pixels along a side of the images that are measured; pictures have their own.
+    """
+
+    name: str
+    question: str
+    method: str
+    regime: str
+    values: tuple[float, ...]
+    measure: Callable[[float, int], Curves]
+    metric: str
+    judged: str
+    limit: float
+    outcome: Outcome
+    does: str
+    picture: Callable[[float, int], np.ndarray]
+    shows: str
+    pictured: tuple[float, float] | None = None
+    said: str | None = None
+    scales: tuple[str, str] = ("log", "log")
+    size: int = 16
+
+
+class Edge(NamedTuple):
+    """Neighbouring values of a sweep: the last one at which a method holds, and the first at which it fails.
+    `within` is None if it holds nowhere, `beyond` if it holds everywhere."""
+
+    within: float | None
+    beyond: float | None
+
+
+def edge(values: Sequence[float], judged: Sequence[float], limit: float) -> Edge:
+    """Where a sweep first exceeds a limit."""
+    exceeded = [not number <= limit for number in judged]  # NaN exceeds any limit
+    if not any(exceeded):
+        return Edge(values[-1], None)
+    first = exceeded.index(True)
+    return Edge(values[first - 1] if first else None, values[first])
+
+
+def sweep(entry: Entry, size: int, values: Sequence[float] | None = None) -> dict[str, Any]:
+    """Measure an entry: its curves and its edge, as they are recorded."""
+    values = entry.values if values is None else values
+    rows = [entry.measure(value, size) for value in values]
+    curves = {name: [float(row[name]) for row in rows] for name in rows[0]}
+    found = edge(values, curves[entry.judged], entry.limit)
+    return {"values": list(values), "curves": curves, "edge": found._asdict()}
+
+
+def pictured(entry: Entry, found: dict[str, Any]) -> tuple[float, float]:
+    """The two values of which an entry has pictures."""
+    if entry.pictured is not None:
+        return entry.pictured
+    within = found["edge"]["within"]
+    return (entry.values[0] if within is None else within), entry.values[-1]
+
+
+# -- shared by entries ------------------------------------------------------------------------------------
+
+White = tuple[float, float, float]
+
+
+def colors(*parts: Any, **how: Any) -> np.ndarray:
+    """Colour over black of an image, by the adjoint that compiles fastest."""
+    rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
+    return np.asarray(rendering.rgba[..., :3], np.float64)
+
+
+def uniform(extinction: Any, color: White = (1.0, 1.0, 1.0)) -> jv.TransferFunction:
+    """The same colour and extinction for every value. The extinction may be traced."""
+    return jv.TransferFunction([0.0, 1.0], np.tile(color, (2, 1)), jnp.full(2, extinction))
+
+
+def cube(side: int = 8) -> jv.Volume:
+    """A volume of ones on [-1, 1]³."""
+    return jv.Volume(np.ones((side,) * 3, np.float32), [2 / (side - 1)] * 3, [-1.0] * 3)
+
+
+def signed(error: np.ndarray, largest: float) -> np.ndarray:
+    """An error as linear RGB: white where it is 0, red where it is positive, blue where it is negative."""
+    error = np.mean(error, axis=-1) if error.ndim == 3 else error
+    part = np.clip(np.nan_to_num(error, nan=largest) / largest, -1, 1)[..., None]
+    red, blue = np.array([0.7, 0.02, 0.02]), np.array([0.02, 0.08, 0.7])
+    return np.where(part > 0, 1 + part * (red - 1), 1 - part * (blue - 1))
+
+
+def grey(values: np.ndarray) -> np.ndarray:
+    """Numbers in [0, 1] as linear RGB."""
+    return np.repeat(np.clip(np.nan_to_num(values), 0, 1)[..., None], 3, axis=-1)
+
+
+def shift_of(transform: Any, offset: Any) -> Any:
+    """A jitter whose random number is `offset` in all pixels. It must have been made with `"blue"`."""
+    import equinox as eqx
+
+    tile = jnp.full_like(transform.noise.tile, offset)
+    return eqx.tree_at(lambda jitter: jitter.noise.tile, transform, tile)
+
+
+def finite(tree: Any) -> bool:
+    """Whether all float arrays of a tree are finite."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    return all(np.isfinite(leaf).all() for leaf in leaves if np.issubdtype(leaf.dtype, np.inexact))

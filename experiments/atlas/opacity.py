@@ -1,0 +1,322 @@
+"""Where does accumulating opacity fail? Opaque rays, great extinction, short cells, early termination."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import jaxvol as jv
+
+from .entry import Entry, colors, cube, finite, grey, signed, uniform
+
+
+LEVEL = 1 / 255
+ALIGNED = (jv.AlphaCorrection(),)
+
+
+# -- opaque cells -----------------------------------------------------------------------------------------
+
+
+def along_z(offset: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """One ray along z through a cube, as arrays of one ray."""
+    return np.array([[offset, 0.2, -3.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32)
+
+
+@jax.jit
+def _opacity(extinction: Array) -> tuple[Array, Array]:
+    """Opacity of a cube of side 2 in four steps, and its derivative by the extinction."""
+
+    def opacity(extinction: Array) -> Array:
+        rays = tuple(jnp.asarray(part) for part in along_z())
+        march = jv.March(0.5, ALIGNED)
+        return jv.render_rays(cube(), uniform(extinction), *rays, march, outputs="rgba").rgba[0, 3]
+
+    return jax.value_and_grad(opacity)(extinction)
+
+
+def opaque(depth: float, size: int) -> dict[str, float]:
+    """`depth`: optical depth of the cube."""
+    extinction = np.float32(depth / 2)
+    value, slope = (np.float64(number) for number in _opacity(jnp.asarray(extinction)))
+    exact = 2 * np.exp(-2 * np.float64(extinction))
+    return {
+        "gradient, relative": float(abs(slope - exact) / exact),
+        "opacity": float(abs(value + np.expm1(-2 * np.float64(extinction)))),
+    }
+
+
+def ball_picture(extinction: float, size: int) -> np.ndarray:
+    """A ball of this extinction, left rule, steps of 1/32."""
+    transfer = jv.TransferFunction([0.1, 0.5], [(0.9, 0.6, 0.3), (0.3, 0.6, 0.9)], [0.0, extinction])
+    volume = _sphere()
+    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.7)
+    return colors(volume, transfer, camera, jv.March(1 / 32, ALIGNED))
+
+
+@cache
+def _sphere() -> jv.Volume:
+    return jv.phantom("sphere", 32)
+
+
+OPAQUE = Entry(
+    name="gradients of opaque rays",
+    question="At which optical depth does the gradient by the extinction drown in rounding?",
+    method="jaxvol.render",
+    regime="optical depth of a ray",
+    values=(1.0, 3.0, 6.0, 9.0, 12.0, 14.0, 16.0, 18.0, 24.0, 40.0),
+    measure=opaque,
+    metric="error",
+    judged="gradient, relative",
+    limit=0.1,
+    outcome="documented",
+    does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 "
+    "cannot tell from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not "
+    "move.",
+    picture=lambda depth, size: ball_picture(depth, size),
+    shows="a ball of this extinction per unit length, radius 1/2",
+    scales=("linear", "log"),
+)
+
+
+def unbounded(extinction: float, size: int) -> dict[str, float]:
+    volume, camera = _sphere(), jv.Camera((0, 0, -3), (0, 0, 0), size=(8, 8), parallel_scale=0.7)
+    image, gradient = _image_and_gradient(volume, camera, jnp.asarray(extinction, jnp.float32))
+    value, slope = _opacity(jnp.asarray(extinction, jnp.float32))
+    exact = -np.expm1(-2 * np.float64(np.float32(extinction)))
+    return {
+        "not finite": 0.0 if finite((image, gradient, value, slope)) else np.nan,
+        "opacity of a cube": float(abs(value - exact)),
+    }
+
+
+@jax.jit
+def _image_and_gradient(volume: jv.Volume, camera: jv.Camera, extinction: Array) -> tuple[Array, tuple]:
+    def loss(given: tuple[jv.Volume, jv.Camera, Array]) -> tuple[Array, Array]:
+        volume, camera, extinction = given
+        transfer = jv.TransferFunction([0.1, 0.5], np.ones((2, 3)), jnp.stack([0 * extinction, extinction]))
+        image = jv.render(volume, transfer, camera, jv.March(0.25, ALIGNED), outputs="rgba").rgba
+        return jnp.sum(image), image
+
+    gradient, image = jax.grad(loss, has_aux=True)((volume, camera, extinction))
+    return image, gradient
+
+
+UNBOUNDED = Entry(
+    name="extinction without bound",
+    question="Do an image and its gradients stay finite for any extinction?",
+    method="jaxvol.TransferFunction",
+    regime="extinction, per length (the cube is 2 long)",
+    values=(1.0, 1e2, 1e4, 1e6, 1e12, 1e20, 1e30, 1e38),
+    measure=unbounded,
+    metric="error of the opacity; NaN if anything is not finite",
+    judged="not finite",
+    limit=0.0,
+    outcome="bounded",
+    does="Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to "
+    "voxels, camera and extinction are finite up to the largest float32.",
+    picture=ball_picture,
+    shows="a ball of this extinction: beyond one opaque cell, its colour no longer changes",
+    pictured=(1.0, 1e38),
+)
+
+
+# -- grazing exits ----------------------------------------------------------------------------------------
+
+
+@jax.jit
+def _grazing(x: Array) -> tuple[Array, Array]:
+    """Opacity, and its derivative by x, of a ray that cuts an edge of the cube."""
+
+    def opacity(x: Array) -> Array:
+        origin = jnp.stack([x, jnp.full_like(x, -1.5), jnp.full_like(x, 0.1)])[None]
+        direction = jnp.array([[1.0, 1.0, 0.0]])
+        march = jv.March(0.25, ALIGNED)
+        return jv.render_rays(cube(), uniform(1.0), origin, direction, march, outputs="rgba").rgba[0, 3]
+
+    return jax.value_and_grad(opacity)(x)
+
+
+def grazing(length: float, size: int) -> dict[str, float]:
+    """`length`: of the ray within the cube, at its edge x = 1, y = -1."""
+    x = np.float32(0.5 - length / np.sqrt(2))
+    exact = (0.5 - np.float64(x)) * np.sqrt(2)
+    value, slope = (np.float64(number) for number in _grazing(jnp.asarray(x)))
+    return {
+        "gradient, relative": float(abs(slope + np.sqrt(2) * np.exp(-exact)) / (np.sqrt(2) * np.exp(-exact))),
+        "opacity, relative": float(abs(value + np.expm1(-exact)) / max(-np.expm1(-exact), 1e-30)),
+        "opacity": float(abs(value + np.expm1(-exact))),
+    }
+
+
+def grazing_picture(length: float, size: int) -> np.ndarray:
+    """Opacity, relative to its largest, of a window this wide at an edge of the cube."""
+    line = (np.arange(size, dtype=np.float64) + 0.5) / size
+    x = np.float32(0.5 - line * length / np.sqrt(2))
+    z = np.linspace(-0.5, 0.5, size, dtype=np.float32)
+    origins = np.stack(np.broadcast_arrays(x[None, :], np.float32(-1.5), z[:, None]), axis=-1)
+    directions = np.broadcast_to(np.array([1, 1, 0], np.float32), origins.shape)
+    march = jv.March(0.25, ALIGNED)
+    rgba = jv.render_rays(
+        cube(), uniform(1.0), origins, directions, march, outputs="rgba", adjoint="forward"
+    ).rgba
+    return grey(np.asarray(rgba[..., 3]) / -np.expm1(-length))
+
+
+GRAZING = Entry(
+    name="grazing exits",
+    question="How short may the part of a ray inside the volume be?",
+    method="jaxvol.AlphaCorrection",
+    regime="length inside / half the side of the cube",
+    values=(0.9, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 2e-7),
+    measure=grazing,
+    metric="error",
+    judged="opacity",
+    limit=1e-6,
+    outcome="bounded",
+    does="The width of the cut cell is a difference of two distances, so its error is that of rounding "
+    "them, however short it is: some 1e-7 of the volume's size. The relative error of a nearly "
+    "transparent pixel grows, that of the gradient does not.",
+    picture=grazing_picture,
+    shows="opacity of a window of this width at an edge of the cube, relative to its largest: exact, it is "
+    "an even ramp",
+    pictured=(1e-2, 2e-6),
+)
+
+
+# -- exits at the end of a cell ---------------------------------------------------------------------------
+
+
+@jax.jit
+def _at_end(spacing: Array) -> tuple[Array, Array]:
+    """Opacity, and its derivative by the spacing along the ray, of a cube of 8 spacings in steps of 1/4."""
+
+    def opacity(spacing: Array) -> Array:
+        along = jnp.stack([jnp.full_like(spacing, 0.25), jnp.full_like(spacing, 0.25), spacing])
+        volume = jv.Volume(np.ones((9, 9, 9), np.float32), along, [-1.0] * 3)
+        rays = tuple(jnp.asarray(part) for part in along_z())
+        return jv.render_rays(volume, uniform(1.0), *rays, jv.March(0.25, ALIGNED), outputs="rgba").rgba[0, 3]
+
+    return jax.value_and_grad(opacity)(spacing)
+
+
+def at_end(part: float, size: int) -> dict[str, float]:
+    """`part`: of a step that the last cell is wide; 0 where the exit lies exactly at the end of a cell."""
+    spacing = np.float32(0.25 * (1 + part / 8))
+    exact = np.exp(-8 * np.float64(spacing))
+    value, slope = (np.float64(number) for number in _at_end(jnp.asarray(spacing)))
+    return {
+        "gradient, relative": float(abs(slope - 8 * exact) / (8 * exact)),
+        "opacity": float(abs(value - (1 - exact))),
+    }
+
+
+def at_end_picture(part: float, size: int) -> np.ndarray:
+    """The derivative of each pixel by the spacing, over its largest, of an orthographic view."""
+    volume = jv.Volume(np.ones((9, 9, 9), np.float32), [0.25, 0.25, 0.25 * (1 + part / 8)], [-1.0] * 3)
+    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=1.2)
+
+    def image(spacing: Array) -> Array:
+        scaled = jv.Volume(volume.data, volume.spacing.at[2].set(spacing), volume.origin)
+        march = jv.March(0.25, ALIGNED)
+        return jv.render(scaled, uniform(1.0), camera, march, outputs="rgba", adjoint="forward").rgba[..., 3]
+
+    slope = jax.jvp(image, (volume.spacing[2],), (jnp.ones(()),))[1]
+    return grey(np.asarray(slope) / (8 * np.exp(-2)))
+
+
+AT_END = Entry(
+    name="exits at the end of a cell",
+    question="Does the gradient by what moves the exit hold as the last cell gets narrower?",
+    method="jaxvol.AlphaCorrection",
+    regime="width of the last cell e / step",
+    values=(0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 0.0),
+    measure=at_end,
+    metric="error",
+    judged="gradient, relative",
+    limit=0.01,
+    outcome="fails",
+    does="The gradient is exact for any e above 0. Where the exit lies exactly at the end of a cell, the "
+    "last cell is not cut and the one behind it is not marched, so that neither has a derivative: the "
+    "gradient by the exit is 0. This takes a ray whose length is a whole number of steps, as of an "
+    "orthographic view along an axis with steps of one voxel. The image is right.",
+    picture=at_end_picture,
+    shows="derivative of each pixel by the spacing, seen along z: it should be the same everywhere on the "
+    "cube",
+    pictured=(0.5, 0.0),
+    scales=("symlog", "log"),
+)
+
+
+# -- early termination ------------------------------------------------------------------------------------
+
+
+@cache
+def _head(size: int) -> tuple[jv.Volume, jv.TransferFunction, jv.Camera]:
+    """README's first scene, coarser."""
+    points = [(60, (0.0, 0.0, 0.0), 0.0), (90, (0.8, 0.7, 0.5), 0.02), (255, (1.0, 1.0, 1.0), 0.9)]
+    volume, transfer = jv.phantom("head", 48), jv.TransferFunction.from_points(points, unit_distance=0.02)
+    camera = jv.Camera((3.0, -5.0, 1.5), volume.center, (0, 0, 1), 30, size=(size, size))
+    return volume, transfer, camera
+
+
+@jax.jit
+def _terminated(scene: tuple, left: Array, factor: Array) -> tuple[Array, Array]:
+    """The sum of all pixels' derivative by a factor of all extinctions, and the image."""
+    volume, transfer, camera = scene
+
+    def loss(factor: Array) -> tuple[Array, Array]:
+        scaled = jv.TransferFunction(transfer.values, transfer.colors, factor * transfer.extinction)
+        march = jv.March(0.02, (jv.SpaceLeaping(), *ALIGNED, jv.EarlyTermination(left)))
+        image = jv.render(volume, scaled, camera, march, outputs="rgba").image((0, 0, 0))
+        return jnp.sum(image), image
+
+    return jax.grad(loss, has_aux=True)(factor)
+
+
+NEVER = 1e-30
+
+
+@cache
+def terminated(left: float, factor: float, size: int) -> tuple[float, np.ndarray]:
+    slope, image = _terminated(_head(min(size, 64)), jnp.asarray(left), jnp.asarray(factor))
+    return float(slope), np.asarray(image, np.float64)
+
+
+def termination(left: float, size: int) -> dict[str, float]:
+    found = {}
+    for name, factor in (("opaque: gradient", 1.0), ("translucent: gradient", 0.05)):
+        exact, truth = terminated(NEVER, factor, size)
+        slope, image = terminated(left, factor, size)
+        found[name] = abs(slope - exact) / abs(exact)
+        if factor == 1:
+            found["opaque: image, largest"] = float(np.abs(image - truth).max())
+    return found
+
+
+def termination_picture(left: float, size: int) -> np.ndarray:
+    return signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05)
+
+
+TERMINATION = Entry(
+    name="early termination in gradients",
+    question="How much transmittance may be left out before the gradient is wrong?",
+    method="jaxvol.EarlyTermination",
+    regime="opacity_left",
+    values=(1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 1 / 255, 0.02, 0.1),
+    measure=termination,
+    metric="error (of gradients: relative)",
+    judged="opaque: gradient",
+    limit=0.05,
+    outcome="documented",
+    does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T "
+    "log(1/T) of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or "
+    "none.",
+    picture=termination_picture,
+    shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
+    pictured=(1e-4, 0.1),
+    size=32,
+)
+
+ENTRIES = (OPAQUE, UNBOUNDED, GRAZING, AT_END, TERMINATION)
