@@ -1,0 +1,102 @@
+"""What would a scene look like without any error, and how far from that is the image taken for it?
+
+The reference is our image at a fraction of the step, by the midpoint rule, cells cut at the exit, rays not
+ended early; of a lit scene every sample is lit, by many templates. Its own error is estimated twice: by the
+difference to the image of twice the step, and, at some pixels, to `render_ray_reference` in float64 at half
+the step. In lit scenes both take one template only, and a third estimate follows from the difference to half as
+many templates from another seed.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.lighting import Lighting
+from jaxvol.metrics import rmse
+
+from .pareto_points import Image, program, templates
+from .pareto_scenes import Case
+
+
+TEMPLATES = 512
+"""Two images of 32 templates each differ by 0.07 on the lit head, as much as they differ from those of some
+settings."""
+PIXELS = 256
+SEEDS = 1001, 2002
+"""Of the reference's templates: not those of the settings."""
+
+
+def march(case: Case, finer: float) -> jv.March:
+    return jv.March(
+        case.scene.step / finer, (*case.placed, jv.AlphaCorrection(), jv.SpaceLeaping()), "midpoint"
+    )
+
+
+def converged(case: Case, finer: int, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
+    """The reference, over white. `finer`: into how many parts it divides a step; `count`: of templates."""
+    lighting = None if case.lighting is None else templates(case, templates=count, blend=True, seed=seed)
+    return program(case, march(case, finer), lighting).image()
+
+
+def own_error(case: Case, finer: int, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
+    """What is estimated of the reference's own error: `rmse` in total, and its parts."""
+    few: Lighting | None = None
+    image = truth
+    if case.lighting is not None:
+        # grown once: in float64, random numbers are others
+        few = templates(case, templates=1, photons=8, seed=SEEDS[0])
+        few = templates(case, given=few.grown(blend=False))
+        image = program(case, march(case, finer), few).image()
+    pixels = visible_pixels(image)
+    exact = in_float64(case, march(case, 2 * finer), few, pixels)
+    there = image[pixels[:, 1], pixels[:, 0]]
+    found: dict[str, Any] = {
+        "steps in a voxel": finer,
+        "difference to twice the step": rmse(image, program(case, march(case, finer / 2), few).image()),
+        "pixels in float64": len(pixels),
+        "difference to float64 at half the step": float(np.sqrt(np.mean((there - exact) ** 2))),
+        "largest difference to float64": float(np.abs(there - exact).max()),
+    }
+    if case.lighting is not None:
+        found["templates"] = count
+        one, other = (converged(case, 1, n, seed) for n, seed in zip((count, count // 2), SEEDS, strict=True))
+        # of images with the variances v and 2 v
+        found["error by the number of templates"] = rmse(one, other) / np.sqrt(3)
+    errors = found["difference to float64 at half the step"], found.get("error by the number of templates", 0)
+    return {"rmse": float(np.hypot(*errors)), **found}
+
+
+def visible_pixels(image: Image) -> np.ndarray:
+    """(column, row) of some pixels that show something, drawn at random; of any if none does."""
+    rows, columns = np.nonzero(np.any(image != 1, axis=-1))
+    if len(rows) == 0:
+        rows, columns = (index.ravel() for index in np.indices(image.shape[:2]))
+    drawn = np.random.default_rng(0).permutation(len(rows))[:PIXELS]
+    return np.column_stack([columns[drawn], rows[drawn]])
+
+
+def in_float64(case: Case, march: jv.March, lighting: Lighting | None, pixels: np.ndarray) -> np.ndarray:
+    """What `render_ray_reference` sees in float64 through these pixels, over white."""
+    with jax.enable_x64(True):
+        volume, transfer, camera, march, lighting = jax.tree.map(
+            doubled, (case.scene.volume, case.scene.transfer, case.scene.camera, march, lighting)
+        )
+
+        def one(pixel: jax.Array) -> jax.Array:
+            origin, direction = (jnp.stack(part) for part in camera.ray(pixel[0], pixel[1]))
+            return jv.render_ray_reference(
+                volume, transfer, origin, direction, march, pixel=(pixel[0], pixel[1]), lighting=lighting
+            ).image()
+
+        return np.asarray(jax.vmap(one)(jnp.asarray(pixels, jnp.int32)))
+
+
+def doubled(leaf: Any) -> Any:
+    """A leaf in float64; voxels keep their type."""
+    if eqx.is_inexact_array(leaf) and leaf.ndim < 3:
+        return jnp.asarray(np.asarray(leaf, np.float64))
+    return leaf
