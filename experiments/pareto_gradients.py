@@ -1,7 +1,8 @@
 """How far is the gradient to the transfer function from the converged one, and what does it take?
 
-The gradient is that of the mean square of all premultiplied pixels, by `adjoint="replay"`, to the colours and to
-the extinction of all control points. Extinctions of 0, whose gradient leaping leaves out by design, do not count.
+The gradient is that of the mean square of all premultiplied pixels, by `adjoint="replay"`, to the colours and
+to the extinction of all control points. Extinctions of 0, whose gradient leaping leaves out by design, do not
+count.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,7 @@ Gradient = tuple[np.ndarray, np.ndarray]
 
 
 def measure(case: Case, settings: dict[str, Setting], repetitions: int) -> dict[str, Any]:
-    """By setting, where one is compared: relative errors, seconds, and the ratio to the base's image alone."""
+    """By setting, where one is compared: relative errors, seconds, and their ratio to the base's image."""
     transfer = case.scene.transfer
     truth = gradient(program(case, march(case, FINER)).of_transfer, transfer)[1]()
     coarser = gradient(program(case, march(case, FINER / 2)).of_transfer, transfer)[1]()

@@ -1,7 +1,7 @@
 """Time, error and picture of every setting in one scene, kept on disk as they are measured.
 
-Each scene has a folder: `scene.json` with what is finished, `reference.npy`, and a picture for each point. What
-is there is not measured again if commit, sources, sizes, seed and volumes are the same.
+Each scene has a folder: `scene.json` with what is finished, `reference.npy`, and a picture for each point.
+What is there is not measured again if commit, sources, sizes, seed and peers are the same.
 """
 
 import hashlib

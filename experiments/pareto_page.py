@@ -1,4 +1,4 @@
-"""Writes the page of a `pareto` record: one HTML file that needs no network, with the picture behind each point.
+"""Writes the page of a `pareto` record: one HTML file without network, with the picture behind each point.
 
 It is made from the record and the small pictures beside it alone; nothing is measured. `pareto_page.html` is
 the page without its data.

@@ -148,13 +148,14 @@ def deferred(case: Case, **how: Any) -> Lighting:
 
 def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = templates, **how: Any) -> Setting:
     """A setting of light; `step` and `quadrature` are the march's, all else the templates'."""
-    march = {name: how.pop(name) for name in ("step", "quadrature") if name in how}
+    march: dict[str, Any] = {name: how.pop(name) for name in ("step", "quadrature") if name in how}
 
     def keep(case: Case) -> Case:  # a volume keeps one baked light only
         return case._replace(scene=case.scene._replace(volume=copied(case.scene.volume)))
 
-    changed = {"changed": keep} if "baked" in how else {}
-    made = ours(*transforms, lighting=partial(by, **how), **march, **changed)
+    if "baked" in how:
+        march["changed"] = keep
+    made = ours(*transforms, lighting=partial(by, **how), **march)
     return Setting(family, made, lambda row: row.lit)
 
 

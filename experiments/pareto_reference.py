@@ -3,8 +3,8 @@
 The reference is our image at a fraction of the step, by the midpoint rule, cells cut at the exit, rays not
 ended early; of a lit scene every sample is lit, by many templates. Its own error is estimated twice: by the
 difference to the image of twice the step, and, at some pixels, to `render_ray_reference` in float64 at half
-the step. In lit scenes both take one template only, and a third estimate follows from the difference to half as
-many templates from another seed.
+the step. In lit scenes both take one template only, and a third estimate follows from the difference to half
+as many templates from another seed.
 """
 
 from typing import Any
@@ -48,8 +48,8 @@ def own_error(case: Case, finer: int, truth: Image, count: int = TEMPLATES) -> d
     image = truth
     if case.lighting is not None:
         # grown once: in float64, random numbers are others
-        few = templates(case, templates=1, photons=8, seed=SEEDS[0])
-        few = templates(case, given=few.grown(blend=False))
+        grown = templates(case, templates=1, photons=8, seed=SEEDS[0]).grown(blend=False)
+        few = templates(case, given=grown)
         image = program(case, march(case, finer), few).image()
     pixels = visible_pixels(image)
     exact = in_float64(case, march(case, 2 * finer), few, pixels)

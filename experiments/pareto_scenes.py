@@ -1,4 +1,4 @@
-"""Which scenes are charted by `pareto`? One row each: what it shows, from where, on which grid, under which light.
+"""Which scenes does `pareto` chart? One row each: what it shows, from where, on which grid, in what light.
 
 Lengths of steps are counted in voxels; of a toroidal scan, a voxel is the distance between samples of a beam.
 """
@@ -112,8 +112,8 @@ def shells(folder: Path | None, size: int, resolution: int) -> Case:
     data = np.asarray(jv.load(folder / SHELLS).data)
     volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
     azimuth, elevation, span = np.deg2rad(38.55), np.deg2rad(54.45) / 2, 69.58
-    ranges = ((np.pi / 2 - half, np.pi / 2 + half) for half in (elevation, azimuth))
-    probe = jv.ToroidalMap(22.70 - 52.70, 52.70, *ranges, (0, span))
+    beta, sigma = ((np.pi / 2 - half, np.pi / 2 + half) for half in (elevation, azimuth))
+    probe = jv.ToroidalMap(22.70 - 52.70, 52.70, beta, sigma, (0, span))
     camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
     transfer = jv.colormap("gray", (60, 200), (0.0, 0.5))
     return Case(Scene(volume, transfer, camera, span / (data.shape[0] - 1)), (probe,))
