@@ -39,6 +39,8 @@ from .speed import THREADS, peers
 PEERS = (VTK, DRJIT)
 QUICK = (PHANTOM, f"{PHANTOM}, lit")
 """The scenes of `--quick`."""
+SAME = 0.01
+"""Errors that differ by less count as equal."""
 FEW = 2
 """Settings of each family under `--quick`."""
 
@@ -69,7 +71,7 @@ def concluded(name: str, kept: dict[str, Any], options: list[str]) -> dict[str, 
     pairs = {n: (p["rmse"], p["time"]) for n, p in points.items()}
     ours = {n: pair for n, pair in pairs.items() if points[n]["family"] not in PEERS}
     theirs = {n: pair for n, pair in pairs.items() if n not in ours}
-    ahead = behind(list(ours.values()), theirs)
+    ahead = behind(list(ours.values()), theirs, SAME)
     return {
         "view": row.view,
         "look": row.look,

@@ -71,6 +71,7 @@ def _panel(panel: Any, name: str, scene: dict[str, Any]) -> None:
     front = [points[n] for n in scene["front of jaxvol"]]
     corners = [(p["rmse"], p["time"] * 1e3) for p in front]
     if corners:
+        corners.append((max(point["rmse"] for point in points.values()), corners[-1][1]))
         panel.step(*zip(*corners, strict=True), where="post", color="k", linewidth=1.2, zorder=1)
     panel.axvline(scene["reference"]["rmse"], color="k", linewidth=0.8, linestyle=":")
     panel.set(xscale="log", yscale="log", xlabel="RMSE")

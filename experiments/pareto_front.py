@@ -28,17 +28,23 @@ def front(points: Sequence[Point]) -> list[int]:
     return found
 
 
-def behind(ours: Sequence[Point], theirs: Mapping[str, Point]) -> dict[str, dict[str, float | None]]:
+def behind(
+    ours: Sequence[Point], theirs: Mapping[str, Point], same: float = 0.0
+) -> dict[str, dict[str, float | None]]:
     """The points of other programs that no point of ours is as good as, in error and in time.
+
+    `same`: errors that differ by this part count as equal, since programs that take the same samples differ
+    by rounding.
 
     For each, by what factor we miss it: `time`: that of our fastest point at its error, over its own;
     `error`: that of our best point in its time, over its own. None where we have no such point.
     """
     found: dict[str, dict[str, float | None]] = {}
     for name, (error, seconds) in theirs.items():
-        if any(e <= error and s <= seconds for e, s in ours):
+        enough = error * (1 + same)
+        if any(e <= enough and s <= seconds for e, s in ours):
             continue
-        fastest = min((s for e, s in ours if e <= error), default=None)
+        fastest = min((s for e, s in ours if e <= enough), default=None)
         best = min((e for e, s in ours if s <= seconds), default=None)
         found[name] = {
             "time": None if fastest is None else fastest / seconds,
