@@ -151,14 +151,12 @@ def main(chosen: Namespace) -> common.Answer | None:
     if chosen.quick:
         chosen.size, chosen.repetitions, chosen.resolution, templates = 32, 2, 32, 4
         names = names if given else list(QUICK)
+    if chosen.point is not None and (len(names) != 1 or not given):
+        raise ValueError(f"--point is of one scene: give one --scene that is there; got {', '.join(names)}.")
     sizes = Sizes(chosen.size, chosen.resolution, chosen.repetitions, templates, chosen.seed)
     folder, present = chosen.output / "pareto", peers()
     print(present, flush=True)
     if chosen.point is not None:
-        if len(names) != 1 or not given:
-            raise ValueError(
-                f"--point is of one scene: give one --scene that is there; got {', '.join(names)}."
-            )
         print(json.dumps(again(names[0], chosen.point, folder, sizes, present), indent=1))
         return None
     if not names:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
 
 from . import common
 from .accuracy import DRJIT, VTK
@@ -77,12 +78,13 @@ def _panel(panel: Any, name: str, scene: dict[str, Any]) -> None:
     panel.set(xscale="log", yscale="log", xlabel="RMSE")
     panel.set_title(f"{name}, {scene['pixels']}²", fontsize=10)
     panel.tick_params(labelsize=8, which="both")
-    panel.yaxis.set_major_formatter("{x:g}")
-    panel.yaxis.set_minor_formatter(_few)
+    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(_few if high / low < 30 else NullFormatter())
     panel.grid(which="major", linewidth=0.3)
 
 
 def _few(value: float, _: Any) -> str:
-    """Labels at 2 and 5 between powers of ten, since times often span less than one."""
+    """Labels at 2 and 5 between powers of ten."""
     lead = value / 10 ** math.floor(math.log10(value))
     return f"{value:g}" if round(lead, 6) in (2, 5) else ""

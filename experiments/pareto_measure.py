@@ -123,7 +123,7 @@ def truth_of(case: Case, row: Row, sizes: Sizes, store: Store) -> np.ndarray:
     """The converged image, from the store if it is there."""
     if "reference" in store.kept:
         return np.load(store.folder / "reference.npy")
-    return pareto_reference.converged(case, row.finer, sizes.templates)
+    return pareto_reference.converged(case, row, sizes.templates)
 
 
 def reference(case: Case, row: Row, sizes: Sizes, store: Store) -> np.ndarray:
@@ -131,7 +131,7 @@ def reference(case: Case, row: Row, sizes: Sizes, store: Store) -> np.ndarray:
     truth = truth_of(case, row, sizes, store)
     if "reference" in store.kept:
         return truth
-    own = pareto_reference.own_error(case, row.finer, truth, sizes.templates)
+    own = pareto_reference.own_error(case, row, truth, sizes.templates)
     store.save()  # makes the folder, and marks what it holds as stale
     np.save(store.folder / "reference.npy", truth)
     small(truth).save(store.folder / "reference.webp", quality=80, method=6)

@@ -1,10 +1,11 @@
 """What would a scene look like without any error, and how far from that is the image taken for it?
 
-The reference is our image at a fraction of the step, by the midpoint rule, cells cut at the exit, rays not
-ended early; of a lit scene every sample is lit, by many templates. Its own error is estimated twice: by the
-difference to the image of twice the step, and, at some pixels, to `render_ray_reference` in float64 at half
-the step. In lit scenes both take one template only, and a third estimate follows from the difference to half
-as many templates from another seed.
+The reference is our image at a fraction of the step, by the midpoint rule (under a thin peak pre-integrated),
+cells cut at the exit, rays not ended early; of a lit scene every sample is lit, by many templates. Its own
+error is estimated twice: by the difference to the image of twice the step, and, at some pixels, to
+`render_ray_reference` in float64 by the midpoint rule, at half the step (under a thin peak at an eighth). In
+lit scenes both take one template only, and a third estimate follows from the difference to half as many
+templates from another seed.
 """
 
 from typing import Any
@@ -16,10 +17,11 @@ import numpy as np
 
 import jaxvol as jv
 from jaxvol.lighting import Lighting
+from jaxvol.march import Quadrature
 from jaxvol.metrics import rmse
 
 from .pareto_points import Image, program, templates
-from .pareto_scenes import Case
+from .pareto_scenes import Case, Row
 
 
 TEMPLATES = 512
@@ -30,43 +32,48 @@ SEEDS = 1001, 2002
 """Of the reference's templates: not those of the settings."""
 
 
-def march(case: Case, finer: float) -> jv.March:
-    return jv.March(
-        case.scene.step / finer, (*case.placed, jv.AlphaCorrection(), jv.SpaceLeaping()), "midpoint"
-    )
+def march(case: Case, finer: float, quadrature: Quadrature = "midpoint") -> jv.March:
+    transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping()
+    return jv.March(case.scene.step / finer, transforms, quadrature)
 
 
-def converged(case: Case, finer: int, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
-    """The reference, over white. `finer`: into how many parts it divides a step; `count`: of templates."""
+def converged(case: Case, row: Row, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
+    """The reference, over white. `row`: how fine it is; `count`: of templates."""
     lighting = None if case.lighting is None else templates(case, templates=count, blend=True, seed=seed)
-    return program(case, march(case, finer), lighting).image()
+    return program(case, march(case, row.finer, row.quadrature), lighting).image()
 
 
-def own_error(case: Case, finer: int, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
+def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
     """What is estimated of the reference's own error: `rmse` in total, and its parts."""
     few: Lighting | None = None
-    image = truth
+    image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
+    fine, coarse = (march(case, n, row.quadrature) for n in (row.finer, row.finer / 2))
     if case.lighting is not None:
         # grown once: in float64, random numbers are others
         grown = templates(case, templates=1, photons=8, seed=SEEDS[0]).grown(blend=False)
         few = templates(case, given=grown)
-        image = program(case, march(case, finer), few).image()
+        image = program(case, fine, few).image()
     pixels = visible_pixels(image)
-    exact = in_float64(case, march(case, 2 * finer), few, pixels)
+    exact = in_float64(case, march(case, exactly), few, pixels)
     there = image[pixels[:, 1], pixels[:, 0]]
     found: dict[str, Any] = {
-        "steps in a voxel": finer,
-        "difference to twice the step": rmse(image, program(case, march(case, finer / 2), few).image()),
+        "steps in a voxel": row.finer,
+        "quadrature": row.quadrature,
+        "difference to twice the step": rmse(image, program(case, coarse, few).image()),
         "pixels in float64": len(pixels),
-        "difference to float64 at half the step": float(np.sqrt(np.mean((there - exact) ** 2))),
+        "steps in a voxel, float64": exactly,
+        "difference to float64": float(np.sqrt(np.mean((there - exact) ** 2))),
         "largest difference to float64": float(np.abs(there - exact).max()),
     }
     if case.lighting is not None:
         found["templates"] = count
-        one, other = (converged(case, 1, n, seed) for n, seed in zip((count, count // 2), SEEDS, strict=True))
+        coarse = row._replace(finer=1)
+        one, other = (
+            converged(case, coarse, n, seed) for n, seed in zip((count, count // 2), SEEDS, strict=True)
+        )
         # of images with the variances v and 2 v
         found["error by the number of templates"] = rmse(one, other) / np.sqrt(3)
-    errors = found["difference to float64 at half the step"], found.get("error by the number of templates", 0)
+    errors = found["difference to float64"], found.get("error by the number of templates", 0)
     return {"rmse": float(np.hypot(*errors)), **found}
 
 

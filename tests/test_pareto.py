@@ -247,10 +247,11 @@ def test_the_reference_of_a_homogeneous_cube_is_its_closed_form():
     transfer = jv.TransferFunction([0.0, 1.0], [[0.5, 0.25, 0.0]] * 2, [1.5, 1.5])
     camera = jv.Camera.looking_at(volume, (0, -1, 0), size=(32, 32), parallel=True)
     case = Case(Scene(volume, transfer, camera, 0.1))
-    truth = pareto_reference.converged(case, 4)
+    row = pareto_scenes.Row(lambda *_: case, finer=4)
+    truth = pareto_reference.converged(case, row)
     left = np.exp(-1.5 * float(volume.corners[1][1] - volume.corners[0][1]))
     np.testing.assert_allclose(truth[16, 16], left + (1 - left) * np.array([0.5, 0.25, 0]), rtol=1e-5)
-    own = pareto_reference.own_error(case, 4, truth)
+    own = pareto_reference.own_error(case, row, truth)
     assert 0 < own["rmse"] < 1e-5
 
 
