@@ -48,6 +48,10 @@ class Program(NamedTuple):
     of_transfer: Callable[[jv.TransferFunction], jax.Array] | None = None
 
 
+def unlit(row: Row) -> bool:
+    return not row.lit
+
+
 class Setting(NamedTuple):
     """A point of the chart: the method whose sweep it belongs to, and how its program is made.
 
@@ -56,7 +60,7 @@ class Setting(NamedTuple):
 
     family: str
     make: Callable[[Case], Program]
-    where: Callable[[Row], bool] = lambda row: not row.lit
+    where: Callable[[Row], bool] = unlit
 
 
 def program(case: Case, march: jv.March, lighting: Lighting | None = None) -> Program:
@@ -95,9 +99,16 @@ def ours(
     return make
 
 
-def stepped(name: str, family: str, steps: tuple[float, ...], *transforms: Any, **how: Any) -> Any:
+def stepped(
+    name: str,
+    family: str,
+    steps: tuple[float, ...],
+    *transforms: Any,
+    where: Callable[[Row], bool] = unlit,
+    **how: Any,
+) -> Any:
     """The same setting at several steps, by name."""
-    return {f"{name}, step {s:g}": Setting(family, ours(*transforms, step=s, **how)) for s in steps}
+    return {f"{name}, step {s:g}": Setting(family, ours(*transforms, step=s, **how), where) for s in steps}
 
 
 def tabulated(points: int, case: Case) -> Case:
@@ -159,6 +170,11 @@ def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = templates, 
     return Setting(family, made, lambda row: row.lit)
 
 
+def straight(row: Row) -> bool:
+    """Where frames are fast enough for all settings: each ray of a toroidal scan is bent sample by sample."""
+    return not row.lit and not row.toroidal
+
+
 def peer(row: Row) -> bool:
     return row.peers is None
 
@@ -170,6 +186,9 @@ JITTERS: dict[str, tuple[jv.Transform, ...]] = {
     "empty-space jittered": (jv.EmptySpaceJitter(0),),
     "empty-space jittered, blue": (jv.EmptySpaceJitter(0, "blue"),),
 }
+
+PAPER = "jittered", "empty-space jittered"
+"""Those of Kye 2013, and the only ones in toroidal scans."""
 
 UNLIT: dict[str, Setting] = {
     **{
@@ -184,7 +203,9 @@ UNLIT: dict[str, Setting] = {
     **{
         name: setting
         for how, jitter in JITTERS.items()
-        for name, setting in stepped(how, "jitter", (1.0, 2.0), *jitter).items()
+        for name, setting in stepped(
+            how, "jitter", (1.0, 2.0), *jitter, where=unlit if how in PAPER else straight
+        ).items()
     },
     **stepped("not aligned", "alignment", (0.5, 1.0, 2.0), without=(jv.AlphaCorrection,)),
     **stepped("not aligned, left", "alignment", (0.5, 1.0), without=(jv.AlphaCorrection,), quadrature="left"),
@@ -198,7 +219,7 @@ UNLIT: dict[str, Setting] = {
     **stepped("no leaping", "leaping", (0.5, 1.0), without=(jv.SpaceLeaping,)),
     **stepped("leaping by distance", "leaping", (0.5, 1.0), jv.SpaceLeaping("distance")),
     **{
-        f"leaping by {method}, cell {cell}": Setting("leaping", ours(jv.SpaceLeaping(method, cell)))
+        f"leaping by {method}, cell {cell}": Setting("leaping", ours(jv.SpaceLeaping(method, cell)), straight)
         for method in ("min_distance", "beam")
         for cell in (4, 8, 16)
     },
@@ -208,11 +229,11 @@ UNLIT: dict[str, Setting] = {
     },
     "not ending early": Setting("termination", ours(without=(jv.EarlyTermination,))),
     **{
-        f"transfer table of {n}": Setting("transfer table", ours(changed=partial(tabulated, n)))
+        f"transfer table of {n}": Setting("transfer table", ours(changed=partial(tabulated, n)), straight)
         for n in (16, 64, 256, 1024)
     },
     **{
-        f"stored as {kind}": Setting("storage", ours(changed=partial(stored, kind)))
+        f"stored as {kind}": Setting("storage", ours(changed=partial(stored, kind)), straight)
         for kind in ("uint8", "uint16", "float16", "float32")
     },
 }

@@ -1,6 +1,7 @@
 """Which scenes does `pareto` chart? One row each: what it shows, from where, on which grid, in what light.
 
-Lengths of steps are counted in voxels; of a toroidal scan, a voxel is the distance between samples of a beam.
+Lengths of steps are counted in voxels; in a toroidal scan, whose voxels are longer across beams than along
+them, in twice the distance between the samples of a beam.
 """
 
 from collections.abc import Callable
@@ -104,7 +105,7 @@ def fetus(folder: Path | None, size: int, resolution: int) -> Case:
         [(50, (0.1, 0.04, 0.03), 0.0), (90, (0.8, 0.5, 0.35), 0.1), (170, (1.0, 0.9, 0.8), 0.5)]
     )
     camera = jv.Camera((60, -150, -110), (0, 0, 95), (1, 0, 0), 30.0, size=(size, size))
-    return Case(Scene(volume, transfer, camera, 100 / (resolution - 1)), (probe,))
+    return Case(Scene(volume, transfer, camera, 2 * 100 / (resolution - 1)), (probe,))
 
 
 def shells(folder: Path | None, size: int, resolution: int) -> Case:
@@ -118,7 +119,7 @@ def shells(folder: Path | None, size: int, resolution: int) -> Case:
     probe = jv.ToroidalMap(22.70 - 52.70, 52.70, beta, sigma, (0, span))
     camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
     transfer = jv.colormap("gray", (60, 200), (0.0, 0.5))
-    return Case(Scene(volume, transfer, camera, span / (data.shape[0] - 1)), (probe,))
+    return Case(Scene(volume, transfer, camera, 2 * span / (data.shape[0] - 1)), (probe,))
 
 
 def lit_head(folder: Path | None, size: int, resolution: int) -> Case:
@@ -156,8 +157,8 @@ ROWS: dict[str, Row] = {
     "lidc0314_airway": Row(partial(real, "lidc0314_airway"), AIRWAY),
     "lidc0314_airway, inside": Row(bronchi, AIRWAY, view="inside", look="opaque"),
     "aneurism": Row(partial(real, "aneurism"), ANEURISM),
-    "fetus phantom": Row(fetus, peers=UNBENT, toroidal=True, finer=8, part=0.5),
-    "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.5),
+    "fetus phantom": Row(fetus, peers=UNBENT, toroidal=True, finer=8, part=0.25),
+    "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.25),
     f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=UNLIT, lit=True, finer=4, part=0.5),
     "engine, lit": Row(lit_engine, ENGINE, peers=UNLIT, lit=True, finer=4, part=0.5),
 }
