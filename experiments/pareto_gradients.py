@@ -17,7 +17,8 @@ import jaxvol as jv
 from jaxvol._util.xla import OPTIONS
 
 from . import timing
-from .pareto_points import BASE, GRADIENTS, Setting, program
+from .pareto_points import BASE, GRADIENTS, Setting
+from .pareto_programs import program
 from .pareto_reference import march
 from .pareto_scenes import Case
 

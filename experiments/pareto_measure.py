@@ -20,7 +20,8 @@ import jaxvol as jv
 from jaxvol.metrics import psnr, rmse, ssim, wood_grain_energy
 
 from . import common, pareto_gradients, pareto_points, pareto_reference, record, timing
-from .pareto_points import Program, Setting
+from .pareto_points import Setting
+from .pareto_programs import Program
 from .pareto_scenes import ROWS, Case, Row
 
 

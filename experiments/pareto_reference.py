@@ -20,7 +20,7 @@ from jaxvol.lighting import Lighting
 from jaxvol.march import Quadrature
 from jaxvol.metrics import rmse
 
-from .pareto_points import Image, program, templates
+from .pareto_programs import Image, program, templates
 from .pareto_scenes import Case, Row
 
 

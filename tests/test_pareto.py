@@ -16,12 +16,14 @@ from experiments import (
     pareto_measure,
     pareto_page,
     pareto_points,
+    pareto_programs,
     pareto_reference,
     pareto_scenes,
     record,
 )
 from experiments.pareto_front import behind, front
-from experiments.pareto_points import BASE, SETTINGS, Program, Setting
+from experiments.pareto_points import BASE, SETTINGS, Setting
+from experiments.pareto_programs import Program
 from experiments.pareto_scenes import ROWS, Case
 from experiments.scenes import PHANTOM, Scene
 
@@ -99,7 +101,7 @@ def ct():
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "float16", "float32"])
 def test_voxels_of_another_type_look_the_same_up_to_rounding(kind):
     case = ct()
-    other = pareto_points.stored(kind, case).scene
+    other = pareto_programs.stored(kind, case).scene
     assert other.volume.data.dtype == kind
     at = (jnp.asarray(s.volume.data, jnp.float32).ravel() for s in (case.scene, other))
     (_, before), (_, after) = (
@@ -114,7 +116,7 @@ def test_voxels_of_another_type_look_the_same_up_to_rounding(kind):
 
 def test_a_table_has_the_values_of_its_transfer_function():
     case = ct()
-    table = pareto_points.tabulated(64, case).scene.transfer
+    table = pareto_programs.tabulated(64, case).scene.transfer
     assert table.values.shape == (64,)
     assert table.values[0] == case.scene.transfer.values[0]
     assert table.values[-1] == case.scene.transfer.values[-1]
