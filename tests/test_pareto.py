@@ -82,6 +82,7 @@ def test_tables_cover_every_kind_and_names_are_unique_as_files():
     for names in (ROWS, SETTINGS):
         assert len({pareto_measure.slug(name) for name in names}) == len(names)
     assert {setting.family for setting in SETTINGS.values()} == set(pareto_chart.COLORS)
+    assert len(set(pareto_chart.COLORS.values())) == len(pareto_chart.COLORS)
     assert set(pareto_points.GRADIENTS) <= set(pareto_points.UNLIT)
     for row in rows:
         settings = pareto_points.of(row, {"VTK": "9", "Dr.Jit": "not here: no LLVM"})
