@@ -24,7 +24,7 @@ from .pareto_programs import Image, program, templates
 from .pareto_scenes import Case, Row
 
 
-TEMPLATES = 512
+TEMPLATES = 256
 """Two images of 32 templates each differ by 0.07 on the lit head, as much as they differ from those of some
 settings."""
 PIXELS = 256

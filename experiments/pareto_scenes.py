@@ -160,7 +160,7 @@ ROWS: dict[str, Row] = {
     "fetus phantom": Row(fetus, peers=UNBENT, toroidal=True, finer=8, part=0.25),
     "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.25),
     f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=UNLIT, lit=True, finer=4, part=0.5),
-    "engine, lit": Row(lit_engine, ENGINE, peers=UNLIT, lit=True, finer=4, part=0.5),
+    "engine, lit": Row(lit_engine, ENGINE, peers=UNLIT, lit=True, finer=4, part=0.25),
 }
 
 
