@@ -93,6 +93,9 @@ def in_float64(case: Case, march: jv.March, lighting: Lighting | None, pixels: n
             doubled, (case.scene.volume, case.scene.transfer, case.scene.camera, march, lighting)
         )
 
+        # voxels keep their type
+        volume = eqx.tree_at(lambda v: v.data, volume, case.scene.volume.data)
+
         def one(pixel: jax.Array) -> jax.Array:
             origin, direction = (jnp.stack(part) for part in camera.ray(pixel[0], pixel[1]))
             return jv.render_ray_reference(
@@ -103,7 +106,7 @@ def in_float64(case: Case, march: jv.March, lighting: Lighting | None, pixels: n
 
 
 def doubled(leaf: Any) -> Any:
-    """A leaf in float64; voxels keep their type."""
-    if eqx.is_inexact_array(leaf) and leaf.ndim < 3:
+    """A leaf in float64, if it is of floats."""
+    if eqx.is_inexact_array(leaf):
         return jnp.asarray(np.asarray(leaf, np.float64))
     return leaf
