@@ -33,19 +33,22 @@ Answer: TypeAlias = tuple[Any, Callable[[Path], None]]
 
 def experiment(
     name: str, question: str, about: str | None, **options: Any
-) -> Callable[[Callable[[Namespace], Answer]], Main]:
+) -> Callable[[Callable[[Namespace], Answer | None]], Main]:
     """Decorator that makes an experiment's `main` of a function from its options to its answer: it measures,
-    writes the record and draws the chart.
+    writes the record and draws the chart. An answer of None writes nothing.
 
     - `name`: of the module, and of the two files.
     - `about`: the module's docstring.
     - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
     """
 
-    def made(answer: Callable[[Namespace], Answer]) -> Main:
+    def made(answer: Callable[[Namespace], Answer | None]) -> Main:
         @command(about, record.RESULTS, seed=0, quick=QUICK, **options)
         def main(chosen: Namespace) -> None:
-            result, draw = answer(chosen)
+            found = answer(chosen)
+            if found is None:
+                return
+            result, draw = found
             path, ran = chosen.output / f"{name}.json", [f"experiments.{name}", *chosen.argv]
             record.write(path, question, result, seed=chosen.seed, command=ran)
             draw(path.with_suffix(".png"))

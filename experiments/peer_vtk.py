@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 import jaxvol as jv
 
@@ -59,6 +59,11 @@ def dense(transfer: jv.TransferFunction, volume: jv.Volume) -> jv.TransferFuncti
         values = jnp.arange(256.0)
     else:
         values = jnp.linspace(transfer.values[0], transfer.values[-1], 1024)
+    return tabulated(transfer, values)
+
+
+def tabulated(transfer: jv.TransferFunction, values: Float[Array, " n"]) -> jv.TransferFunction:
+    """The transfer function with these control points, on the same curves."""
     colors, extinction = jax.vmap(transfer)(values)
     return jv.TransferFunction(values, jnp.stack(colors, axis=-1), extinction)
 

@@ -28,7 +28,7 @@ def write(path: Path, question: str, result: Any, *, seed: int, command: list[st
         "command": shlex.join(["python", "-m", *command]),
         "seed": seed,
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
-        "commit": _commit(),
+        "commit": commit(),
         "device": _device(),
         "result": result,
     }
@@ -60,7 +60,7 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """The checkout's commit, with + if files differ from it; None outside a checkout."""
     here = Path(__file__).parent
 
