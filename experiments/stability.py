@@ -79,7 +79,7 @@ def draw(result: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
         panel.set_axis_off()
     for panel, (name, found) in zip(axes.flat, entries.items(), strict=False):
         chart(panel, ENTRIES[name], found)
-    handles = [plt.Rectangle((0, 0), 1, 1, color=color, alpha=0.35) for color in OUTCOMES.values()]
+    handles = [Rectangle((0, 0), 1, 1, color=color, alpha=0.35) for color in OUTCOMES.values()]
     labels = [f"edge; beyond it: {outcome}" for outcome in OUTCOMES if outcome != "bounded"]
     figure.legend(handles[1:], labels, loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(

@@ -32,7 +32,7 @@ PINS = {
     "gradients of opaque rays": Pin({14.0: 0.00353}, {16.5: 0.345}),
     "extinction without bound": Pin({1.0: 0.0, 1e6: 0.0, 1e38: 0.0}),
     "grazing exits": Pin({0.9: 0.0, 1e-4: 0.0, 2e-7: 0.0}),
-    "exits at the end of a cell": Pin({0.5: 0.0, 1e-5: 0.0}, {0.0: 1.0}),
+    "exits at the end of a cell": Pin({0.5: 0.0, 1e-5: 0.0, 0.0: 0.0}),
     "early termination in gradients": Pin({5e-5: 0.01822}, {2e-4: 0.06258}),
     "tolerances finer than the finest cell": Pin({0.01: 0.5795}, {0.004: 1.398}),
     "adaptive strides under light": Pin({0.005: 0.6104}, {0.002: 1.526}),
@@ -58,6 +58,17 @@ RELATIVE, ABSOLUTE = 0.1, 2e-5
 """How far a pinned number may move."""
 
 SLOW = {
+    "gradients at label faces",
+    "jitter at label faces",
+    "lopsided templates",
+    "tolerances finer than the finest cell",
+    "gradients of what is leapt over",
+    "wood grain without empty samples",
+    "gaps of rays under a toroidal map",
+    "voxels of 16-bit floats",
+    "jitter offsets near 1",
+    "extinction without bound",
+    "occupancy under steep transfer functions",
     "early termination in gradients",
     "adaptive strides under light",
     "sheets thinner than a cell of rays",

@@ -141,8 +141,8 @@ def fit(
     `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
     the residual does not determine.
 
-    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Where fits fail, and where
-    not: `experiments/stability.py`, "fits of what images do not show", "fits from opaque starts",
+    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Where fits fail, and
+    where not: `experiments/stability.py`, "fits of what images do not show", "fits from opaque starts",
     "fits under noise".
 
     **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a

@@ -68,11 +68,13 @@ class AlphaCorrection(Transform):
     labels: bool = eqx.field(static=True, default=False)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        reaches_past = cell.front + cell.width > ray.length
+        back = cell.front + cell.width
+        reaches_past = back > ray.length
         # A cell entirely past the exit is not sampled; its width only has to be ≥ 0.
         # Not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10).
         left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
-        cell = Cell(cell.front, jnp.where(reaches_past, left, cell.width), cell.cut | reaches_past)
+        # A cell that ends at the exit is not cut, but its width is the exit's to change.
+        cell = Cell(cell.front, jnp.where(back >= ray.length, left, cell.width), cell.cut | reaches_past)
         if not self.labels and not ray.path.gaps:
             return (cell,)
 

@@ -200,6 +200,7 @@ def extinction(transfer):
     return transfer.extinction
 
 
+@pytest.mark.slow
 def test_control_points_are_counted_from_images():
     """Candidates of 2 and 3 points, with only their extinction free, and a truth of each."""
     models = jv.nested_points(PLAIN, (2, 3), where=extinction)

@@ -94,6 +94,7 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, a
     assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
 
 
+@pytest.mark.slow
 def test_rays_end_early_only_where_some_become_opaque(sphere):
     volume, _, camera = sphere
     thin, thick = (jv.plan(volume, soft_transfer(d), camera, TOLERANCE) for d in (20.0, 0.05))
@@ -109,6 +110,7 @@ def test_gradients_let_rays_end_later_only(sphere):
     assert ends.opacity_left == pytest.approx(1e-4)
 
 
+@pytest.mark.slow
 def test_a_narrow_peak_is_integrated(sphere):
     volume, _, camera = sphere
     values = [0.0, 0.395, 0.4, 0.405, 1.0]
@@ -125,12 +127,14 @@ def test_an_empty_image_is_planned(sphere):
     assert found.error < TOLERANCE / 4
 
 
+@pytest.mark.slow
 def test_what_cannot_be_reached_is_said(sphere):
     found = plan_of(sphere, 1e-9)  # rounding is greater
     assert not found.within
     assert "not within the tolerance" in str(found)
 
 
+@pytest.mark.slow
 def test_transforms_of_the_scene_are_kept():
     volume, probe = jv.toroidal_phantom("spheres", (24, 20, 16))
     transfer = jv.preset("mr_head", (0, 255))
