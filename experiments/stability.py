@@ -18,6 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from matplotlib.patches import Rectangle
+
 from . import common
 from .atlas import ENTRIES, FAMILIES
 from .atlas.entry import Entry, pictured, sweep
