@@ -241,8 +241,8 @@ AT_END = Entry(
     limit=0.01,
     outcome="bounded",
     does="The gradient is exact for any e, and where the exit lies exactly at the end of a cell: then the "
-    "last cell is not cut, but its width is the exit's to change. This happens in orthographic views along an "
-    "axis with steps of one voxel.",
+    "last cell is not cut, but its width is the exit's to change. This happens in orthographic views along "
+    "an axis with steps of one voxel.",
     picture=at_end_picture,
     shows="derivative of each pixel by the spacing, seen along z: it should be the same everywhere on the "
     "cube",
