@@ -16,9 +16,10 @@ from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 
 from . import common
 from .atlas import ENTRIES, FAMILIES
@@ -45,8 +46,8 @@ def chart(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
         )
         lost = [v for v, number in zip(values, curve, strict=True) if not math.isfinite(number)]
         panel.plot(lost, [top] * len(lost), "x", color=line.get_color())
-    _scale(panel.set_xscale, entry.scales[0], values)
-    _scale(panel.set_yscale, entry.scales[1], [v for curve in found["curves"].values() for v in curve])
+    _scale(panel, "x", entry.scales[0], values)
+    _scale(panel, "y", entry.scales[1], [v for curve in found["curves"].values() for v in curve])
     if len(values) > 1 and values[0] > values[-1]:  # from harmless to harmful, from left to right
         panel.invert_xaxis()
     panel.axhline(entry.limit, color="0.6", linewidth=0.8, linestyle="--")
@@ -60,14 +61,30 @@ def chart(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     panel.legend(fontsize=6, framealpha=0.7)
 
 
-def _scale(setter: Any, scale: str, values: Sequence[float]) -> None:
+TICKS = 6
+"""At most, along an axis with a logarithmic scale."""
+
+
+def _scale(panel: Any, name: Literal["x", "y"], scale: str, values: Sequence[float]) -> None:
+    """Sets the scale of an axis, with ticks that do not overlap. Linear where nothing is positive."""
+    axis, setter = getattr(panel, f"{name}axis"), getattr(panel, f"set_{name}scale")
+    sizes = [abs(v) for v in values if v != 0 and math.isfinite(v)]
+    if scale == "linear" or not sizes:
+        setter("linear")
+        return
+    least, decades = min(sizes), math.log10(max(sizes) / min(sizes))
     if scale == "symlog":
-        least = min((abs(v) for v in values if v != 0 and math.isfinite(v)), default=1.0)
         setter("symlog", linthresh=least)
-    elif scale == "log":
-        setter("log", nonpositive="mask")
+        powers = range(math.floor(math.log10(least)), math.ceil(math.log10(max(sizes))) + 1)
+        every = -(-len(powers) // (TICKS - 1))
+        axis.set_ticks([0.0, *(10.0**power for power in powers[::-1][::every])])
     else:
-        setter(scale)
+        setter("log", nonpositive="mask")
+        axis.set_major_locator(LogLocator(numticks=TICKS))
+    if decades > 1:
+        axis.set_minor_formatter(NullFormatter())
+    else:  # ticks at powers of ten alone would be too few
+        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
 
 
 def draw(result: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
