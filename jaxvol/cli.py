@@ -328,7 +328,7 @@ def _render(options: argparse.Namespace) -> None:
         image_file("--depth", options.depth, 0)
     volume, transfer, camera = _view(options)
     background = None if options.transparent else options.background
-    march = _march(options, volume, transfer, camera)
+    volume, march = _march(options, volume, transfer, camera)
     _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
 
 
@@ -358,16 +358,18 @@ def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera
     return volume, transfer, camera.zoom(options.zoom)
 
 
-def _march(options: argparse.Namespace, volume: Volume, transfer: TransferFunction, camera: Camera) -> March:
-    """Of the given step; without one, as planned."""
+def _march(
+    options: argparse.Namespace, volume: Volume, transfer: TransferFunction, camera: Camera
+) -> tuple[Volume, March]:
+    """The volume and its march: of the given step; without one, as planned."""
     if options.step is None:
         found = plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance)
         if not found.within:
             print(f"RMSE {found.error:.2g} rather than {found.tolerance:.2g}; jaxvol plan tells more")
-        return found.march
+        return found.volume, found.march
     if options.tolerance is not None:
         raise ValueError("--tolerance finds a step; leave out --step.")
-    return March(options.step, FAST, "midpoint")
+    return volume, March(options.step, FAST, "midpoint")
 
 
 def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:

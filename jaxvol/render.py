@@ -2,6 +2,7 @@
 engine."""
 
 import math
+import warnings
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -46,7 +47,8 @@ def render(
 
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
-    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image.
+    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image,
+      without transforms that are part of the scene (a `ToroidalMap`).
     - `tolerance`: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
     - `compositing`: how the cells of a ray become a pixel: `"over"`, or a `Weighting` or `Selection`. Where
       a `Selection` chooses a depth, no adjoint marches again: JAX differentiates what is computed there.
@@ -84,9 +86,13 @@ def render(
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
     order = "render(volume, transfer, camera, march)"
-    if isinstance(march, str) and march == "auto":
+    if isinstance(march, str):
+        if march != "auto":
+            raise ValueError(f'march must be a jaxvol March or "auto"; got {march!r}.')
         given = PLANNED if tolerance is None else tolerance
         found = plan(volume, transfer, camera, given, compositing=compositing, lighting=lighting)
+        if not found.within:
+            warnings.warn(f"the image may not be within the tolerance: {found}", stacklevel=2)
         volume, march, lighting = found.volume, found.march, found.lighting
     elif tolerance is not None:
         raise ValueError(f'tolerance goes with march="auto"; got {tolerance!r} with {described(march)}.')

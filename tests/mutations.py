@@ -80,17 +80,17 @@ MUTATIONS = [
         ("planning/test_probe.py",),
     ),
     Mutation(
-        "plan: pixels that see nothing counted as if they had the error of the others",
+        "plan: patches at the edge counted as whole ones",
         "planning/probe.py",
-        "np.sqrt(max(unseen, 0.0))) * self.share)",
-        "np.sqrt(max(unseen, 0.0))))",
+        "inside = ((column < width) & (row < height)).astype(float)",
+        "inside = ((column < width + 9) & (row < height + 9)).astype(float)",
         ("planning/test_probe.py",),
     ),
     Mutation(
         "plan: the error of the most accurate image taken to be 0",
         "planning/probe.py",
-        "last * ratio / (1 - ratio))",
-        "0 * last * ratio / (1 - ratio))",
+        "return cls(probe, images[-1], last * ratio / (1 - ratio))",
+        "return cls(probe, images[-1], 0 * last)",
         ("planning/test_probe.py",),
     ),
     Mutation(
@@ -103,8 +103,8 @@ MUTATIONS = [
     Mutation(
         "plan: the tolerance ten times as large",
         "planning/plan.py",
-        "goal = MARGIN * tolerance - (ends if over else 0)",
-        "goal = 10 * MARGIN * tolerance - (ends if over else 0)",
+        "goal = MARGIN * tolerance - ends",
+        "goal = 10 * MARGIN * tolerance - ends",
         ("planning/test_plan.py::test_it_is_within_its_tolerance",),
     ),
     Mutation(

@@ -98,7 +98,7 @@ def test_examples_are_found_wherever_they_stand():
     )
     assert examples(text) == ["one = 1\n", "two = 2\nfor three in range(3):\n    pass"]
     assert sum(FITS in block for block in DOCUMENTS["README.md"]) == 1
-    assert len(DOCUMENTS["README.md"]) == 2
+    assert len(DOCUMENTS["README.md"]) == 3
 
 
 def test_every_link_to_a_file_leads_somewhere():

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from .._util.checks import described, integer, is_traced
 from ..arguments import check_arguments
@@ -15,13 +16,14 @@ from ..compositing import Compositing, Mode, Over, compositing_of
 from ..lighting.shading import Lighting
 from ..march import March, Transform
 from ..occupancy import Blocks
+from ..rendering import Rendering
 from ..space import node_distance
 from ..transfer import Transfer
 from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..volume import Volume
 from .probe import Probe, Setting, Truth
 from .storage import stored
-from .trials import Trial, Trials
+from .trials import COARSEST, RAY, Trial, Trials
 
 
 MARGIN = 0.85
@@ -46,6 +48,9 @@ OPAQUE = 0.01
 WORTHWHILE = 24
 """Samples of a pixel, by the midpoint rule, below which nothing else can be faster by more than some 15 %."""
 
+HALVED = 3
+"""How often the step is halved at most because light changes along a ray."""
+
 DECIDED = AdaptiveSampling, EarlyTermination, SpaceLeaping
 """Transforms that a plan decides on, besides `AlphaCorrection` at the exit."""
 
@@ -62,7 +67,7 @@ class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
     - `march`, `volume`, `lighting`: what to pass to `render`.
-    - `tolerance`: what was asked for. `error`: predicted; a bound that is exceeded in one of twenty cases.
+    - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels.
     - `seconds`: predicted for one image on this machine, once compiled. `samples`: predicted for each pixel.
     - `parts`: what was kept or left out, and why.
     - `probed`: seconds that planning took, compilation included.
@@ -85,8 +90,9 @@ class Plan(NamedTuple):
 
     def __str__(self) -> str:
         transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
+        missed = "" if self.within else "NOT WITHIN THE TOLERANCE: "
         head = (
-            f"step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}\n"
+            f"{missed}step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}\n"
             f"RMSE {self.error:.2g} predicted, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a "
             f"pixel; some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
         )
@@ -104,7 +110,7 @@ def plan(
     transforms: tuple[Transform, ...] | Any = (),
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
-    gradients: bool = False,
+    gradients: bool | Any = False,
     seed: int | Any = 0,
 ) -> Plan:
     """Finds the cheapest way to render a scene within a tolerance, by rendering parts of it.
@@ -117,7 +123,8 @@ def plan(
     - **quadrature and strides**: `"preintegrated"` and `AdaptiveSampling` are tried where rays take many
       samples, and kept where they take so many fewer that they are faster, by what a sample costs on CPU
       (`planning/trials.py`: `RAY`, `SAMPLE`).
-    - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image.
+    - **`SpaceLeaping`**: kept where blocks are proven empty, in images that are composited "over". It does
+      not change them; but extinctions of 0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces.
     - **`EarlyTermination`**: kept where rays end early, at an eighth of the tolerance, which bounds its error
@@ -126,7 +133,8 @@ def plan(
       no voxel changes, or the image by less than an eighth of the tolerance; else to float16, on the same
       terms.
     - **lighting**: the first of `Lighting.simpler` that is within the tolerance, compared with
-      `Lighting.smooth`; the step is halved as long as that changes the lit image by more than what is left.
+      `Lighting.smooth` (so many templates as given, blended: the noise that these have themselves does not
+      count); the step is halved as long as that changes the lit image by more than what is left.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
     estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
@@ -140,8 +148,9 @@ def plan(
     - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
     - `transforms`: those that are part of the scene, such as a `ToroidalMap`, or jitter. They are kept.
     - `compositing`, `lighting`: as for `render`.
-    - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, and lightings
-      without a gradient are left out. The tolerance is that of the image all the same.
+    - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, voxels keep
+      their type, and simpler lightings without a gradient are left out. The tolerance is that of the image
+      all the same. What is proven (empty space, faces) is proven for this transfer function only.
     - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
       `seconds`.
 
@@ -154,41 +163,58 @@ def plan(
     begun = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
+    if not isinstance(gradients, bool):
+        raise ValueError(f"gradients must be True or False; got {described(gradients)}.")
     setting = Setting(volume, transfer, compositing_of(compositing))
     tolerance, given = _checked(tolerance, transforms, (setting, camera, lighting))
     space = March(1.0, given).locate(volume)
-    probe = Probe.of(camera, space, integer("seed", seed, 0))
+    visible = transfer.visible(Blocks.of(volume))
+    probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
 
-    proven, parts = _proven(setting, given)
     over = isinstance(setting.compositing, Over)
-    ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
-    goal = MARGIN * tolerance - (ends if over else 0)
-    trials = Trials(
-        probe,
-        setting,
-        goal if lighting is None else goal * (1 - LIT),
-        float(jnp.median(node_distance(space, Blocks.of(volume).low.shape))),
-        (*given, *proven, *((EarlyTermination(ends),) if over else ())),
-    )
-    chosen, truth = _marched(trials, parts)
-    lit, light_error, light_seconds = None, 0.0, 0.0
+    proven, parts = _proven(np.asarray(visible), given, over=over)
+    ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
+    goal = MARGIN * tolerance - ends
+    voxel = float(jnp.median(node_distance(space, visible.shape)))
+
+    def trials_of(ends: float) -> Trials:
+        own = (EarlyTermination(ends),) if over else ()
+        steps = goal if lighting is None else goal * (1 - LIT)
+        return Trials(probe, setting, steps, tolerance, voxel, (*given, *proven, *own))
+
+    trials = trials_of(ends)
+    brightest = _brightest(trials.image(COARSEST, "midpoint"))
+    if over and brightest > 1:
+        ends = ends / brightest
+        trials = trials_of(ends)
+    chosen, truth = _marched(trials, parts, lit=lighting is not None)
+    brightest, lit, light_error, light_seconds = _brightest(truth.image), None, 0.0, 0.0
     if lighting is not None:
-        chosen, lit, light_error, light_seconds = _lit(
+        chosen, lit, light_error, light_seconds, brightest = _lit(
             trials, chosen, lighting, goal, parts, gradients=gradients
         )
     march = chosen.march
     if over:
-        opaque = probe.part(truth.image.rgba[:, 3] >= 1 - ends)
-        why = f"{opaque:.0%} of the pixels become opaque"
-        parts.append(Part(f"EarlyTermination({ends:.2g})", opaque >= OPAQUE, why))
+        opaque = probe.mean(truth.image.rgba[:, 3] >= 1 - ends)
+        why = f"{opaque:.1%} of the pixels become opaque"
+        parts.append(Part(_written(EarlyTermination(ends)), opaque >= OPAQUE, why))
         if opaque < OPAQUE:
-            march = _without(march, EarlyTermination)
-    setting, rounding, said = stored(probe, setting, chosen.march, tolerance * ENDS)
+            march, ends = _without(march, EarlyTermination), 0.0
+    rounding, said = 0.0, [(f"voxels as {volume.data.dtype}", True, "as they are given, for their gradient")]
+    if not gradients:
+        setting, rounding, said = stored(probe, setting, chosen.march, lit, tolerance * ENDS)
     parts += [Part(*each) for each in said]
-    error = chosen.error + light_error + rounding + (ends if over else 0)
+    error = chosen.error + light_error + rounding + ends * brightest
     seconds = _seconds(trials, chosen) + light_seconds
     taken = time.perf_counter() - begun
     return Plan(march, setting.volume, lit, tolerance, error, seconds, chosen.samples, tuple(parts), taken)
+
+
+def _brightest(image: Rendering) -> float:
+    """The brightest colour, 1 or more: by so much of what is left of a ray its early end may err."""
+    rgba = np.asarray(image.rgba, np.float64)
+    seen = rgba[:, 3] > 1e-3
+    return float(max(1.0, np.max(rgba[seen, :3] / rgba[seen, 3:], initial=0.0)))
 
 
 def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[Transform, ...]]:
@@ -199,7 +225,7 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
             "jax.vmap and jax.grad, and pass the march that it finds to render."
         )
     try:
-        number = float(tolerance)
+        number = math.nan if isinstance(tolerance, str) else float(tolerance)
     except (TypeError, ValueError) as fault:
         raise ValueError(f"tolerance must be a number; got {described(tolerance)}.") from fault
     if isinstance(tolerance, bool) or not 0 < number < 1:
@@ -214,9 +240,11 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     return number, given
 
 
-def _proven(setting: Setting, given: tuple[Transform, ...]) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that proofs decide on."""
-    visible = np.asarray(setting.transfer.visible(Blocks.of(setting.volume)))
+def _proven(
+    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...], *, over: bool
+) -> tuple[tuple[Transform, ...], list[Part]]:
+    """Transforms that proofs decide on, from the blocks that may hold anything visible. `over`: whether cells
+    are composited "over"."""
     found: list[Transform] = []
     parts = []
     faces = sum(bool(np.take(visible, end, axis).any()) for axis in range(3) for end in (0, -1))
@@ -229,16 +257,21 @@ def _proven(setting: Setting, given: tuple[Transform, ...]) -> tuple[tuple[Trans
     else:
         parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
     empty = float(1 - visible.mean())
-    leaps = isinstance(setting.compositing, Over) and empty >= EMPTY
-    parts.append(Part("SpaceLeaping", leaps, f"{empty:.0%} of the blocks hold nothing visible"))
+    leaps = over and empty >= EMPTY
+    why = f"{empty:.1%} of the blocks hold nothing visible" if over else "it is for images composited over"
+    parts.append(Part("SpaceLeaping", leaps, why))
     return (*found, *((SpaceLeaping(),) if leaps else ())), parts
 
 
-def _marched(trials: Trials, parts: list[Part]) -> tuple[Trial, Truth]:
-    """The cheapest march within the goal, unlit."""
+def _marched(trials: Trials, parts: list[Part], *, lit: bool) -> tuple[Trial, Truth]:
+    """The cheapest march within the goal, unlit. `lit`: whether it is for an image with light, along which
+    adaptive sampling cannot know how samples change."""
     uniform, truth = trials.uniform()
     step, samples = float(uniform.march.step) / trials.voxel, uniform.samples
     name = f"step {float(uniform.march.step):.4g}"
+    if not math.isfinite(uniform.error):
+        parts.append(Part(name, True, "the image is not finite, or rays use up their samples"))
+        return uniform, truth
     if uniform.error > trials.goal:
         parts.append(Part(name, True, f"{step:.2g} voxels, the shortest tried: not within the tolerance"))
         return uniform, truth
@@ -252,43 +285,47 @@ def _marched(trials: Trials, parts: list[Part]) -> tuple[Trial, Truth]:
         return uniform, truth
     others = {
         "preintegrated": trials.integrated(step, truth),
-        "AdaptiveSampling": trials.adaptive(step, truth),
+        "AdaptiveSampling": "it does not know light" if lit else trials.adaptive(step, truth),
     }
-    best = min([uniform, *(other for other in others.values() if other)], key=lambda each: each.cost)
+    found = [uniform, *(other for other in others.values() if isinstance(other, Trial))]
+    best = min(found, key=lambda each: each.cost)
     for name, other in others.items():
-        why = "not within the tolerance where it would be faster"
-        if other is not None:
-            ratio = other.cost / uniform.cost
-            length = float(other.march.step)
-            why = (
-                f"step {length:.4g}, {other.samples:.1f} samples a pixel for {samples:.1f}: cost {ratio:.2f}"
-            )
+        why = other
+        if isinstance(other, Trial):
+            fewer = f"{other.samples:.1f} samples a pixel for {samples:.1f}"
+            why = f"step {float(other.march.step):.4g}, {fewer}: cost {other.cost / uniform.cost:.2f}"
+        assert isinstance(why, str)
         parts.append(Part(name, other is best, why))
     return best, truth
 
 
 def _lit(
     trials: Trials, chosen: Trial, lighting: Lighting, goal: float, parts: list[Part], *, gradients: bool
-) -> tuple[Trial, Lighting, float, float]:
-    """The march, the cheapest lighting within what is left of the goal, its error, and the seconds that it
-    adds to an image."""
+) -> tuple[Trial, Lighting, float, float, float]:
+    """The march, the cheapest lighting within what is left of the goal, its error, the seconds that it adds
+    to an image, and the brightest colour."""
     probe, setting = trials.probe, trials.setting
     smooth = probe.render(setting, chosen.march, lighting.smooth)
-    tried = [each for each in lighting.simpler if each.has_gradient or not gradients]
-    left, best = goal - chosen.error, None
-    for other in (*((each.lighting, each.what) for each in tried), (lighting, "as given")):
-        error = probe.distance(probe.render(setting, chosen.march, other[0]), smooth)
-        if best is None or error < best[1]:
-            best = other[0], error
-        parts.append(Part(f"light: {other[1]}", error <= left, f"RMSE {error:.2g}"))
+    tried = [(each.lighting, each.what) for each in lighting.simpler if each.has_gradient or not gradients]
+    left, found = goal - chosen.error, []
+    for other, what in (*tried, (lighting, "as given")):
+        error = probe.distance(probe.render(setting, chosen.march, other), smooth)
+        found.append((error if math.isfinite(error) else math.inf, other, what))
         if error <= left:
             break
-    assert best is not None
-    lit, error = best
+    error, lit, used = min(found, key=lambda each: each[0])
+    if error <= left:
+        error, lit, used = found[-1]
+    for each, _, what in found:
+        why = f"RMSE {each:.2g}"
+        if what == used and error > left:
+            why += ", the least of these: not within the tolerance"
+        parts.append(Part(f"light: {what}", what == used, why))
     # how light changes along a ray is not known before: shorter steps must not change the image
-    march, change, allowed = chosen.march, math.inf, max(goal - error, goal * (1 - LIT))
+    march, change = chosen.march, math.inf
+    allowed = goal - error if error <= left else goal * (1 - LIT)
     image = probe.render(setting, march, lit)
-    for _ in range(3):
+    for _ in range(HALVED):
         half = March(march.step / 2, march.transforms, march.quadrature)
         finer = probe.render(setting, half, lit)
         change = 4 / 3 * probe.distance(image, finer)
@@ -296,12 +333,12 @@ def _lit(
             break
         why = f"with light, twice the step changes the image by {change:.2g}"
         parts.append(Part(f"step {float(half.step):.4g}", True, why))
-        image, march = finer, half
-    samples = probe.samples(image)
+        image, march, change = finer, half, change / 3
+    samples = probe.mean(image.samples)
     marched = Trial(march, max(chosen.error, change), samples, chosen.kind)
     unlit, with_light = (_fastest(trials, march, each) for each in (None, lit))
-    pixels = probe.pixels * probe.share / probe.source.origins.shape[0]
-    return marched, lit, error, max(with_light - unlit, 0.0) * pixels
+    pixels = probe.pixels * probe.share / probe.inside.size
+    return marched, lit, error, max(with_light - unlit, 0.0) * pixels, _brightest(image)
 
 
 def _without(march: March, kind: type[Transform]) -> March:
@@ -328,8 +365,11 @@ def _seconds(trials: Trials, chosen: Trial) -> float:
     for step in trials.steps("midpoint"):
         times.append(_fastest(trials, trials.march(step)))
         samples.append(float(np.asarray(trials.image(step, "midpoint").samples, np.float64).sum()))
-    a_sample = max(times[0] - times[1], 0.0) / max(samples[0] - samples[1], 1.0)
-    return a_sample * chosen.cost * trials.probe.pixels
+    pixels = trials.probe.pixels
+    if samples[0] <= 1.1 * samples[1]:  # nothing is seen
+        return times[1] * pixels * trials.probe.share / trials.probe.inside.size
+    a_sample = max(times[0] - times[1], 0.0) / (samples[0] - samples[1])
+    return a_sample * (chosen.cost - RAY * (1 - trials.probe.share)) * pixels
 
 
 def _written(transform: Transform) -> str:

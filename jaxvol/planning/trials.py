@@ -30,6 +30,9 @@ LONGEST = 8
 ones."""
 
 
+SLOWER = "not within the tolerance where it would be faster"
+
+
 class Trial(NamedTuple):
     """A march, the error of its image, samples for each pixel, and a key of `SAMPLE`."""
 
@@ -47,7 +50,7 @@ class Trial(NamedTuple):
 class Trials:
     """Marches of one scene that have been tried.
 
-    - `goal`: the error that they may have.
+    - `goal`: the error that they may have. `beyond`: that of the image, above which the plan fails.
     - `voxel`: world length that steps are counted in. `transforms`: of all marches.
     """
 
@@ -56,10 +59,11 @@ class Trials:
         probe: Probe,
         setting: Setting,
         goal: float,
+        beyond: float,
         voxel: float,
         transforms: tuple[Transform, ...],
     ):
-        self.probe, self.setting, self.goal = probe, setting, goal
+        self.probe, self.setting, self.goal, self.beyond = probe, setting, goal, beyond
         self.voxel, self.transforms = voxel, transforms
         self._images: dict[tuple[Quadrature, float], Rendering] = {}
 
@@ -105,12 +109,11 @@ class Trials:
                 break
             steps.append(steps[-1] / 2)
         if error > self.goal and math.isfinite(error):
-            best, error = steps[-1], truth.own
-            # its error is not known well enough to be within the goal
-            error = max(error, math.nextafter(self.goal, math.inf))
+            # its error is not known well enough
+            best, error = steps[-1], max(truth.own, math.nextafter(self.beyond, math.inf))
         elif best < COARSEST:
             best, error = self._between(best, error, truth, quadrature)
-        samples = self.probe.samples(self.image(best, quadrature))
+        samples = self.probe.mean(self.image(best, quadrature).samples)
         return Trial(self.march(best, quadrature), error, samples, quadrature), truth
 
     def _between(
@@ -135,28 +138,28 @@ class Trials:
     def _tried(self, march: March, kind: str, truth: Truth) -> Trial:
         """A march, rendered."""
         image = self.probe.render(self.setting, march)
-        return Trial(march, truth.error(image), self.probe.samples(image), kind)
+        return Trial(march, truth.error(image), self.probe.mean(image.samples), kind)
 
-    def integrated(self, step: float, truth: Truth) -> Trial | None:
-        """Pre-integration with the longest steps within the goal; None unless that is faster than the
-        midpoint rule with this `step`, in voxels, or where cells cannot be integrated."""
+    def integrated(self, step: float, truth: Truth) -> Trial | str:
+        """Pre-integration with the longest steps within the goal, if that is faster than the midpoint rule
+        with this `step`, in voxels; or why not."""
         if not self.integrable:
-            return None
+            return "these cells cannot be integrated"
         found, longer = None, step * SAMPLE["preintegrated"]
         while longer <= 2 * COARSEST:
             trial = self._tried(self.march(longer, "preintegrated"), "preintegrated", truth)
             if trial.error > self.goal:
                 break
             found, longer = trial, longer * 1.5
-        return found
+        return found or SLOWER
 
-    def adaptive(self, step: float, truth: Truth) -> Trial | None:
+    def adaptive(self, step: float, truth: Truth) -> Trial | str:
         """Adaptive sampling, with cells from half this step on, and the largest tolerance of its own that
-        keeps the goal; None if none does, or nothing can be predicted."""
+        keeps the goal; or why not."""
         windows = Windows.of(self.setting.volume)
         varies = self.setting.compositing.variation(self.setting.transfer, windows)
         if not bool(jnp.any(jnp.isfinite(varies.total))):
-            return None
+            return "it cannot be predicted how this scene varies"
         found, tolerance = None, 2 * self.goal
         for _ in range(4):
             march = self.march(step / 2, "midpoint", AdaptiveSampling(tolerance, LONGEST))
@@ -172,4 +175,4 @@ class Trials:
                 break
             else:
                 tolerance /= 4
-        return found
+        return found or SLOWER

@@ -1,15 +1,18 @@
 """Is a plan within its tolerance, and does it hold nothing that the scene does not need?"""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing import Over
+from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
 from jaxvol.metrics import rmse
+from jaxvol.occupancy import Blocks
+from jaxvol.planning import trials
 from jaxvol.planning.plan import _proven
-from jaxvol.planning.probe import Setting
 
 from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
 
@@ -89,7 +92,8 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, a
     data = np.zeros(volume.shape, np.float32)
     data[8:16, 8:16, 8:16] = 0.5
     data = np.roll(data, 8 * (1 if end else -1), axis)
-    proven, parts = _proven(Setting(jv.Volume(data, volume.spacing), transfer, Over()), ())
+    visible = transfer.visible(Blocks.of(jv.Volume(data, volume.spacing)))
+    proven, parts = _proven(np.asarray(visible), (), over=True)
     assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
     assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
 
@@ -108,6 +112,7 @@ def test_gradients_let_rays_end_later_only(sphere):
     found = jv.plan(volume, soft_transfer(0.05), camera, TOLERANCE, gradients=True)
     (ends,) = (each for each in found.march.transforms if isinstance(each, jv.EarlyTermination))
     assert ends.opacity_left == pytest.approx(1e-4)
+    assert found.volume.data.dtype == volume.data.dtype
 
 
 @pytest.mark.slow
@@ -120,18 +125,72 @@ def test_a_narrow_peak_is_integrated(sphere):
     assert error_of(found, volume, peak, camera) <= TOLERANCE
 
 
+@pytest.mark.slow
+def test_colours_above_1_let_rays_end_later(sphere):
+    volume, _, camera = sphere
+    thick = soft_transfer(0.05)
+    bright = jv.TransferFunction(thick.values, 50 * thick.colors, thick.extinction)
+    found = jv.plan(volume, bright, camera, TOLERANCE)
+    assert found.within
+    assert error_of(found, volume, bright, camera) <= TOLERANCE
+
+
+@pytest.mark.slow
+def test_a_small_object_in_a_large_image_is_seen():
+    data = np.zeros((64, 64, 64), np.uint8)
+    data[30:32, 40:42, 20:22] = 255
+    volume = jv.Volume(data)
+    points = [(60, (1, 0.8, 0.6), 0.0), (255, (1, 1, 1), 0.95)]
+    transfer = jv.TransferFunction.from_points(points, unit_distance=0.2)
+    camera = jv.Camera.looking_at(volume, (1, 0.5, 0.3), size=(192, 192))
+    for seed in range(5):
+        found = jv.plan(volume, transfer, camera, 0.003, seed=seed)
+        assert error_of(found, volume, transfer, camera) <= 0.003
+
+
 def test_an_empty_image_is_planned(sphere):
     volume, _, camera = sphere
     found = jv.plan(volume, uniform_transfer(0.0), camera, TOLERANCE)
     assert found.within
     assert found.error < TOLERANCE / 4
+    assert found.seconds < 1
 
 
 @pytest.mark.slow
-def test_what_cannot_be_reached_is_said(sphere):
-    found = plan_of(sphere, 1e-9)  # rounding is greater
+def test_what_cannot_be_reached_is_said(sphere, monkeypatch):
+    monkeypatch.setattr(trials, "FINE", 0.5)  # of a voxel, with both quadratures
+    monkeypatch.setattr(trials, "FINEST", 0.5)
+    found = plan_of(sphere, 2e-4)
     assert not found.within
     assert "not within the tolerance" in str(found)
+    volume, transfer, camera = sphere
+    with pytest.warns(UserWarning, match="may not be within"):
+        jv.render(volume, transfer, camera, "auto", tolerance=2e-4)
+
+
+@pytest.mark.slow
+def test_light_is_simpler_where_that_looks_the_same(sphere):
+    """Light that is nearly the same everywhere may be fetched from a grid, unless it is to be differentiated;
+    and the image is as far from that under all templates, blended, as the plan says."""
+    volume, transfer, camera = sphere
+    light = ScattererTemplates(jv.Material(0.3, 0.1, 1.4), ConstantLight((0.5, 0.5, 0.5)), templates=2)
+    tolerance = 0.05
+    found = jv.plan(volume, transfer, camera, tolerance, lighting=light)
+    fine = jv.March(float(volume.spacing.min()) / 8, (jv.AlphaCorrection(),), "midpoint")
+    truth = jv.render(volume, transfer, camera, fine, lighting=light.smooth)
+    image = jv.render(found.volume, transfer, camera, found.march, lighting=found.lighting)
+    error = max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1)))
+    assert found.within
+    assert error <= tolerance
+    assert isinstance(found.lighting, Deferred)
+    inner = found.lighting.lighting
+    assert isinstance(inner, ScattererTemplates)
+    assert inner.baked
+    kept: Any = jv.plan(volume, transfer, camera, tolerance, lighting=light, gradients=True).lighting
+    while isinstance(kept, Deferred):
+        kept = kept.lighting
+    assert isinstance(kept, ScattererTemplates)
+    assert not kept.baked
 
 
 @pytest.mark.slow
