@@ -324,9 +324,16 @@ MUTATIONS = [
     Mutation(
         "cut: last cell reaches past the exit",
         "transforms/alpha_correction.py",
-        "cell = Cell(cell.front, jnp.where(reaches_past, left, cell.width),",
+        "cell = Cell(cell.front, jnp.where(back >= ray.length, left, cell.width),",
         "cell = Cell(cell.front, cell.width,",
         ("transforms/test_alpha_correction.py::test_a_constant_volume_is_exact_under_jitter",),
+    ),
+    Mutation(
+        "cut: a cell that ends at the exit has a width that does not follow it",
+        "transforms/alpha_correction.py",
+        "jnp.where(back >= ray.length, left, cell.width)",
+        "jnp.where(reaches_past, left, cell.width)",
+        ("transforms/test_alpha_correction.py::test_the_gradient_by_an_exit_at_the_end_of_a_cell",),
     ),
     Mutation(
         "cut: part of a cell behind a label boundary dropped",

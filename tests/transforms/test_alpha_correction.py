@@ -1,5 +1,7 @@
 """Back faces: uneven if the last cell reaches past the exit, smooth if it is cut there."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -20,6 +22,29 @@ def images(transforms, quadrature, camera, step=0.11):
     exact = jv.render(volume, transfer, camera, jv.March(0.001, (jv.AlphaCorrection(),), "midpoint"))
     rendering = jv.render(volume, transfer, camera, jv.March(step, transforms, quadrature))
     return rendering, np.asarray(rendering.rgba - exact.rgba)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_the_gradient_by_an_exit_at_the_end_of_a_cell(fast):
+    """A ray of eight whole steps, or of a little more or less, through a constant cube."""
+    march = jv.March(0.25, (jv.AlphaCorrection(),), max_samples=16)
+    origin, direction = np.array([0.1, 0.2, -3], np.float32), np.array([0, 0, 1], np.float32)
+
+    @jax.jit
+    def slope(spacing):
+        def opacity(spacing):
+            along = jnp.stack([jnp.float32(0.25), jnp.float32(0.25), spacing])
+            volume = jv.Volume(np.ones((9, 9, 9), np.float32), along, [-1.0] * 3)
+            if fast:
+                return jv.render_rays(
+                    volume, uniform_transfer(1.0), origin[None], direction[None], march
+                ).rgba[0, 3]
+            return jv.render_ray_reference(volume, uniform_transfer(1.0), origin, direction, march).rgba[3]
+
+        return jax.grad(opacity)(spacing)
+
+    for spacing in np.array([0.25, 0.2501, 0.2499], np.float32):
+        assert slope(spacing) == pytest.approx(8 * np.exp(-8 * float(spacing)), rel=1e-5)
 
 
 # along z the value is constant on each ray, so that the exit is the only source of error
