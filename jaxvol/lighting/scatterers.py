@@ -252,9 +252,7 @@ class ScattererTemplates(Lighting):
         grid = f"computed on a grid of {baked.baked} nodes"
         few = self._with(templates=min(2, self.templates), blend=True, photons=8, baked=False)
         return (
-            Simpler(
-                Deferred(baked), f"computed on a grid of {baked.baked} nodes, fetched once per ray", False
-            ),
+            Simpler(Deferred(baked), f"{grid}, fetched once per ray", False),
             Simpler(Deferred(few), "two templates of eight photons, once per ray"),
             Simpler(baked, grid, False),
             Simpler(self._with(photons=4, baked=False), "four photons"),
