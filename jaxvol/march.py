@@ -221,7 +221,8 @@ class March(eqx.Module):
       by at most α τ / 8 times the difference of its colours. Where the transfer function is neither steep nor
       has narrow peaks, `"midpoint"` may be more accurate, in half to two thirds of the time. It takes one
       fetch for each cell and one more for each segment, or two for each piece where a transform's pieces are
-      not joined (`Transform.joins`).
+      not joined (`Transform.joins`). Extinction times the range of values must stay below the greatest number
+      of their type, 3e38 for float32: the integral over values is infinite beyond, and the image NaN.
       Of a labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take
       it there, too, and light is computed there.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to

@@ -26,12 +26,14 @@ from .storage import stored
 from .trials import COARSEST, RAY, Trial, Trials
 
 
-MARGIN = 0.85
+MARGIN = 0.95
 """Part of the tolerance that is used."""
 
-ENDS = 1 / 8
-"""Part of it for rays that end early, whose error is at most the transmittance at which they end; and for
-voxels of a smaller type."""
+ENDS = 1 / 16
+"""Part of it for rays that end early, whose error is at most the transmittance at which they end."""
+
+ROUNDED = 1 / 8
+"""Part of it that voxels of a smaller type may take, of what all else has left."""
 
 LIT = 1 / 2
 """Part of what is left that is for light, where there is any."""
@@ -127,11 +129,11 @@ def plan(
       not change them; but extinctions of 0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces.
-    - **`EarlyTermination`**: kept where rays end early, at an eighth of the tolerance, which bounds its error
-      (times the brightest colour, where that is above 1).
+    - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
+      error (over the brightest colour, where that is above 1).
     - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
-      no voxel changes, or the image by less than an eighth of the tolerance; else to float16, on the same
-      terms.
+      no voxel changes, or the image by less than an eighth of the tolerance and than what all else leaves of
+      it; else to float16, on the same terms.
     - **lighting**: the first of `Lighting.simpler` that is within the tolerance, compared with
       `Lighting.smooth` (so many templates as given, blended: the noise that these have themselves does not
       count); the step is halved as long as that changes the lit image by more than what is left.
@@ -174,40 +176,43 @@ def plan(
     over = isinstance(setting.compositing, Over)
     proven, parts = _proven(np.asarray(visible), given, over=over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
-    goal = MARGIN * tolerance - ends
     voxel = float(jnp.median(node_distance(space, visible.shape)))
 
-    def trials_of(ends: float) -> Trials:
+    def trials_of(ends: float, goal: float) -> Trials:
         own = (EarlyTermination(ends),) if over else ()
         steps = goal if lighting is None else goal * (1 - LIT)
         return Trials(probe, setting, steps, tolerance, voxel, (*given, *proven, *own))
 
-    trials = trials_of(ends)
-    brightest = _brightest(trials.image(COARSEST, "midpoint"))
-    if over and brightest > 1:
-        ends = ends / brightest
-        trials = trials_of(ends)
+    # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
+    # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
+    seen = trials_of(ends, tolerance).image(COARSEST, "midpoint")
+    opaque = probe.mean(seen.rgba[:, 3] >= 1 - ends) if over else 0.0
+    share = ends if opaque >= OPAQUE else 0.0
+    goal = MARGIN * tolerance - share
+    trials = trials_of(ends / _brightest(seen), goal)
     chosen, truth = _marched(trials, parts, lit=lighting is not None)
     brightest, lit, light_error, light_seconds = _brightest(truth.image), None, 0.0, 0.0
     if lighting is not None:
         chosen, lit, light_error, light_seconds, brightest = _lit(
             trials, chosen, lighting, goal, parts, gradients=gradients
         )
-    march = chosen.march
+    march, name = _without(chosen.march, EarlyTermination), "EarlyTermination"
+    if share:
+        ending = EarlyTermination(share / brightest)
+        march, name = March(march.step, (*march.transforms, ending), march.quadrature), _written(ending)
     if over:
-        opaque = probe.mean(truth.image.rgba[:, 3] >= 1 - ends)
-        why = f"{opaque:.1%} of the pixels become opaque"
-        parts.append(Part(_written(EarlyTermination(ends)), opaque >= OPAQUE, why))
-        if opaque < OPAQUE:
-            march, ends = _without(march, EarlyTermination), 0.0
+        parts.append(Part(name, bool(share), f"{opaque:.1%} of the pixels become opaque"))
+    error = chosen.error + light_error + share
     rounding, said = 0.0, [(f"voxels as {volume.data.dtype}", True, "as they are given, for their gradient")]
     if not gradients:
-        setting, rounding, said = stored(probe, setting, chosen.march, lit, tolerance * ENDS)
+        allowed = min(ROUNDED * tolerance, max(tolerance - error, 0))
+        setting, rounding, said = stored(probe, setting, chosen.march, lit, allowed)
     parts += [Part(*each) for each in said]
-    error = chosen.error + light_error + rounding + ends * brightest
     seconds = _seconds(trials, chosen) + light_seconds
     taken = time.perf_counter() - begun
-    return Plan(march, setting.volume, lit, tolerance, error, seconds, chosen.samples, tuple(parts), taken)
+    return Plan(
+        march, setting.volume, lit, tolerance, error + rounding, seconds, chosen.samples, tuple(parts), taken
+    )
 
 
 def _brightest(image: Rendering) -> float:
