@@ -74,7 +74,8 @@ def test_render_needs_nothing_but_a_file(volume_file, tmp_path):
 
 
 def render_file(volume_file, *words, size=("16", "16")):
-    return main(["render", str(volume_file), "--size", *size, *map(str, words)])
+    """The command with a given step, which need not be planned: all that a file needs beside it is above."""
+    return main(["render", str(volume_file), "--size", *size, "--step", "0.4", *map(str, words)])
 
 
 def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path, monkeypatch, capsys):
