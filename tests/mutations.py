@@ -103,8 +103,8 @@ MUTATIONS = [
     Mutation(
         "plan: the tolerance ten times as large",
         "planning/plan.py",
-        "goal = MARGIN * tolerance - ends",
-        "goal = 10 * MARGIN * tolerance - ends",
+        "goal = MARGIN * tolerance - share",
+        "goal = 10 * MARGIN * tolerance - share",
         ("planning/test_plan.py::test_it_is_within_its_tolerance",),
     ),
     Mutation(
