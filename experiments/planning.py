@@ -313,8 +313,11 @@ def main(chosen: Namespace) -> common.Answer:
     folder, large = common.data(), 512
     if chosen.quick:
         folder, chosen.scenes, chosen.size, chosen.every, chosen.repetitions, large = None, 2, 24, 2, 1, 32
-    rows, costs = [], {}
+    rows, costs, shape = [], {}, None
     for number, scene in enumerate(scenes(folder, chosen.scenes, chosen.size, chosen.seed)):
+        if scene.volume.shape != shape:
+            jax.clear_caches()  # a process cannot hold the programs of all volumes
+            shape = scene.volume.shape
         rows.append(measure(scene, number, number % chosen.every == 0, chosen.repetitions))
         if scene.name not in costs:
             costs[scene.name] = cost(scene, large)

@@ -150,16 +150,10 @@ def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False
     return classification.spanned(beside, *(classification.searched(end) for end in (front, back)))
 
 
-def contained(ray: Ray, depth: Scalar) -> Bool[Array, ""]:
-    """Whether this depth is inside the volume: neither past the exit nor in a gap."""
-    inside = depth < ray.length
-    return inside & ray.path.contains(ray.path(depth)) if ray.path.gaps else inside
-
-
 def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     """Opacity of a piece; 0 past the exit, and in gaps."""
     _, extinction = pipeline.classification.of_cells(measured)
-    inside = contained(ray, pipeline.march.sample(piece))
+    inside = ray.contains(pipeline.march.sample(piece))
     optical_depth = jnp.where(inside, extinction, 0) * piece.width
     # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
     t = jnp.tanh(optical_depth / 2)
@@ -178,7 +172,7 @@ def add(
     march, _, _, compositing = pipeline
     depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece)
     alpha = jnp.where(at.finished, 0, alpha)
-    fragment = Fragment(alpha, depth, value, color, taken & contained(ray, depth))
+    fragment = Fragment(alpha, depth, value, color, taken & ray.contains(depth))
     stats = at.stats
     if stats is not None:
         shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)

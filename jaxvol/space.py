@@ -6,7 +6,7 @@ different `Path`; the rest of the march is unaffected.
 """
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -21,20 +21,20 @@ from .volume import Volume
 class Path(eqx.Module):
     """A ray in grid coordinates."""
 
-    gaps: ClassVar[bool] = False
-    """Whether a ray may leave the grid between its entry and its exit."""
-
     @abstractmethod
     def __call__(self, s: Scalar) -> Vec3:
         """Grid coordinate at depth `s`, in world length past the entry."""
 
-    def contains(self, coordinate: Vec3) -> Bool[Array, ""]:
-        """Whether a coordinate of this path is inside the volume. False only in gaps."""
-        return jnp.ones((), bool)
+
+Gap: TypeAlias = tuple[Scalar, Scalar]
+"""Depths between which a ray is outside the grid."""
 
 
 class Space(eqx.Module):
     """The mapping between the world and a volume's grid."""
+
+    searches: ClassVar[bool] = False
+    """Whether `interval` and `gaps` search, in a loop."""
 
     @property
     @abstractmethod
@@ -49,6 +49,11 @@ class Space(eqx.Module):
     @abstractmethod
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         """Distances at which a line enters and leaves the grid; on a miss, the first exceeds the second."""
+
+    def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
+        """Where a line is outside the grid between its entry and its exit, which lies `length` from there:
+        equally many gaps for every line, in order; those that it does not have begin at infinity."""
+        return ()
 
     @abstractmethod
     def coordinate(self, point: Vec3) -> Vec3:
@@ -84,6 +89,7 @@ class Ray(eqx.Module):
       them as finely as the volume needs, however far away the camera is.
     - `path`: the ray in grid coordinates.
     - `pixel`: (column, row); keys everything random along the ray.
+    - `gaps`: depths between entry and exit where the ray is outside the volume; with gradients.
     """
 
     entry: Vec3
@@ -92,6 +98,17 @@ class Ray(eqx.Module):
     length: Scalar
     path: Path
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
+    gaps: tuple[Gap, ...] = ()
+
+    def contains(self, depth: Scalar) -> Bool[Array, "..."]:
+        """Whether this depth is inside the volume: neither past the exit nor in a gap."""
+        return (depth < self.length) & ~self.in_gap(depth)
+
+    def in_gap(self, depth: Scalar) -> Bool[Array, "..."]:
+        within = jnp.zeros(jnp.shape(depth), bool)
+        for left, back in self.gaps:
+            within |= (depth >= left) & (depth < back)
+        return within
 
 
 def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
@@ -110,7 +127,8 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
     start = jnp.where(hit, start, 0)  # a miss has infinite distances, whose products are NaN
     entry = along(close, direction, start)
     length = jnp.where(hit, far - start, 0)
-    ray = Ray(entry, direction, base + start, length, space.path(entry, direction), pixel)
+    path, gaps = space.path(entry, direction), space.gaps(entry, direction, length)
+    ray = Ray(entry, direction, base + start, length, path, pixel, gaps)
     return invalid(ray, ~jnp.isfinite(toward))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from experiments import record
 from experiments.command import command
 from experiments.common import plt, save
-from experiments.minimum_distance import HIERARCHY, MAP, PROVEN, PUBLISHED, named
+from experiments.minimum_distance import HIERARCHY, MAP, OF_VOXELS, PROVEN, PUBLISHED, VOXELS, named
 
 from .common import OUTPUT, RECORDS
 
@@ -18,30 +18,23 @@ PAPER = 8, 0.47  # R, time over that of the distance map
 
 
 def draw(measured: dict[str, Any], path: Path) -> None:
-    """A panel for each scene; above the points of the published method, their shares of wrong pixels."""
+    """A panel for each scene; below the points of the published method, their shares of wrong pixels."""
     scenes, cells = measured["result"]["scenes"], measured["result"]["cells"]
     size = (4.2 * len(scenes) + 0.4, 3.6)
     figure, (axes,) = plt.subplots(1, len(scenes), figsize=size, squeeze=False, layout="constrained")
     for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
-        for method, style in ((PUBLISHED, "C3o-"), (PROVEN, "C0s-")):
+        for method, style in ((PUBLISHED, "C3o-"), (OF_VOXELS, "C1^-"), (PROVEN, "C0s-")):
             ratios = [rows[named(method, cell)]["ratio"] for cell in cells]
             low, high = ([r[end] for r in ratios] for end in ("low", "high"))
             panel.plot(cells, [r["median"] for r in ratios], style, markersize=5, label=method)
             panel.fill_between(cells, low, high, color=style[:2], alpha=0.2, linewidth=0)
         for cell in cells:
-            row = rows[named(PUBLISHED, cell)]
-            panel.annotate(
-                f"{row['wrong']:.2%}",
-                (cell, row["ratio"]["median"]),
-                (0, 7),
-                textcoords="offset points",
-                ha="center",
-                fontsize=7,
-                color="C3",
-            )
-        panel.axhline(1, color="k", linestyle="--", label=MAP)
-        panel.axhline(rows[HIERARCHY]["ratio"]["median"], color="C2", linestyle="-.", label=HIERARCHY)
-        panel.plot(*PAPER, "kx", markersize=8, label="the paper")
+            wrong = rows[named(PUBLISHED, cell)]["wrong"]
+            panel.text(cell, 0.02, f"{wrong:.2%}", ha="center", fontsize=7, color="C3")
+        for method, color, line in ((MAP, "k", "--"), (VOXELS, "C1", "--"), (HIERARCHY, "C2", "-.")):
+            panel.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
+        off = rows[VOXELS]["ratio"]["median"] * PAPER[1]  # the paper's map is one of voxels
+        panel.plot(PAPER[0], off, "kx", markersize=8, label="the paper, off the distance map of voxels")
         panel.set_xscale("log", base=2)
         panel.set_xticks(cells, cells)
         panel.set_ylim(bottom=0)

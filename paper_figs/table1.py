@@ -29,9 +29,10 @@ def table(measured: dict[str, Any]) -> str:
     ]
     result = measured["result"]
     each = [
-        (name, size, result["volumes"][name][str(size)])
+        (f"{name}, {said}", size, condition["volumes"][name][str(size)])
+        for said, condition in result["conditions"].items()
         for size in result["sizes"]
-        for name in result["volumes"]
+        for name in condition["volumes"]
     ]
     for name, size, rows in each:
         cells = [f"{size}²", f"{rows[PLAIN]['seconds']:.3f} s"]

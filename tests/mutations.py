@@ -164,6 +164,27 @@ MUTATIONS = [
         ),
     ),
     Mutation(
+        "toroidal map: the first gap of a ray only",
+        "transforms/sector_faces.py",
+        "GAPS = 2",
+        "GAPS = 1",
+        ("transforms/test_toroidal_map.py::test_gaps_are_where_a_ray_is_outside_in_between",),
+    ),
+    Mutation(
+        "toroidal map: a ray is back as soon as it passes one face",
+        "transforms/sector_faces.py",
+        "reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces))",
+        "reduce(jnp.maximum, map(clear, to_faces))",
+        ("transforms/test_toroidal_map.py::test_gaps_are_where_a_ray_is_outside_in_between",),
+    ),
+    Mutation(
+        "alignment: cells are not cut at gaps",
+        "transforms/alpha_correction.py",
+        "here = (depth > cell.front) & (depth < cell.front + cell.width)",
+        "here = (depth > cell.front) & (depth < cell.front)",
+        ("transforms/test_toroidal_map.py::test_an_independent_marcher_sees_the_same",),
+    ),
+    Mutation(
         "entry: distances measured from a ray's base point, not from its origin",
         "space.py",
         "ray = Ray(entry, direction, base + start, length,",

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
-from .._util.vec3 import Vec3
 from .._util.xla import in_memory
 from ..beams import Box
 from ..camera import Camera
@@ -103,7 +102,8 @@ class _PixelTiles(RayTiles):
         column, row = self._pixels(tile, group_y * side + y, group_x * side + x)
         column, row = column.reshape(-1, group), row.reshape(-1, group)
         width, height = self.size
-        return entering(space, *lines(source, column, row), (column < width) & (row < height))
+        wanted = (column < width) & (row < height)
+        return entering(space, lines(source, column, row), wanted, self.tiling.searched)
 
     def box(self, source: Camera, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
@@ -153,7 +153,8 @@ class _OwnRayTiles(RayTiles):
         known = jnp.minimum(number, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
-        return entering(space, (x, y, z), (dx, dy, dz), source.pixel(known), number < count)
+        own = Line((x, y, z), (dx, dy, dz), source.pixel(known))
+        return entering(space, own, number < count, self.tiling.searched)
 
     def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
@@ -214,15 +215,10 @@ def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:
     return jax.vmap(jax.vmap(f))
 
 
-def entering(
-    space: Space,
-    origin: Vec3,
-    direction: Vec3,
-    pixel: tuple[Lanes, Lanes],
-    wanted: Bool[Array, "groups rays"],
-) -> Ray:
-    """Rays, cut to the volume; those that are not wanted miss it."""
-    ray = vmap_rays(lambda origin, direction, pixel: enter(space, origin, direction, pixel))(
-        origin, direction, pixel
-    )
+def entering(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], searched: int) -> Ray:
+    """Rays, cut to the volume; those that are not wanted miss it. `searched`: groups at a time, where ends of
+    rays are searched."""
+    group = jax.vmap(lambda line: enter(space, *line))
+    map_groups = partial(jax.lax.map, group, batch_size=searched) if space.searches else jax.vmap(group)
+    ray = map_groups(lines)
     return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))

@@ -31,7 +31,7 @@ from .._util.trees import PyTree, added, floats, zeros_of
 from .._util.vec3 import Scalar, Vec3, along
 from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..compositing import Weighting
-from ..reference import Pipeline, Progress, contained, measure, pieces
+from ..reference import Pipeline, Progress, measure, pieces
 from ..rendering import Rendering
 from ..space import Ray
 from ..transfer import Transfer, classification_of
@@ -168,7 +168,7 @@ class Replay(SampleVisitor):
             worth = [
                 value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
             ]
-        inside = vmap_cells(contained, of_cells=(False, True))
+        inside = vmap_cells(Ray.contains, of_cells=(False, True))
         carry, slopes = self._slopes(samples.opacity, weights, worth, given.worth, carry)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 

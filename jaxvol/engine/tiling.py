@@ -19,6 +19,8 @@ class Tiling(NamedTuple):
       refilled.
     - `tile`: beams that are marched to their ends before the next ones are made: 262 144 rays.
     - `direct_tile`: the same where JAX differentiates the march itself, and so keeps all its states.
+    - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
+      many steps as the slowest ray among them.
     - `chunk`: samples shaded at a time, a multiple of 128.
     """
 
@@ -29,6 +31,7 @@ class Tiling(NamedTuple):
     min_alive: float = 0.75
     tile: int = 4096
     direct_tile: int = 64
+    searched: int = 16
     chunk: int = CHUNK
 
     @property

@@ -48,7 +48,10 @@ OPAQUE = 0.01
 """Part of the pixels that become opaque, below which there is nothing to end early."""
 
 WORTHWHILE = 24
-"""Samples of a pixel, by the midpoint rule, below which nothing else can be faster by more than some 15 %."""
+"""Samples of a pixel, by the midpoint rule, below which nothing else can be faster by more than some 15 %;
+unless steps are shorter than FAIR voxels, of which cells that are integrated may need few."""
+
+FAIR = 0.5
 
 HALVED = 3
 """How often the step is halved at most because light changes along a ray."""
@@ -282,9 +285,9 @@ def _marched(trials: Trials, parts: list[Part], *, lit: bool) -> tuple[Trial, Tr
         return uniform, truth
     parts.append(Part(name, True, f"{step:.3g} voxels, {uniform.kind}: RMSE {uniform.error:.2g}"))
     if uniform.kind == "preintegrated":
-        parts.append(Part("preintegrated", True, "the midpoint rule would take more than 32 steps a voxel"))
+        parts.append(Part("preintegrated", True, "the midpoint rule would be slower within the tolerance"))
         return uniform, truth
-    if samples <= WORTHWHILE:
+    if samples <= WORTHWHILE and step >= FAIR:
         why = f"{samples:.1f} samples a pixel: too few to save any"
         parts.append(Part("preintegrated, AdaptiveSampling", False, why))
         return uniform, truth

@@ -1,6 +1,7 @@
 """Which steps, quadratures and strides are within a tolerance, and what do they cost?"""
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -90,12 +91,22 @@ class Trials:
         return integrator is not None and isinstance(self.setting.compositing, Over)
 
     def uniform(self) -> tuple[Trial, Truth]:
-        """The longest steps within the goal: by the midpoint rule; or integrated, where that would take more
-        than 32 steps for a voxel. And what they were compared with."""
+        """The longest steps within the goal: by the midpoint rule; or integrated, where that takes more than
+        32 steps of a voxel, or cannot be proven with them. And what they were compared with."""
         found, truth = self._longest("midpoint", FINE if self.integrable else FINEST)
         if found.error > self.goal and self.integrable and math.isfinite(found.error):
             found, truth = self._longest("preintegrated", FINEST)
+            found = min(found, *self._sampled(truth), key=lambda each: each.cost)
         return found, truth
+
+    def _sampled(self, truth: Truth) -> Iterator[Trial]:
+        """The longest steps within the goal by the midpoint rule, if any that was tried is: the truth may be
+        known better now."""
+        for step in sorted((step for of, step in self._images if of == "midpoint"), reverse=True):
+            error = truth.error(self.image(step, "midpoint"))
+            if error <= self.goal:
+                yield self._trial(*self._between(step, error, truth, "midpoint"), "midpoint")
+                return
 
     def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Trial, Truth]:
         """The longest steps within the goal, compared with steps of a quarter of them or less. If there are
@@ -113,8 +124,11 @@ class Trials:
             best, error = steps[-1], max(truth.own, math.nextafter(self.beyond, math.inf))
         elif best < COARSEST:
             best, error = self._between(best, error, truth, quadrature)
-        samples = self.probe.mean(self.image(best, quadrature).samples)
-        return Trial(self.march(best, quadrature), error, samples, quadrature), truth
+        return self._trial(best, error, quadrature), truth
+
+    def _trial(self, step: float, error: float, quadrature: Quadrature) -> Trial:
+        samples = self.probe.mean(self.image(step, quadrature).samples)
+        return Trial(self.march(step, quadrature), error, samples, quadrature)
 
     def _between(
         self, step: float, error: float, truth: Truth, quadrature: Quadrature

@@ -1,7 +1,6 @@
 """How wide is a cell that crosses a face? Sampling alignment, also called alpha correction (Kye 2013), at the
 exit; the same idea at faces of labels and gaps."""
 
-from collections.abc import Callable
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
@@ -15,7 +14,6 @@ from ..space import Ray
 from ..volume import Volume
 
 
-Region: TypeAlias = Callable[[Scalar], Int[Array, ""]]
 Bracket: TypeAlias = tuple[Scalar, Scalar, Bool[Array, ""]]
 """Inner end, outer end, and whether the region at the outer end differs from the inner one."""
 
@@ -35,8 +33,8 @@ class AlphaCorrection(Transform):
     the width e up to the exact exit: its opacity becomes `1 - exp(-extinction e)`, which is the paper's
     `1 - (1 - α)^(e/d)`. A volume of constant extinction is rendered exactly at any step.
 
-    Where a ray may leave the volume and re-enter it, as under `ToroidalMap`, the faces of such gaps are
-    found by bisection and cells are cut there, too; a gap shorter than a quarter of a cell may be missed.
+    Where a ray leaves the volume and re-enters it, as under `ToroidalMap`, cells are cut at both ends of such
+    a gap, too. Of a cell that holds several gaps, only the first and the last end of them are cut.
 
     With this transform, the image is continuous in the camera and in everything else that moves the exit,
     and its gradient is complete. Without it, the image jumps when a sample crosses the exit, and the
@@ -47,10 +45,11 @@ class AlphaCorrection(Transform):
     - `labels`: also cut cells where the volume's label changes between two samples; the face is found by
       bisection. The part before it is classified at the sample, the part behind it at the face: each by
       its own label, so that the faces of a segmentation stay smooth under jitter. A label that lasts less
-      than a cell may be missed. Costs a label fetch per bisection, and a second sample per cell.
+      than a cell may be missed. Costs a label fetch per bisection, and a second sample per cell. The ends of
+      gaps are then found by bisection, too.
 
-    Gradients treat the faces of labels and gaps as fixed in space: with respect to the camera, they miss
-    how such a face moves along a ray. The motion of the exit is included.
+    Gradients treat the faces of labels as fixed in space: with respect to the camera, they miss how such a
+    face moves along a ray; with `labels=True`, those of gaps, too. The motion of the exit is included.
 
     Where it fails, and where not: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
@@ -75,20 +74,42 @@ class AlphaCorrection(Transform):
         left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
         # A cell that ends at the exit is not cut, but its width is the exit's to change.
         cell = Cell(cell.front, jnp.where(back >= ray.length, left, cell.width), cell.cut | reaches_past)
-        if not self.labels and not ray.path.gaps:
-            return (cell,)
-
-        def region(s: Scalar) -> Int[Array, ""]:
-            coordinate = ray.path(s)
-            inside = ray.path.contains(coordinate)
-            return jnp.where(inside, volume.label(coordinate) if self.labels else 0, -1)
-
-        return _divided(cell, region)
+        if self.labels:
+            return _divided(cell, *_label_faces(cell, ray, volume))
+        return _divided(cell, *_gap_faces(cell, ray)) if ray.gaps else (cell,)
 
 
-def _divided(cell: Cell, region: Region) -> tuple[Cell, Cell, Cell]:
-    """Split a cell where its region first and last changes: three pieces, front to back. If the region does
-    not change, the last two have width 0."""
+def _divided(cell: Cell, first: Scalar, last: Scalar, changes: Bool[Array, ""]) -> tuple[Cell, Cell, Cell]:
+    """Split a cell at its first and last face: three pieces, front to back. If it has none, the last two have
+    width 0."""
+    end = cell.front + cell.width
+    first = jnp.where(changes, first, end)
+    last = jnp.where(changes, last, end)
+    last = jnp.where(last < first, first, last)
+    return (
+        Cell(cell.front, first - cell.front, cell.cut & (first >= end)),
+        Cell(first, last - first, cell.cut & (first < end) & (last >= end)),
+        Cell(last, end - last, cell.cut),
+    )
+
+
+def _gap_faces(cell: Cell, ray: Ray) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
+    """The first and the last end of a gap within a cell, and whether there is any."""
+    first = last = cell.front
+    found = jnp.zeros_like(cell.cut)
+    for depth in (end for gap in ray.gaps for end in gap):
+        here = (depth > cell.front) & (depth < cell.front + cell.width)
+        first, last = jnp.where(here & ~found, depth, first), jnp.where(here, depth, last)
+        found |= here
+    return first, last, found
+
+
+def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
+    """Where a cell's label first and last changes, a gap having one of its own; and whether it does."""
+
+    def region(s: Scalar) -> Int[Array, ""]:
+        return jnp.where(ray.in_gap(s), -1, volume.label(ray.path(s)))
+
     front, width = jax.lax.stop_gradient((cell.front, cell.width))
     depths = [front + width * (i / PROBES) for i in range(PROBES + 1)]
     regions = [region(depth) for depth in depths]
@@ -116,12 +137,4 @@ def _divided(cell: Cell, region: Region) -> tuple[Cell, Cell, Cell]:
     # each piece begins on its own side of the face, since it is sampled there
     _, first = face(regions[0], forward)
     last, _ = face(regions[-1], backward)
-    end = cell.front + cell.width
-    first = jnp.where(changes, first, end)
-    last = jnp.where(changes, last, end)
-    last = jnp.where(last < first, first, last)
-    return (
-        Cell(cell.front, first - cell.front, cell.cut & (first >= end)),
-        Cell(first, last - first, cell.cut & (first < end) & (last >= end)),
-        Cell(last, end - last, cell.cut),
-    )
+    return first, last, changes

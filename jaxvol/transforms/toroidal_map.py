@@ -22,19 +22,13 @@ from .._util.checks import Arrayable, finite_array, number, require
 from .._util.vec3 import Scalar, Vec3, along, apart
 from ..march import Transform
 from ..occupancy import BLOCK, Occupancy, Sums
-from ..space import Path, Space, slab_interval
+from ..space import Gap, Path, Space
 from ..volume import Volume
+from .sector_faces import SectorFaces, hypot
 
-
-STEPS = 64
-"""Maximum number of steps towards a face. Rays that need more graze it, and pass by it or along it."""
 
 CUBES = 48
 """Cells per side of the box around the sector, in the occupancy grid."""
-
-BACK = 0.01
-"""How far behind the origin an entry is searched for, in sizes of the probe. `enter` moves a ray's origin
-close to its entry, and rounding may take it past the entry: by this much for a camera 1e4 sizes away."""
 
 
 class ToroidalMap(Transform):
@@ -42,7 +36,9 @@ class ToroidalMap(Transform):
 
     The volume's own spacing and origin have no meaning under this map; world coordinates are the probe's,
     with the origin on the motor axis. The world is empty outside the swept sector. A ray may leave the sector
-    through its hollow near side and re-enter it; `AlphaCorrection` cuts cells at each such face.
+    and re-enter it, as through its hollow near side. Of such gaps two are found; what a third one hides is
+    taken for material, and a ray that is nowhere farther outside than 2e-6 of the probe's size counts as
+    inside. `AlphaCorrection` cuts cells at both ends of gaps.
 
     **Arguments:**
 
@@ -136,13 +132,15 @@ class ToroidalMap(Transform):
 
     def _forward(self, point: Vec3) -> Vec3:
         x, y, z = point
-        off = _hypot(y, z) - self.a
+        off = hypot(y, z) - self.a
         half = math.pi / 2
-        return half + _atan2(y, z), half + _atan2(x, off), _hypot(x, off) - self.b
+        return half + _atan2(y, z), half + _atan2(x, off), hypot(x, off) - self.b
 
 
 class _Sector(Space):
     """The space of a volume under a `ToroidalMap`."""
+
+    searches: ClassVar[bool] = True
 
     probe: ToroidalMap
     shape: tuple[int, int, int] = eqx.field(static=True)
@@ -179,9 +177,9 @@ class _Sector(Space):
         x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
         middle = jnp.arange(CUBES, dtype=x.dtype) + 0.5
         point = jnp.meshgrid(*(a + middle * step for a, step in zip(low, size, strict=True)), indexing="ij")
-        radius = jnp.sqrt(x * x + y * y + z * z) / 2 + 16 * float(jnp.finfo(x.dtype).eps) * self._size
-        rho = _hypot(point[1], point[2])
-        off = _hypot(point[0], rho - self.probe.a)
+        radius = jnp.sqrt(x * x + y * y + z * z) / 2 + 16 * float(jnp.finfo(x.dtype).eps) * self._faces.size
+        rho = hypot(point[1], point[2])
+        off = hypot(point[0], rho - self.probe.a)
 
         def angle(axis_distance: Scalar) -> Scalar:
             """Upper bound on the change of an angle about an axis within the sphere."""
@@ -205,97 +203,21 @@ class _Sector(Space):
     def path(self, entry: Vec3, direction: Vec3) -> "_Curved":
         return _Curved(self, entry, direction)
 
-    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """First entry, at most `BACK` behind the origin, and last exit; between them the ray may be outside.
-
-        A closed form is not worth its cost (the faces are two tori, two cones and two planes). But the
-        distance to each face has one, so each end is approached by steps of the least distance left to go.
-        The interval of a ray that grazes a face may include some of the empty space before it.
-        """
-        low, high = (apart(corner) for corner in self.probe.corners)
-        near, far = slab_interval(origin, direction, low, high)
-        near = jnp.maximum(near, -BACK * self._size)
-        hit = far > jnp.maximum(near, 0)
-        near, far = jnp.where(hit, near, 0), jnp.where(hit, far, 0)
-        first = self._face(origin, direction, near, far - near, 1)
-        last = self._face(origin, direction, far, far - near, -1)
-        hit &= last > first
-        return jnp.where(hit, first, jnp.inf), jnp.where(hit, last, -jnp.inf)
-
-    def _face(self, origin: Vec3, direction: Vec3, begin: Scalar, length: Scalar, sign: int) -> Scalar:
-        """Distance at which the sector begins, searched from `begin` over `length` along `sign` × the ray."""
-        tolerance = 8 * jnp.finfo(begin.dtype).eps * self._size
-
-        def outside_at(sector: _Sector, origin: Vec3, direction: Vec3, t: Scalar) -> tuple[Scalar, Scalar]:
-            """How far outside the sector a point is, and the derivative of that along the ray."""
-            one = jnp.ones_like(t)
-            return jax.jvp(lambda t: sector._outside(along(origin, direction, t)), (t,), (one,))
-
-        fixed = jax.lax.stop_gradient((self, origin, direction))
-        begin, length, tolerance = jax.lax.stop_gradient((begin, length, tolerance))
-
-        def cond(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> Bool[Array, ""]:
-            gone, outside, _, steps = state
-            return (outside > tolerance) & (gone <= length) & (steps < STEPS)
-
-        def body(state: tuple[Scalar, Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-            gone, outside, slope, steps = state
-            here = along(fixed[1], fixed[2], begin + sign * gone)
-            gone = gone + fixed[0]._clear(here, jnp.maximum(outside, tolerance), sign * slope)
-            return gone, *outside_at(*fixed, begin + sign * gone), steps + 1
-
-        outside, slope = outside_at(*fixed, begin)
-        gone, outside, _, _ = jax.lax.while_loop(cond, body, (0 * outside, outside, slope, 0 * outside))
-        t = begin + sign * gone
-        # One Newton step removes what the tolerance left, and carries the gradient of the implicit function.
-        value, slope = outside_at(self, origin, direction, t)
-        slope = jax.lax.stop_gradient(slope)
-        at_face = (jnp.abs(outside) <= 4 * tolerance) & (jnp.abs(slope) > 1e-3)
-        return jnp.where(at_face, t - value / jnp.where(at_face, slope, 1), t)
-
     @property
-    def _size(self) -> Scalar:
-        """Length scale of rounding errors."""
-        probe = self.probe
-        return jax.lax.stop_gradient(jnp.abs(probe.a) + probe.b + probe.gamma_range[1])
+    def _faces(self) -> SectorFaces:
+        probe, (low, high) = self.probe, map(apart, self.probe.corners)
+        ranges = probe.beta_range, probe.sigma_range, probe.gamma_range
+        return SectorFaces(probe.a, probe.b, *ranges, low, high)
 
-    def _clear(self, point: Vec3, outside: Scalar, slope: Scalar) -> Scalar:
-        """A step along the ray that cannot pass the face `outside` away, whose distance has `slope` < 0.
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        return self._faces.interval(origin, direction)
 
-        The distance f to each face has |f'| ≤ 1, so a step of f is safe. Its second derivative along a line
-        is at least -(1/ρ + 1/D), with D the distance to the circle of apexes, and this at most doubles within
-        half of the smaller of ρ and D. So f + f' s - ½ k s², with k = 4 / min(ρ, D), is a lower bound, and a
-        step to its root s is safe as well: near a face it is Newton's step, which does not slow down where
-        the ray meets the face obliquely.
-        """
-        x, y, z = point
-        rho = _hypot(y, z)
-        near = jnp.minimum(rho, _hypot(x, rho - self.probe.a))
-        slope = jnp.minimum(slope, 0)
-        root = jnp.sqrt(slope * slope + 8 * outside / jnp.maximum(near, outside))
-        return jnp.maximum(outside, jnp.minimum(2 * outside / (root - slope), near / 2))
-
-    def _outside(self, point: Vec3) -> Scalar:
-        """Lower bound on a point's distance from the sector; negative inside."""
-        x, y, z = point
-        probe, half = self.probe, math.pi / 2
-        off = _hypot(y, z) - probe.a
-        depth = _hypot(x, off) - probe.b
-        outside = jnp.maximum(probe.gamma_range[0] - depth, depth - probe.gamma_range[1])
-        for (first, last), across, ahead in (
-            (probe.sigma_range - half, x, off),
-            (probe.beta_range - half, y, z),
-        ):
-            before = ahead * jnp.sin(first) - across * jnp.cos(first)
-            beyond = across * jnp.cos(last) - ahead * jnp.sin(last)
-            outside = jnp.maximum(outside, jnp.maximum(before, beyond))
-        return outside
+    def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
+        return self._faces.gaps(entry, direction, length)
 
 
 class _Curved(Path):
     """A straight world ray in the grid of a sector."""
-
-    gaps: ClassVar[bool] = True
 
     sector: _Sector
     entry: Vec3
@@ -303,27 +225,6 @@ class _Curved(Path):
 
     def __call__(self, s: Scalar) -> Vec3:
         return self.sector.coordinate(along(self.entry, self.direction, s))
-
-    def contains(self, coordinate: Vec3) -> Bool[Array, ""]:
-        probe, inside = self.sector.probe, jnp.ones((), bool)
-        rounding = 16 * float(jnp.finfo(coordinate[0].dtype).eps)
-        axes = (
-            (probe.beta_range, math.pi),
-            (probe.sigma_range, math.pi),
-            (probe.gamma_range, self.sector._size),
-        )
-        for c, n, (ends, size) in zip(coordinate, self.sector.shape, axes, strict=True):
-            # rounding at a face must not decide whether its sample is visible
-            slack = rounding * size / (ends[1] - ends[0]) * (n - 1)
-            inside = inside & (c >= -slack) & (c <= n - 1 + slack)
-        return inside
-
-
-def _hypot(a: Scalar, b: Scalar) -> Scalar:
-    """sqrt(a² + b²), with gradient 0 at the origin."""
-    square = a * a + b * b
-    away = square > 0
-    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)
 
 
 def _atan2(a: Scalar, b: Scalar) -> Scalar:
