@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 import jaxvol as jv
@@ -46,6 +47,7 @@ CONDITIONS = {
 
 def measure(scene: Scene, repetitions: int, seed: int, condition: Condition) -> dict[str, Any]:
     """Time and error of a scene's frame under every march."""
+    jax.clear_caches()  # a process cannot hold the programs of all scenes
     under = {
         name: jv.March(scene.step, (*marches.transforms(name, seed), *condition.transforms))
         for name in METHODS
