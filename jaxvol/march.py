@@ -189,7 +189,7 @@ class Transform(eqx.Module):
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
-        is fixed; a piece may have width 0."""
+        is fixed; where it is more than one, a piece may have width 0."""
         return (cell,)
 
     joins: ClassVar[bool] = False

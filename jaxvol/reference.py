@@ -160,17 +160,28 @@ def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Sc
     return 2 * t / (1 + t)
 
 
-def is_sample(march: March, ray: Ray, piece: Cell) -> Bool[Array, ""]:
-    """Whether a piece counts as a sample. Where a cell is not divided, some of its pieces have width 0."""
-    return (march.sample(piece) < ray.length) & (piece.width > 0)
+def is_sample(march: March, ray: Ray, piece: Cell, *, alone: bool) -> Bool[Array, ""]:
+    """Whether a piece counts as a sample. `alone`: cells are never divided; otherwise some pieces of those
+    that are not have width 0."""
+    before_exit = march.sample(piece) < ray.length
+    # not where it is known: it would take 15 % of a frame whose last cells are cut
+    return before_exit if alone else before_exit & (piece.width > 0)
 
 
 def add(
-    pipeline: Pipeline, ray: Ray, at: Progress, piece: Cell, value: Scalar, color: Vec3 | None, alpha: Scalar
+    pipeline: Pipeline,
+    ray: Ray,
+    at: Progress,
+    piece: Cell,
+    value: Scalar,
+    color: Vec3 | None,
+    alpha: Scalar,
+    *,
+    alone: bool,
 ) -> Progress:
-    """Composites a piece of the next cell. A ray that is finished sees no more."""
+    """Composites a piece of the next cell. A ray that is finished sees no more. `alone`: of `is_sample`."""
     march, _, _, compositing = pipeline
-    depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece)
+    depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece, alone=alone)
     alpha = jnp.where(at.finished, 0, alpha)
     fragment = Fragment(alpha, depth, value, color, taken & ray.contains(depth))
     stats = at.stats
@@ -217,14 +228,15 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     at, _ = with_stride(pipeline, ray, at)
     stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, classification)
     after, alphas, color = at, [], None
-    for piece in pieces(pipeline, ray, at):
+    cut = pieces(pipeline, ray, at)
+    for piece in cut:
         measured = measure(pipeline, ray, piece)
         alphas.append(opacity(pipeline, ray, piece, measured))
         if not isinstance(compositing, Selection):
             transmittance = compositing.transmittance(after.composite)
             classified = classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
-        after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1])
+        after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1], alone=len(cut) == 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     after = move(march, ray, stop(pipeline, after), transparent, stride)
     if at.stride is None:  # a scan has as many steps as a ray may take

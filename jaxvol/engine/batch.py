@@ -77,7 +77,6 @@ class Job(NamedTuple):
     """All that does not change while rays are marched.
 
     - `empty_space`: where it is known, and `prepared`, what it has found out about these beams.
-    - `any_order`: whether the first pass takes all rays.
     """
 
     pipeline: Pipeline
@@ -86,25 +85,20 @@ class Job(NamedTuple):
     visitor: SampleVisitor | None
     empty_space: EmptySpaceIndex | None
     prepared: PyTree
-    any_order: Bool[Array, ""]
 
     def alive(self, at: Progress) -> Bool[Array, "*rays"]:
         """Rays that are not finished, and may take more samples."""
         return ~at.finished & (at.index < self.pipeline.march.most_samples)
 
-    def wanted(self, at: Progress, regular: bool) -> Bool[Array, "*rays"]:
-        """Rays to march in this pass: in the `regular` one, or where samples are limited, all that are alive;
-        otherwise those that may still shift, or all if `any_order`."""
-        alive = self.alive(at)
-        if regular or self.pipeline.march.max_samples is not None:
-            return alive
-        return alive & (self.any_order | ~regular_from_here(at))
+    def shifts(self, at: Progress) -> Bool[Array, "*rays"]:
+        """Those of them that still have a shift ahead."""
+        return self.alive(at) & ~regular_from_here(at)
 
 
 def march_batch(
-    job: Job, rows: Int[Array, " batch"], state: State, keep: Int[Array, ""], *, regular: bool
+    job: Job, rows: Int[Array, " batch"], state: State, keep: Int[Array, ""]
 ) -> tuple[State, Bool[Array, " batch"]]:
-    """Marches the groups in these rows while more than `keep` of them are wanted, and tells which still are.
+    """Marches the groups in these rows while more than `keep` of them are alive, and tells which still are.
     A row past the last one stands for no group."""
     tiling, beams, visitor = job.tiling, job.beams, job.visitor
     size, group = rows.size, tiling.group
@@ -132,11 +126,14 @@ def march_batch(
     more = jax.tree.map(lambda leaf: jnp.zeros((size * group, *leaf.shape[2:]), leaf.dtype), sums)
     more = varying(more, rays)
 
-    def going(here: Progress) -> Bool[Array, " batch"]:
+    def groups(rays: Bool[Array, " rays"]) -> Bool[Array, " batch"]:
         # XLA finds the maximum of floats with SIMD, but looks at one truth value after the other
-        return jnp.max(grouped(job.wanted(here, regular).astype(jnp.float32)), axis=-1) > 0
+        return jnp.max(grouped(rays.astype(jnp.float32)), axis=-1) > 0
 
-    def advance(state: State) -> State:
+    def enough(here: Progress) -> Bool[Array, ""]:
+        return jnp.sum(groups(job.alive(here))) > keep
+
+    def advance(state: State, *, regular: bool) -> State:
         here, (mine, more, total) = state
         here = _to_next_cell(job, beam, rays, here)
         after, samples = march_segment(job.pipeline, tiling, rays, here, regular=regular)
@@ -145,11 +142,20 @@ def march_batch(
             more = jax.tree.map(jnp.add, more, found)
         return finished_after(range_, after), (mine, more, total)
 
-    here, (mine, more, total) = jax.lax.while_loop(
-        lambda state: jnp.sum(going(state[0])) > keep, advance, (here, (mine, more, total))
-    )
+    # segments in which a ray may shift, or run out of samples, cost a tenth more: so as few as possible
+    limited = job.pipeline.march.max_samples is not None
+    marched: State = here, (mine, more, total)
+    if job.pipeline.march.may_shift or limited:
+        marched = jax.lax.while_loop(
+            lambda state: enough(state[0]) & (limited | jnp.any(job.shifts(state[0]))),
+            partial(advance, regular=False),
+            marched,
+        )
+    if not limited:
+        marched = jax.lax.while_loop(lambda state: enough(state[0]), partial(advance, regular=True), marched)
+    here, (mine, more, total) = marched
     visited = jax.tree.map(scatter, carry, mine), jax.tree.map(scatter_add, sums, more), total
-    return (jax.tree.map(scatter, at, here), visited), going(here)
+    return (jax.tree.map(scatter, at, here), visited), groups(job.alive(here))
 
 
 def with_fields(at: Progress, **changes: Array) -> Progress:

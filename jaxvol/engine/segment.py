@@ -8,6 +8,7 @@ opacities a third. (Measured on CPU.)
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -85,35 +86,44 @@ def march_segment(
     at the end of a run. `regular`: no ray has a shift ahead of it."""
     march, classification = pipeline.march, pipeline.classification
     number = tiling.cells if at.stride is None else min(tiling.cells, RUN)
-    samples = _sampled(pipeline, number, ray, at)
-    taken: Int[Array, " rays"] | int
-    taken, shifted = number, None
+    every = samples = _sampled(pipeline, number, ray, at)
+    taken: Int[Array, " rays"] | None = None
+    shifted = None
     # otherwise runs begin and end with segments
     partly = at.phase is not None or RUN % number > 0
     if not regular or (at.stride is not None and partly):
-        taken, shifted = _taken(march, at, samples)
-        samples = _without(samples, taken, ray)
+        taken, shifted = in_memory(always(at), partial(_taken, march), at, every.opacity)
+        samples = _without(every, taken, ray)
     colors: list[Vec3] | list[None]
     if isinstance(pipeline.compositing, Selection):
-        colors = [None] * len(samples.cells)
+        colors = [None] * len(every.cells)
     elif classification.light is None:
-        colors = _colors(pipeline, at, samples.measured)
+        colors = _colors(pipeline, at, every.measured)
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
         )
-    values = [read[0] for read in samples.measured]
-    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
+    values = [read[0] for read in every.measured]
+    cells = tuple(zip(every.cells, values, colors, every.opacity, strict=True))
 
-    def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
+    def composited(ray: Ray, at: Progress, taken: Bool[Array, ""] | None, cell: Any) -> Progress:
+        finished = at.finished
+        if taken is not None:
+            at = replace(at, finished=finished | ~taken)
         for piece in cell:
-            at = add(pipeline, ray, at, *piece)
-        return stop(pipeline, at)
+            at = add(pipeline, ray, at, *piece, alone=len(cell) == 1)
+        return stop(pipeline, replace(at, finished=finished))
 
-    each = jax.vmap(composited)
+    def next_(at: Progress, each: tuple[Int[Array, ""], Any]) -> tuple[Progress, None]:
+        index, cell = each
+        # not from `samples`, whose arrays would have to be stored
+        takes = None if taken is None else index < taken
+        return jax.vmap(composited)(ray, at, takes, cell), None
+
     # unrolled, so that nothing between two cells is put in memory
-    after, _ = jax.lax.scan(lambda at, cell: (each(ray, at, cell), None), at, cells, unroll=number)
-    steps = jnp.broadcast_to(jnp.asarray(taken, at.index.dtype), at.index.shape)
+    order = jnp.arange(number, dtype=at.index.dtype)
+    after, _ = jax.lax.scan(next_, at, (order, cells), unroll=number)
+    steps = jnp.full_like(at.index, number) if taken is None else taken
     steps = steps if at.stride is None else steps * at.stride
     return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples
 
@@ -214,19 +224,23 @@ def _measured_over(
     return [classification.spanned(*each) for each in zip(beside, fronts, backs, strict=True)]
 
 
-def _taken(march: March, at: Progress, samples: Samples) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
+def _taken(
+    march: March, at: Progress, opacity: list[Scalar]
+) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
     """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
     shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
     left = march.most_samples - at.index
-    number = jnp.arange(samples.number, dtype=at.index.dtype)
+    number = jnp.arange(opacity[0].shape[0], dtype=at.index.dtype)
     if at.stride is not None:
         run, phase = RUN * at.stride, 0 if at.phase is None else at.phase
         steps = jnp.minimum(left, run - ((at.index + phase) & (run - 1)))
-        left = jnp.sum(begins(at, samples.number) < steps[None], axis=0, dtype=left.dtype)
-    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=0)
+        left = jnp.sum(begins(at, number.size) < steps[None], axis=0, dtype=left.dtype)
     cells = number.size
-    # a minimum, since XLA computes argmax by comparing pairs
-    first = jnp.min(jnp.where(transparent, number[:, None] + 1, cells + 1), axis=0)
+    # cell by cell, back to front: a reduction over all of them would be a loop of its own
+    first = jnp.full_like(left, cells + 1)
+    for k in reversed(range(cells)):
+        transparent = jnp.all(jnp.stack([alpha[k] for alpha in opacity]) == 0, axis=0)
+        first = jnp.where(transparent, k + 1, first)
     shifted = ~regular_from_here(at) & (first <= jnp.minimum(left, cells))
     return jnp.minimum(jnp.where(shifted, first, cells), left), shifted
 

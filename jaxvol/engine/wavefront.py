@@ -3,10 +3,8 @@
 - Rays are compacted in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is
   marched segment by segment until too few of its groups are left (`Tiling.min_alive`); then batches are made
   up anew from the groups that are left. Idle lanes cost as much as working ones.
-- A ray that may still shift (`Transform.shift`) must stop at its next transparent cell. Groups with such rays
-  are marched first; the second pass can then take whole segments without that test. If more than half of the
-  groups have such rays, and rays do not leap, the first pass takes all groups, so that neighbours stay
-  together in the cache. Where the number of samples is limited, there is only the first pass.
+- A ray that may still shift (`Transform.shift`) must stop at its next transparent cell. As soon as a batch
+  has no such rays left, it takes whole segments without that test.
 - Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments.
 
 None of it shows in an image: cells, transforms and compositing are those of `reference`. (Measured on CPU.)
@@ -37,7 +35,7 @@ from ..reference import (
 from ..space import Ray
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
 from .rays import vmap_rays
-from .segment import SampleVisitor, regular_from_here
+from .segment import SampleVisitor
 from .tiling import Tiling
 
 
@@ -58,7 +56,7 @@ def march_rays(
         prepared = index.prepare(beams.box, tiling.cells * march.step)
         visible = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
         finished |= ~jnp.repeat(visible, beams.groups // beams.count)[:, None]
-    job = Job(pipeline, beams, tiling, visitor, index, prepared, jnp.zeros((), bool))
+    job = Job(pipeline, beams, tiling, visitor, index, prepared)
     at = with_fields(at, finished=finished)
     # Rays that may shift begin behind a transparent first cell. Not for a `Selection`, to which such cells
     # may matter; not where rays leap, since a leap shifts them, too; not for a visitor, which must see every
@@ -66,24 +64,17 @@ def march_rays(
     weighs = isinstance(pipeline.compositing, Weighting)
     if march.may_shift and weighs and index is None and visitor is None:
         at = _past_first_cell(pipeline, rays, at)
-        alive = job.alive(at)
-        job = job._replace(any_order=_mostly(alive & ~regular_from_here(at), of=alive))
     if beams.range is not None:
         over = vmap_rays(partial(over_transparent, pipeline))
         # `first` is not a valid index for rays that see nothing: these are finished before, and so not moved.
         at = over(rays, finished_after(beams.range, at), beams.range.first)
     visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
     state: State = varying((at, visited), rays)
-    limited = march.max_samples is not None
-    if march.may_shift or limited:
-        state = _pass(job, state, regular=False)
-    if not limited:
-        state = _pass(job, state, regular=True)
-    return state
+    return _marched(job, state)
 
 
-def _pass(job: Job, state: State, *, regular: bool) -> State:
-    """Marches groups for as long as any of their rays is wanted, in rounds of batches."""
+def _marched(job: Job, state: State) -> State:
+    """Marches groups for as long as any of their rays is alive, in rounds of batches."""
     size = min(job.tiling.batch, job.beams.groups)
     enough = int(job.tiling.min_alive * size)
 
@@ -95,18 +86,13 @@ def _pass(job: Job, state: State, *, regular: bool) -> State:
 
         def one(i: Int[Array, ""], state: tuple[State, Array]) -> tuple[State, Array]:
             some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
-            after, going = march_batch(job, some, state[0], keep, regular=regular)
+            after, going = march_batch(job, some, state[0], keep)
             return after, state[1].at[some].set(going, mode="drop")
 
         return jax.lax.fori_loop(0, batches, one, state)
 
-    going = jnp.any(job.wanted(state[0], regular), axis=-1)
+    going = jnp.any(job.alive(state[0]), axis=-1)
     return jax.lax.while_loop(lambda state: jnp.any(state[1]), round_, (state, going))[0]
-
-
-def _mostly(some: Bool[Array, "groups rays"], of: Bool[Array, "groups rays"]) -> Bool[Array, ""]:
-    """Whether more than half of the groups with any ray of the one kind have one of the other."""
-    return 2 * jnp.sum(jnp.any(some, axis=-1)) > jnp.sum(jnp.any(of, axis=-1))
 
 
 def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
@@ -123,7 +109,7 @@ def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
         moved = move(march, ray, begun, jnp.ones((), bool), stride)
         if moved.stats is not None:
-            taken = jnp.sum(jnp.stack([is_sample(march, ray, piece) for piece in cut]))
+            taken = jnp.sum(jnp.stack([is_sample(march, ray, piece, alone=len(cut) == 1) for piece in cut]))
             samples = moved.stats.samples + taken.astype(moved.stats.samples.dtype)
             moved = eqx.tree_at(lambda moved: moved.stats.samples, moved, samples)
         return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
