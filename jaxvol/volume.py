@@ -128,14 +128,16 @@ class Volume(eqx.Module):
 
         - `"trilinear"`: derivative of the trilinear interpolant within a cell: exact for the rendered
           field, discontinuous between cells.
-        - `"central"`: difference between one node to either side: continuous, with an error of
-          O(spacing²) relative to the gradient of the sampled field. At the border of the grid, the
-          difference spans only the part inside.
+        - `"central"`: trilinear interpolation of central differences at the nodes, which at the border of
+          the grid are one-sided: continuous, with an error of O(spacing²) relative to the gradient of the
+          sampled field. From the second node to the last but one, it equals the difference of the values one
+          node to either side; for a `field`, it is that difference everywhere, over the part inside.
         """
         if method == "trilinear":
             slopes = self._trilinear_slopes(coordinate)
         elif method == "central":
-            slopes = self._central_slopes(coordinate)
+            central = self.field is None
+            slopes = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
         else:
             raise ValueError(f'method must be "trilinear" or "central"; got {method!r}.')
         sx, sy, sz = slopes
@@ -170,7 +172,7 @@ class Volume(eqx.Module):
             _mix(fx, _mix(fy, c001 - c000, c011 - c010), _mix(fy, c101 - c100, c111 - c110)),
         )
 
-    def _central_slopes(self, coordinate: Vec3) -> Vec3:
+    def _field_slopes(self, coordinate: Vec3) -> Vec3:
         def slope(axis: int) -> Scalar:
             last = self.shape[axis] - 1
             before, after = (jnp.clip(coordinate[axis] + side, 0, last) for side in (-1, 1))

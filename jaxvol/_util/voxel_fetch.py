@@ -4,12 +4,13 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .vec3 import Scalar, Vec3
 from .xla import gather
@@ -21,6 +22,9 @@ Cube: TypeAlias = list[list[list[Scalar]]]
 Node: TypeAlias = tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
 """Indices along x, y, z."""
 
+SLOPE_BITS = 10
+"""Bits of a doubled slope of 8-bit voxels, an integer between -510 and 510."""
+
 
 class Fetch(eqx.Module):
     """How voxels are read from memory."""
@@ -28,6 +32,60 @@ class Fetch(eqx.Module):
     @abstractmethod
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
+
+    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+        """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
+        the nodes. That of a node is half the difference of the two voxels beside it, or at the border the
+        difference between itself and the one beside it. From six cubes, unless they are stored."""
+        node, fraction = split(coordinate, data.shape)
+        x, y, z = (
+            interpolated(self._slopes_of_nodes(data, node, axis, coordinate[0].dtype), fraction)
+            for axis in range(3)
+        )
+        return x, y, z
+
+    def _slopes_of_nodes(self, data: Shaped[Array, "nx ny nz"], node: Node, axis: int, dtype: Any) -> Cube:
+        """Slopes along an axis of the eight nodes that begin with this one."""
+
+        def beside(offset: int) -> Cube:
+            # of nodes, not of a coordinate moved by one, which may round to another node
+            i, j, k = ((n + offset * (a == axis)).astype(dtype) for a, n in enumerate(node))
+            return _with_first(axis, self.cube(data, (i, j, k))[0])
+
+        def slope(whole: Bool[Array, ""], before: Scalar, after: Scalar) -> Scalar:
+            return (after - before) * jnp.where(whole, 1, 0.5).astype(dtype)
+
+        # A cube does not reach past the border. There it begins with the first node, or ends with the last.
+        first, last = node[axis] == 0, node[axis] == data.shape[axis] - 2
+        (a, b), (c, d) = beside(-1), beside(1)
+        b, c = (
+            jax.tree.map(partial(jnp.where, border), outer, inner)
+            for border, outer, inner in ((first, a, b), (last, d, c))
+        )
+        lower, upper = jax.tree.map(partial(slope, first), a, c), jax.tree.map(partial(slope, last), b, d)
+        return _with_first(axis, [lower, upper])
+
+
+def _with_first(axis: int, cube: Cube) -> Cube:
+    """A cube with this axis and x exchanged."""
+
+    def corner(*index: int) -> Scalar:
+        order = [axis if i == 0 else 0 if i == axis else i for i in range(3)]
+        x, y, z = (index[i] for i in order)
+        return cube[x][y][z]
+
+    return [[[corner(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+
+
+def interpolated(cube: Cube, fraction: Vec3) -> Scalar:
+    """Trilinear interpolation."""
+
+    def mix(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
+        return a + f * (b - a)
+
+    fx, fy, fz = fraction
+    (y0, y1), (y2, y3) = ((mix(fz, *row) for row in plane) for plane in cube)
+    return mix(fx, mix(fy, y0, y1), mix(fy, y2, y3))
 
 
 class OneByOne(Fetch):
@@ -38,9 +96,15 @@ class OneByOne(Fetch):
 
 
 class Packed(Fetch):
-    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches."""
+    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
+
+    - `nodes`: of 8-bit voxels, where they are stored, the slopes of each node. Doubled they are integers of
+      10 bits: that along x in the highest bits of a word, that along y from bit 12 on, that along z in the
+      lowest.
+    """
 
     words: UInt32[Array, " voxels"]
+    nodes: UInt32[Array, " voxels"] | None = None
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         dtype = coordinate[0].dtype
@@ -63,6 +127,34 @@ class Packed(Fetch):
             return [[voxel(word, 0), voxel(word, 1)] for word in words]
 
         return [row(base), row(base + ny * nz)], fraction
+
+    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+        if self.nodes is None:
+            return super().slopes(data, coordinate)
+        node, fraction = split(coordinate, data.shape)
+        base, dtype = flat_index(node, data.shape), coordinate[0].dtype
+        _, ny, nz = data.shape
+        shift = 32 - SLOPE_BITS
+
+        # Parts of the array, so that all eight fetches share one index: XLA adds an offset that is part of
+        # the index 16 times for 16 samples. A slice that is fetched from is not stored.
+        last = (ny + 1) * nz + 1
+        length = data.size - last
+
+        def word(offset: int) -> Int[Array, ""]:
+            return gather(jax.lax.slice(self.nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
+
+        words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+
+        def slope(of_word: Callable[[Int[Array, ""]], Int[Array, ""]]) -> Scalar:
+            """The slope that is put into the highest bits, which alone are read."""
+
+            def top(word: Int[Array, ""]) -> Scalar:
+                return (of_word(word) & -(1 << shift)).astype(dtype)
+
+            return interpolated(jax.tree.map(top, words), fraction) * 2.0 ** -(shift + 1)
+
+        return slope(lambda word: word), slope(lambda word: word << 10), slope(lambda word: word << shift)
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
         word = gather(self.words, flat)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Shaped, UInt32
 
 from .._util.checks import is_traced
 from .._util.memo import memoized
-from .._util.voxel_fetch import Packed
+from .._util.voxel_fetch import SLOPE_BITS, Packed
 from ..volume import Volume, with_fetch
 
 
@@ -39,9 +39,18 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     return memoized(data, _packed)
 
 
-def with_words(volume: Volume, words: UInt32[Array, " voxels"] | None) -> Volume:
-    """The volume, with its packed copy where there is one."""
-    return volume if words is None else with_fetch(volume, Packed(words))
+def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
+    """The slopes of a volume's nodes, exact, for the gradient. For 8-bit voxels only; otherwise None where
+    `words_of` is."""
+    small = words_of(volume) is not None and volume.data.dtype.itemsize == 1
+    return memoized(volume.data, _packed_slopes) if small else None
+
+
+def with_words(
+    volume: Volume, words: UInt32[Array, " voxels"] | None, slopes: UInt32[Array, " voxels"] | None = None
+) -> Volume:
+    """The volume, with its packed copy where there is one, and with the slopes of its nodes."""
+    return volume if words is None else with_fetch(volume, Packed(words, slopes))
 
 
 @jax.jit
@@ -57,3 +66,20 @@ def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
     if bits == 8:
         words = words | beside(words, 1) << 16
     return words.reshape(-1)
+
+
+@jax.jit
+def _packed_slopes(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
+    voxels = data.astype(jnp.int32)
+
+    def doubled(axis: int) -> UInt32[Array, "nx ny nz"]:
+        n = voxels.shape[axis]
+        rise = jnp.diff(voxels, axis=axis)
+        before, after = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, n - 2), (1, n - 1)))
+        ends = (2 * jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 2, n - 1)))
+        first, last = ends
+        whole = jnp.concatenate([first, before + after, last], axis)
+        return (whole & (2**SLOPE_BITS - 1)).astype(jnp.uint32)
+
+    x, y, z = (doubled(axis) for axis in range(3))
+    return (x << (32 - SLOPE_BITS) | y << 12 | z).reshape(-1)
