@@ -47,9 +47,9 @@ EMPTY = 0.05
 OPAQUE = 0.01
 """Part of the pixels that become opaque, below which there is nothing to end early."""
 
-WORTHWHILE = 24
-"""Samples of a pixel, by the midpoint rule, below which nothing else can be faster by more than some 15 %;
-unless steps are shorter than FAIR voxels, of which cells that are integrated may need few."""
+WORTHWHILE = 16
+"""Samples of a pixel, by the midpoint rule, below which cells that are integrated save no more than 16 %,
+even if they are four times as long; they may be longer where steps are shorter than FAIR voxels."""
 
 FAIR = 0.5
 
@@ -72,7 +72,8 @@ class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
     - `march`, `volume`, `lighting`: what to pass to `render`.
-    - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels.
+    - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels; where
+      nothing could be proven to be within the tolerance, just above it.
     - `seconds`: predicted for one image on this machine, once compiled. `samples`: predicted for each pixel.
     - `parts`: what was kept or left out, and why.
     - `probed`: seconds that planning took, compilation included.
@@ -95,11 +96,12 @@ class Plan(NamedTuple):
 
     def __str__(self) -> str:
         transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
-        missed = "" if self.within else "NOT WITHIN THE TOLERANCE: "
+        missed = "" if self.within else "NOT PROVEN TO BE WITHIN THE TOLERANCE: "
+        rmse = f"RMSE {self.error:.2g} predicted" if self.within else "RMSE unknown"
         head = (
             f"{missed}step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}\n"
-            f"RMSE {self.error:.2g} predicted, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a "
-            f"pixel; some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
+            f"{rmse}, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a pixel; "
+            f"some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
         )
         wide = max(len(part.name) for part in self.parts)
         lines = [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
@@ -135,11 +137,11 @@ def plan(
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
     - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
-      no voxel changes, or the image by less than an eighth of the tolerance and than what all else leaves of
-      it; else to float16, on the same terms.
-    - **lighting**: the first of `Lighting.simpler` that is within the tolerance, compared with
-      `Lighting.smooth` (so many templates as given, blended: the noise that these have themselves does not
-      count); the step is halved as long as that changes the lit image by more than what is left.
+      no voxel changes; or if the image changes by less than an eighth of the tolerance, and by less than all
+      other errors leave of it. If neither, to float16, on the same terms.
+    - **lighting**: the first of `Lighting.simpler`, of what was given and of `Lighting.smooth` that is within
+      the tolerance, compared with the last (as many templates as were given, blended: their own noise does
+      not count); the step is halved as long as that changes the lit image by more than what is left.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
     estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
@@ -159,8 +161,8 @@ def plan(
     - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
       `seconds`.
 
-    **Returns:** a `Plan`. If no step is within the tolerance, down to 1/256 of a voxel, `Plan.within` is
-    False and `Plan.parts` says so.
+    **Returns:** a `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which takes
+    images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
 
     **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
     (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
@@ -281,7 +283,8 @@ def _marched(trials: Trials, parts: list[Part], *, lit: bool) -> tuple[Trial, Tr
         parts.append(Part(name, True, "the image is not finite, or rays use up their samples"))
         return uniform, truth
     if uniform.error > trials.goal:
-        parts.append(Part(name, True, f"{step:.2g} voxels, the shortest tried: not within the tolerance"))
+        why = f"{step:.2g} voxels, the shortest tried: not proven to be within the tolerance"
+        parts.append(Part(name, True, why))
         return uniform, truth
     parts.append(Part(name, True, f"{step:.3g} voxels, {uniform.kind}: RMSE {uniform.error:.2g}"))
     if uniform.kind == "preintegrated":
@@ -316,7 +319,7 @@ def _lit(
     smooth = probe.render(setting, chosen.march, lighting.smooth)
     tried = [(each.lighting, each.what) for each in lighting.simpler if each.has_gradient or not gradients]
     left, found = goal - chosen.error, []
-    for other, what in (*tried, (lighting, "as given")):
+    for other, what in (*tried, (lighting, "as given"), (lighting.smooth, "as given, without its noise")):
         error = probe.distance(probe.render(setting, chosen.march, other), smooth)
         found.append((error if math.isfinite(error) else math.inf, other, what))
         if error <= left:
