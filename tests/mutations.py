@@ -56,6 +56,10 @@ class Mutation(NamedTuple):
         return text.replace(self.old, self.new)
 
 
+TO_AXIS = (
+    "transforms/test_toroidal_map.py::"
+    "test_rays_along_faces_and_across_the_axis_see_no_more_than_the_sector[touches the axis]"
+)
 LEAPING_GRADIENT = (
     "engine/test_gradient_matrix.py::test_leaping_does_not_change_replay_gradients[jittered-hierarchy-uint8]"
 )
@@ -277,6 +281,27 @@ MUTATIONS = [
         "jnp.where((steps > 0) & ~at.finished, a, b), moved, at)",
         "jnp.where(steps > 0, a, b), moved, at)",
         (LEAPING_GRADIENT,),
+    ),
+    Mutation(
+        "shift: whole segments are taken although rays may still shift",
+        "engine/batch.py",
+        "(limited | jnp.any(job.shifts(state[0])))",
+        "limited",
+        ("engine/test_tiling.py::test_batches_that_are_refilled_do_not_show_where_rays_may_shift",),
+    ),
+    Mutation(
+        "shift: only the first group's shifts count",
+        "engine/batch.py",
+        "jnp.any(job.shifts(state[0]))",
+        "jnp.any(job.shifts(state[0])[:1])",
+        ("engine/test_tiling.py::test_batches_that_are_refilled_do_not_show_where_rays_may_shift",),
+    ),
+    Mutation(
+        "toroidal map: the search for a face ends too early",
+        "transforms/sector_faces.py",
+        "STEPS = 256",
+        "STEPS = 8",
+        (TO_AXIS,),
     ),
     Mutation(
         "leap: range of visible cells ends one cell too early",
