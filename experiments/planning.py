@@ -4,8 +4,8 @@ Random scenes: real volumes (nuclear, dental, CT and MR data) and phantoms, two 
 random transfer functions of three to eight points, some opaque, some with narrow peaks; random cameras, a
 quarter of them inside. (What a sample costs was fitted to five other scenes, one of the head phantom.) Each
 is planned for three tolerances. The image under the plan is compared with a converged one, over black or
-white, whichever differs more; the converged image is integrated between cells' ends, at a step of an eighth of a voxel, or less
-until it differs by at most 1e-4 from that of twice the step.
+white, whichever differs more; the converged image is integrated between cells' ends, at a step of an eighth
+of a voxel, or less until it differs by at most 1e-4 from that of twice the step.
 
 Of some scenes, a table of marches is searched: three quadratures and adaptive sampling, at steps from a
 thirty-second of a voxel to four, with leaps and without. Of each kind, the two with the longest steps (or the

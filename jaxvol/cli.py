@@ -365,7 +365,7 @@ def _march(
     if options.step is None:
         found = plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance)
         if not found.within:
-            print(f"RMSE {found.error:.2g} rather than {found.tolerance:.2g}; jaxvol plan tells more")
+            print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
         return found.volume, found.march
     if options.tolerance is not None:
         raise ValueError("--tolerance finds a step; leave out --step.")

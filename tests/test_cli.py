@@ -67,10 +67,19 @@ def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
     assert np.abs(imread(output) - np.asarray(jv.to_srgb(linear)) * 255).max() <= 1
 
 
-def test_render_needs_nothing_but_a_file(volume_file, tmp_path):
+def test_render_needs_nothing_but_a_file_and_plan_says_how(volume_file, tmp_path, capsys):
     output = tmp_path / "out.png"
     assert main(["render", str(volume_file), "-o", str(output), "--size", "16", "16"]) == 0
     assert imread(output).std() > 5
+    capsys.readouterr()
+    assert main(["plan", str(volume_file), "--size", "16", "16", "--tolerance", str(1 / 255)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"step [\d.e-]+, (midpoint|preintegrated)", printed)
+    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping", "voxels as uint8"):
+        assert word in printed
+    for bad in ("0", "nan", "2"):
+        assert main(["plan", str(volume_file), "--tolerance", bad]) == 2
+        assert "tolerance must be" in capsys.readouterr().err
 
 
 def render_file(volume_file, *words, size=("16", "16")):

@@ -161,8 +161,8 @@ def plan(
     - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
       `seconds`.
 
-    **Returns:** a `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which takes
-    images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
+    **Returns:** a `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which
+    takes images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
 
     **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
     (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.

@@ -130,10 +130,10 @@ class SectorFaces(eqx.Module):
 
         The distance f to each face has |f'| ≤ 1, so a step of |f| is safe. Its second derivative along a line
         is 0 for the planes, at most 1/ρ for the cones, and 1/ρ + 1/D for the tori, with ρ the distance to the
-        motor axis and D that to the circle of apexes; and this at most doubles within half of ρ, and of D. So
-        |f| falls by at most v s + ½ k s², with k = 4 / ρ or 4 / min(ρ, D) and v how fast it falls here, and a
-        step to the root of |f| = v s + ½ k s² is safe as well: near a face it is Newton's step, which does not
-        slow down where the line meets the face obliquely.
+        motor axis and D that to the circle of apexes; and this at most doubles within half of ρ, and of D.
+        So |f| falls by at most v s + ½ k s², with k = 4 / ρ or 4 / min(ρ, D) and v how fast it falls here,
+        and a step to the root of |f| = v s + ½ k s² is safe as well: near a face it is Newton's step, which
+        does not slow down where the line meets the face obliquely.
         """
         x, y, z = point
         rho = hypot(y, z)
@@ -175,8 +175,8 @@ class SectorFaces(eqx.Module):
         return list(map(ToFace, *outside((t,), (jnp.ones_like(t),))))
 
     def _outside(self, point: Vec3) -> list[Scalar]:
-        """Lower bounds on a point's distance from what each face bounds, negative inside: two tori, two cones,
-        two planes."""
+        """Lower bounds on a point's distance from what each face bounds, negative inside: two tori, two
+        cones, two planes."""
         x, y, z = point
         half = math.pi / 2
         off = hypot(y, z) - self.a

@@ -38,8 +38,8 @@ class ToroidalMap(Transform):
     with the origin on the motor axis. The world is empty outside the swept sector. A ray may leave the sector
     and re-enter it, as through its hollow near side. Of such gaps two are found; what a third one hides is
     taken for material. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside,
-    and so may one that runs along a face at less than 1e-5 of it. `AlphaCorrection` cuts cells at both ends of
-    gaps.
+    and so may one that runs along a face at less than 1e-5 of it. `AlphaCorrection` cuts cells at both ends
+    of gaps.
 
     **Arguments:**
 
@@ -53,8 +53,8 @@ class ToroidalMap(Transform):
 
     All are differentiable, once: second derivatives miss how entries, exits and gaps curve. Values and
     gradients are finite everywhere; where an angle has no gradient, on the motor axis (y = z = 0) and at the
-    apex (x = R = 0), it is taken as 0, and so is that of an entry or exit whose ray meets its face at less than
-    0.06 degrees.
+    apex (x = R = 0), it is taken as 0, and so is that of an entry or exit whose ray meets its face at less
+    than 0.06 degrees.
 
     Where it fails, and where not: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".

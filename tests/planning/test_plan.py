@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
+from jaxvol.lighting import ConstantLight, Deferred, DirectionalLight, ScattererTemplates
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks
 from jaxvol.planning import trials
@@ -133,6 +133,9 @@ def test_colours_above_1_let_rays_end_later(sphere):
     found = jv.plan(volume, bright, camera, TOLERANCE)
     assert found.within
     assert error_of(found, volume, bright, camera) <= TOLERANCE
+    for each in found.march.transforms:
+        if isinstance(each, jv.EarlyTermination):
+            assert each.opacity_left < TOLERANCE / 16
 
 
 @pytest.mark.slow
@@ -162,7 +165,8 @@ def test_what_cannot_be_reached_is_said(sphere, monkeypatch):
     monkeypatch.setattr(trials, "FINEST", 0.5)
     found = plan_of(sphere, 2e-4)
     assert not found.within
-    assert "not within the tolerance" in str(found)
+    assert "not proven to be within the tolerance" in str(found)
+    assert "RMSE unknown" in str(found)
     volume, transfer, camera = sphere
     with pytest.warns(UserWarning, match="may not be within"):
         jv.render(volume, transfer, camera, "auto", tolerance=2e-4)
@@ -191,6 +195,20 @@ def test_light_is_simpler_where_that_looks_the_same(sphere):
         kept = kept.lighting
     assert isinstance(kept, ScattererTemplates)
     assert not kept.baked
+
+
+@pytest.mark.slow
+def test_light_without_its_noise_is_the_last_resort(sphere):
+    """One template for each pixel is too noisy for this tolerance, and so is all that is simpler and has
+    gradients."""
+    volume, transfer, camera = sphere
+    sun = DirectionalLight((1, 0.3, 0.2), (3, 3, 3))
+    light = ScattererTemplates(jv.Material(0.3, 0.1, 1.4), sun, templates=2)
+    found = jv.plan(volume, transfer, camera, 0.004, lighting=light, gradients=True)
+    assert found.within
+    assert isinstance(found.lighting, ScattererTemplates)
+    assert found.lighting.blend
+    assert not light.blend
 
 
 @pytest.mark.slow
