@@ -95,9 +95,9 @@ MUTATIONS = [
     ),
     Mutation(
         "plan: faces at the far ends not looked at",
-        "planning/plan.py",
-        "for end in (0, -1))",
-        "for end in (1, 1))",
+        "space.py",
+        "for axis in range(3) for end in (0, -1)]",
+        "for axis in range(3) for end in (1, 1)]",
         ("planning/test_plan.py::test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face",),
     ),
     Mutation(

@@ -13,6 +13,7 @@ from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks
 from jaxvol.planning import trials
 from jaxvol.planning.plan import _proven
+from jaxvol.space import Affine
 
 from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
 
@@ -92,8 +93,9 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, a
     data = np.zeros(volume.shape, np.float32)
     data[8:16, 8:16, 8:16] = 0.5
     data = np.roll(data, 8 * (1 if end else -1), axis)
-    visible = transfer.visible(Blocks.of(jv.Volume(data, volume.spacing)))
-    proven, parts = _proven(np.asarray(visible), (), over=True)
+    cube = jv.Volume(data, volume.spacing)
+    visible = transfer.visible(Blocks.of(cube))
+    proven, parts = _proven(visible, Affine(cube), (), over=True)
     assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
     assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
 
