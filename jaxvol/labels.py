@@ -72,24 +72,24 @@ class LabelTransferFunction(Transfer):
         """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
         the opacity that it had. Other labels stay as they are.
 
-        **Raises:** `ValueError` for labels that have no function here, and for what is not true or false."""
+        **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
         found = self.visible
         for label, shown in self._changes("visible", visible):
-            if jnp.shape(shown) != () or jnp.result_type(shown) != bool:
+            if jnp.shape(shown) != () or not jnp.issubdtype(jnp.result_type(shown), bool):
                 raise ValueError(f"visible[{label}] must be True or False; got {described(shown)}.")
             found = found.at[label].set(shown)
         return eqx.tree_at(lambda transfer: transfer.visible, self, found)
 
     def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
-        """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels keep
-        theirs, at first 1.
+        """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
+        keep theirs, which are 1 at first.
 
-        f is a factor of the extinction: of the optical depth of whatever the label fills, at all values alike.
-        What has the opacity α at f = 1 has 1 - (1 - α)^f: at f = 0.5, 0.9 becomes 0.68, and 0.1 becomes 0.05. So
-        the image does not depend on the step, and f may exceed 1. It is differentiable; where it is 0, as
-        where an extinction is, its derivative misses what is leapt over (`SpaceLeaping`).
+        f is a factor of the extinction, at all values alike: what has the opacity α at f = 1 has
+        1 - (1 - α)^f, so that f = 0.5 makes 0.68 of 0.9, and 0.05 of 0.1. The image does not depend on the
+        step, and f may exceed 1. f is differentiable. Where it is 0, as where an extinction is, its
+        derivative misses what is leapt over (`SpaceLeaping`).
 
-        **Raises:** `ValueError` for labels that have no function here, and for factors that are negative or not
+        **Raises:** `ValueError` for labels beyond the last one, and for factors that are negative or not
         finite."""
         found = self.opacity
         for label, factor in self._changes("opacity", opacity):

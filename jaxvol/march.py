@@ -419,6 +419,8 @@ class March(eqx.Module):
             fits = first >= end
             if not self.ends_at_exit:
                 fits &= run.within(ray.length)
+                for left, back in ray.gaps:  # a shift may still move the run, by a step at most
+                    fits &= run.within(left) | (run.front - run.step >= back)
             for error, tolerated in predicted:
                 fits &= transmittance * error <= tolerated
             chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)

@@ -38,7 +38,10 @@ def why_unseen(
         extends = f"the volume, which extends from ({low}) to ({high})"
         if _values_along(volume, camera, Affine(volume))[0].any():
             return f"no ray of the camera meets what the clip leaves of {extends}. Change its box or planes."
-        return f"no ray of the camera meets {extends}. Point the camera at its center, as Camera.looking_at does."
+        return (
+            f"no ray of the camera meets {extends}. Point the camera at its center, as Camera.looking_at "
+            "does."
+        )
     if opacity > 0:
         return (
             f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, which raises the "

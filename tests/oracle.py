@@ -105,8 +105,8 @@ def march(
       sample is a cell of its own.
     - `empty_jump`: (n,) distance from the first transparent sample to the next one, in steps.
     - `planes`: pairs (origin, normal). Only what lies on the sides of all their normals is seen; or, with
-      `inside_out`, only what does not. A ray begins with the first point of it that is seen, and ends with the
-      last one. `align` cuts cells where it is in between, too.
+      `inside_out`, only what does not. A ray begins with the first point of it that is seen, and ends with
+      the last one. `align` also cuts cells at the ends of what is not seen in between.
     """
     data, spacing, origin = (np.asarray(a, np.float64) for a in (data, spacing, origin))
     origins, directions = (np.asarray(a, np.float64).reshape(-1, 3) for a in (origins, directions))

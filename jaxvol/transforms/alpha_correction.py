@@ -34,7 +34,8 @@ class AlphaCorrection(Transform):
     `1 - (1 - α)^(e/d)`. A volume of constant extinction is rendered exactly at any step.
 
     Where a ray leaves the volume and re-enters it, as under `ToroidalMap` or where `Clip` cuts something out,
-    cells are cut at both ends of such a gap, too. Of a cell that holds several gaps, only the first and the last end of them are cut.
+    cells are cut at both ends of such a gap, too. Of a cell that holds several gaps, only the first and the
+    last end of them are cut.
 
     With this transform, the image is continuous in the camera and in everything else that moves the exit,
     and its gradient is complete. Without it, the image jumps when a sample crosses the exit, and the

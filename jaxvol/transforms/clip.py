@@ -25,35 +25,37 @@ class Clip(Transform):
     Cut faces are faces like those of the volume. A ray enters and leaves the volume at them, so that its
     first sample lies on the face, which `EmptySpaceJitter` keeps smooth, and `AlphaCorrection` cuts its last
     cell there. With `inside_out`, a ray that enters or leaves the volume in what is cut away begins or ends
-    at the cut; another one has a gap: samples there are transparent, `AlphaCorrection` cuts cells at both
-    ends of it (three samples of each cell in place of one), and `EmptySpaceJitter` treats it as empty space.
+    at the cut. Any other ray that meets it has a gap. There, samples are transparent, `EmptySpaceJitter`
+    shifts them, and `AlphaCorrection` cuts cells at both ends, for which it takes three samples of each
+    cell. Without `AlphaCorrection`, a face behind a gap lies where the next sample happens to be, and is as
+    noisy under jitter as any surface in the volume.
 
-    What is sampled is not changed: values, gradients and light are those of the whole volume, as if nothing
-    were cut away. Its place among other transforms does not matter; under a `ToroidalMap`, the box and planes
-    are those of the world.
+    What is sampled stays the same: values and light are those of the whole volume, as if nothing were cut
+    away. The place among other transforms does not matter. Box and planes are in world coordinates, also
+    under a `ToroidalMap`.
 
     **Arguments:**
 
     - `box`: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
     - `planes`: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
-      that points to what is inside. (As VTK's `AddClippingPlane` and PyVista's `add_volume_clip_plane` have
-      it. PyVista's `clip` and ParaView's filter keep the other side, unless told to invert.)
+      that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane`. (PyVista's `clip` keeps
+      the other side by default.)
     - `inside_out`: cut away what is inside all of these, and show the rest.
 
-    Corners of the box, origins and normals are differentiable, as are the ends of rays that follow from them.
+    `box`, `origins` and `normals` are differentiable: gradients include how ends of rays and gaps move.
     Where a face of the box coincides with one of the volume, the derivative is that of moving it inwards.
-    Without `AlphaCorrection` the image jumps when a sample crosses a cut, and gradients miss these jumps; with
-    `AlphaCorrection(labels=True)` they take the ends of gaps as fixed. Where a gap comes to hold a ray's
-    entry, the ray's samples move to the cut, and the image changes by the error of its step.
+    Without `AlphaCorrection` the image jumps when a sample crosses a cut, and gradients miss these jumps.
+    With `AlphaCorrection(labels=True)`, they take the ends of gaps as fixed. Where a gap comes to reach the
+    ray's entry, the samples behind it move, and the image jumps by the error of the step.
 
-    A ray that runs within a plane, up to rounding, may count as inside or outside. Inside out, what is left
-    between the volume's face and the cut is left out if it is thinner than 16 roundings of the volume's
-    diagonal: where both should coincide, it would be seen as a film.
+    A ray within a plane is inside; rounding decides of rays that nearly are. Inside out, a film of less than
+    2e-6 of the volume's diagonal between its face and the cut is not seen: it is rounding, where the two
+    should coincide.
 
-    Where it fails, and where not: `experiments/stability.py`, "jitter on clipped faces".
+    Where it fails, and where not: `experiments/stability.py`, "jitter behind cuts".
 
-    **Raises:** `ValueError` without a box or a plane, for numbers that are not finite, a box whose ends do not
-    increase, and a normal of length 0.
+    **Raises:** `ValueError` without a box or a plane, for numbers that are not finite, a box whose ends do
+    not increase, and a normal of length 0.
     """
 
     box: Float[Array, "6"] | None
@@ -96,11 +98,12 @@ class HalfSpace(NamedTuple):
 
     def height(self, at: Vec3) -> Scalar:
         """Distance of a point from the plane, negative outside."""
-        return sum(n * (x - p) for n, x, p in zip(self.normal, at, self.point, strict=True))
+        (x, y, z), (px, py, pz) = at, self.point
+        return dot(self.normal, (x - px, y - py, z - pz))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which a line enters and leaves; infinite where it does not, and in the wrong order if it
-        is outside everywhere."""
+        """Distances at which a line enters and leaves; infinite where it does not. Of a line that is outside
+        everywhere, the first exceeds the second."""
         height, rate = self.height(origin), dot(self.normal, direction)
         # Smaller rates count as parallel. Not 0: the derivative of 1/x, 1/x², must be finite.
         parallel = jnp.abs(rate) < float(jnp.finfo(rate.dtype).tiny) ** 0.25
@@ -118,10 +121,11 @@ class HalfSpace(NamedTuple):
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
             for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
         )
-        spans = sum(abs(low) + size * n for low, size, n in zip(grid.origin, grid.size, shape, strict=True))
-        reach = sum(abs(n) * size for n, size in zip(self.normal, grid.size, strict=True))
-        rounding = 16 * float(jnp.finfo(reach.dtype).eps) * spans
-        return self.height((x[:, None, None], y[None, :, None], z[None, None])), 0.51 * reach + rounding
+        a, b, c = map(jnp.abs, self.normal)
+        # as far as coordinates go: what rounds most
+        ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
+        reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
+        return self.height((x[:, None, None], y[None, :, None], z[None, None])), reach
 
 
 class _Clipped(Space):
@@ -153,8 +157,8 @@ class _Clipped(Space):
         return self.inner.path(entry, direction)
 
     def _inside(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which a line enters and leaves what is inside all sides; on a miss, the first is at least
-        the second."""
+        """Distances at which a line enters and leaves what is inside all sides; on a miss, the first is at
+        least the second."""
         nears, fars = zip(*(side.interval(origin, direction) for side in self.sides), strict=True)
         return reduce(_later, nears), reduce(_earlier, fars)
 
