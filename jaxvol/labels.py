@@ -50,8 +50,8 @@ class LabelTransferFunction(Transfer):
     """All functions, stacked along a leading axis for the label; the last is that of invisible labels."""
     opacity: Float[Array, " labels"]
     """Of each label, a factor of its extinction: see `with_opacity`. Differentiable."""
-    visible: Bool[Array, " labels"]
-    """Of each label, whether it is seen."""
+    shown: Bool[Array, " labels"]
+    """Of each label, whether it is seen: see `with_visibility`."""
 
     def __init__(
         self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
@@ -66,19 +66,19 @@ class LabelTransferFunction(Transfer):
         each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
         self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
         self.opacity = jnp.ones(len(each), self.stacked.extinction.dtype)
-        self.visible = jnp.ones(len(each), bool)
+        self.shown = jnp.ones(len(each), bool)
 
     def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
         """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
         the opacity that it had. Other labels stay as they are.
 
         **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
-        found = self.visible
+        found = self.shown
         for label, shown in self._changes("visible", visible):
             if jnp.shape(shown) != () or not jnp.issubdtype(jnp.result_type(shown), bool):
                 raise ValueError(f"visible[{label}] must be True or False; got {described(shown)}.")
             found = found.at[label].set(shown)
-        return eqx.tree_at(lambda transfer: transfer.visible, self, found)
+        return eqx.tree_at(lambda transfer: transfer.shown, self, found)
 
     def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
         """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
@@ -109,7 +109,7 @@ class LabelTransferFunction(Transfer):
     @property
     def _seen(self) -> TransferFunction:
         """All functions, with the extinctions that are seen."""
-        factor = jnp.where(self.visible, self.opacity, 0)
+        factor = jnp.where(self.shown, self.opacity, 0)
         extinction = self.stacked.extinction * factor[:, None]
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 

@@ -45,7 +45,7 @@ def side_interval(origins, directions, planes):
 def planes_of(box, planes=()):
     """Planes as (origin, normal): the six of a box (x_min, x_max, y_min, …), if there is one, and others."""
     found = [(np.asarray(p, float), np.asarray(n, float)) for p, n in planes]
-    for i, end in enumerate([] if box is None else box):
+    for i, end in enumerate([] if box is None else np.asarray(box, float)):
         axis = np.eye(3)[i // 2]
         found.append((end * axis, axis if i % 2 == 0 else -axis))
     return found

@@ -15,7 +15,7 @@ from jaxvol._util.vec3 import apart
 from jaxvol.march import Cell
 from jaxvol.metrics import boundary_noise
 from jaxvol.occupancy import Blocks
-from jaxvol.space import Ray, Straight
+from jaxvol.space import Ray, Straight, enter
 
 from .. import oracle
 from ..scenes import (
@@ -34,8 +34,7 @@ from . import test_space_leaping as leaping, test_toroidal_map as toroidal
 
 
 ALIGNED = jv.AlphaCorrection()
-CORNER = (0.5, 3, -3, -0.2, 0.4, 3)
-"""A box that reaches past three faces of [-1, 1]³."""
+EVERYWHERE = (-9.0, 9.0) * 3
 
 
 @functools.cache
@@ -60,6 +59,12 @@ def random_rays(seed, count=64):
     directions = (targets - origins) / np.linalg.norm(targets - origins, axis=1, keepdims=True)
     directions[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     return origins.astype(np.float32), directions.astype(np.float32)
+
+
+def in_double(rays):
+    """Origins and directions, each of shape (n, 3)."""
+    origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in rays)
+    return origins, directions
 
 
 # ---- which part is seen ----
@@ -94,7 +99,7 @@ CROP = (slice(5, 18), slice(3, 21), slice(8, 16))
 
 @pytest.mark.parametrize(
     "transforms",
-    [(jv.Jitter(3), ALIGNED), *slow((), (jv.EmptySpaceJitter(4), jv.EarlyTermination(0.05)))],
+    [(jv.Jitter(3), ALIGNED), *slow(((),), ((jv.EmptySpaceJitter(4), jv.EarlyTermination(0.05)),))],
 )
 def test_a_box_along_the_grid_shows_what_a_cropped_volume_shows(transforms):
     whole = anisotropic_noise()
@@ -102,74 +107,90 @@ def test_a_box_along_the_grid_shows_what_a_cropped_volume_shows(transforms):
     low = origin + spacing * [part.start for part in CROP]
     high = origin + spacing * [part.stop - 1 for part in CROP]
     part = jv.Volume(np.asarray(whole.data)[CROP], whole.spacing, low)
-    camera, transfer = around(whole), soft_transfer()
+    camera, transfer = around(whole).zoom(2.5), soft_transfer()
     clipped = jv.March(0.07, (*transforms, jv.Clip(np.stack([low, high], axis=1).reshape(-1))))
     cut = jv.render(whole, transfer, camera, clipped)
     cropped = jv.render(part, transfer, camera, jv.March(0.07, transforms))
     off = np.abs(np.asarray(cut.rgba - cropped.rgba)).max(axis=-1)
     same = np.asarray(cut.samples) == np.asarray(cropped.samples)
-    assert 0.1 < np.mean(np.asarray(cut.samples) > 0) < 0.9
+    assert 0.2 < np.mean(np.asarray(cut.samples) > 0) < 0.9
     assert same.mean() > 0.99
     assert off[same].max() < 2e-5
     np.testing.assert_allclose(cut.depth[same], cropped.depth[same], rtol=1e-5)
 
 
-def opacity_of(clip, origins, directions, extinction=1.5, transforms=(ALIGNED,)):
-    march = jv.March(0.13, (*transforms, clip))
+def opacity_of(rays, box=EVERYWHERE, planes=(), *, inside_out=False, extinction=1.5, transforms=(ALIGNED,)):
+    """Opacity of `constant`. Always of two planes, so that one program serves all."""
+    origins, directions = rays
+    aside = [((0, 0, -9), (0, 0, 1))] * (2 - len(planes))
+    march = jv.March(0.13, (*transforms, jv.Clip(box, [*planes, *aside], inside_out=inside_out)))
     rendering = jv.render_rays(constant(), uniform_transfer(extinction), origins, directions, march)
     return np.asarray(rendering.rgba[:, 3])
 
 
 def test_what_misses_the_volume_or_holds_all_of_it_changes_nothing_or_leaves_nothing():
-    origins, directions = random_rays(0)
-    march = jv.March(0.13, (ALIGNED,))
-    whole = jv.render_rays(constant(), uniform_transfer(1.5), origins, directions, march).rgba[:, 3]
-    far, all_of_it, exactly = (3, 4, 3, 4, 3, 4), (-3, 3) * 3, (-1, 1) * 3
-    for box in (all_of_it, exactly):
-        np.testing.assert_allclose(opacity_of(jv.Clip(box), origins, directions), whole, atol=1e-6)
-        assert not opacity_of(jv.Clip(box, inside_out=True), origins, directions).any()
-    assert not opacity_of(jv.Clip(far), origins, directions).any()
-    hollowed = opacity_of(jv.Clip(far, inside_out=True), origins, directions)
-    np.testing.assert_allclose(hollowed, whole, atol=1e-6)
+    rays = random_rays(0)
+    whole = 1 - np.exp(-1.5 * kept_lengths(*in_double(rays), (), inside_out=False))
+    for box in (EVERYWHERE, (-1, 1) * 3):
+        np.testing.assert_allclose(opacity_of(rays, box), whole, atol=1e-5)
+        assert not opacity_of(rays, box, inside_out=True).any()
+    far = (3, 4, 3, 4, 3, 4)
+    assert not opacity_of(rays, far).any()
+    np.testing.assert_allclose(opacity_of(rays, far, inside_out=True), whole, atol=1e-5)
 
 
 def test_planes_that_contradict_each_other_hold_nothing():
-    origins, directions = random_rays(0)
-    nothing = [((0, 0, 0.1), (0, 0, 1)), ((0, 0, -0.1), (0, 0, -1))]
-    assert not opacity_of(jv.Clip(planes=nothing), origins, directions).any()
-    whole = opacity_of(jv.Clip((-3, 3) * 3, nothing, inside_out=True), origins, directions)
-    assert whole.max() > 0.9
+    rays, planes = random_rays(0), [((0, 0, 0.1), (0, 0, 1)), ((0, 0, -0.1), (0, 0, -1))]
+    assert not opacity_of(rays, planes=planes).any()
+    whole = opacity_of(rays, (3, 4, 3, 4, 3, 4), inside_out=True)
+    np.testing.assert_allclose(opacity_of(rays, planes=planes, inside_out=True), whole, atol=1e-6)
 
 
-def test_rays_within_a_plane_see_all_or_nothing_and_have_finite_gradients():
-    x = np.array([0.25, 0.0, -0.5], np.float32)
-    origins = np.stack([x, 0 * x, np.full_like(x, -3)], axis=1)
-    directions = np.tile(np.array([[0, 0, 1]], np.float32), (3, 1))
-
-    def opacity(planes, inside_out=False):
-        clip = jv.Clip(planes=planes, inside_out=inside_out)
-        return jv.render_rays(
-            constant(), uniform_transfer(1.0), origins, directions, jv.March(0.13, (ALIGNED, clip))
-        ).rgba[:, 3]
-
-    aside = [(jnp.array([0.25, 0, 0]), jnp.array([1.0, 0, 0]))]
+def test_rays_within_a_plane_are_inside():
+    origins = np.repeat(np.array([[0.25, 0, -3], [0, 0, -3], [-0.5, 0, -3], [0.25, 0, 0]], np.float32), 16, 0)
+    directions = np.tile(np.array([[0, 0, 1]], np.float32), (64, 1))
+    inside = np.exp(-1.5 * np.array([2, 2, 2, 1])), np.array([True, False, False, True])
     for inside_out in (False, True):
-        found = np.asarray(opacity(aside, inside_out))
-        expected = np.array([1, 0, 0]) != inside_out  # on the plane counts as inside
-        np.testing.assert_allclose(found, np.where(expected, 1 - np.exp(-2), 0), atol=1e-6)
-        slopes = jax.grad(lambda planes, i=inside_out: opacity(planes, i).sum())(aside)
-        assert np.all(np.isfinite(jax.tree.leaves(slopes)))
+        expected = np.where(inside[1] != inside_out, 1 - inside[0], 0)
+        for box, planes in ((EVERYWHERE, [((0.25, 0, 0), (3, 0, 0))]), ((0.25, 9, -9, 9, -9, 9), ())):
+            found = opacity_of((origins, directions), box, planes, inside_out=inside_out)
+            np.testing.assert_allclose(found[::16], expected, atol=1e-5)
+
+
+def test_derivatives_of_ends_are_finite_wherever_a_ray_runs():
+    """Within a plane, along an edge, past the volume, and where a face of the box is one of the volume."""
+    pixel = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+    origins = np.array([[0.25, 0, -3], [0.25, -1, -3], [-0.5, 0, -3], [0.25, 0, 0], [1, 1, -3], [5, 5, 5]])
+    directions = np.tile(np.array([[0, 0, 1.0]]), (6, 1))
+
+    @functools.partial(jax.jit, static_argnums=1)
+    @functools.partial(jax.jacrev, has_aux=True)
+    def slopes(given, inside_out):
+        box, origins, directions, planes = given
+        space = jv.March(1.0, (jv.Clip(box, planes, inside_out=inside_out),)).locate(constant())
+        rays = jax.vmap(lambda o, d: enter(space, apart(o), apart(d), pixel))(origins, directions)
+        ends = jnp.concatenate([rays.t_in, rays.length])
+        return ends, ends
+
+    plane = jnp.array([0.25, 0.0, 0.0]), jnp.array([2.0, 0.0, 0.0])
+    for box in ((0.25, 1, -1, 1, -1, 1), (0.25, 1, 2, 3, -1, 1)):
+        given = jnp.array(box, float), *map(jnp.float32, (origins, directions)), (plane,)
+        for inside_out in (False, True):
+            found, ends = slopes(given, inside_out)
+            assert np.all(np.isfinite(ends))
+            assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
 
 
 def test_a_film_between_a_face_and_a_cut_that_coincide_is_not_seen():
     """The whole step of its only sample would be."""
     box = np.array((0.0, 1.0) * 3, np.float32)
     origins, directions = random_rays(1)
-    origins = np.where(np.abs(origins).max(axis=1, keepdims=True) < 1.2, origins - 3 * directions, origins)
-    exact = opacity_of(jv.Clip(box, inside_out=True), origins, directions, 50.0, ())
-    for rounded in (np.nextafter(box, np.float32(0)), np.nextafter(box, np.float32(2))):
-        rounded[::2] = 0
-        found = opacity_of(jv.Clip(rounded, inside_out=True), origins, directions, 50.0, ())
+    within = np.abs(origins).max(axis=1, keepdims=True) < 1.2
+    rays = np.where(within, origins - 3 * directions, origins), directions
+    exact = opacity_of(rays, box, inside_out=True, extinction=50.0, transforms=())
+    for toward in (0, 2):
+        rounded = np.where(box > 0, np.nextafter(box, np.float32(toward)), box)
+        found = opacity_of(rays, rounded, inside_out=True, extinction=50.0, transforms=())
         np.testing.assert_allclose(found, exact, atol=1e-3)
 
 
@@ -177,25 +198,24 @@ def test_a_film_between_a_face_and_a_cut_that_coincide_is_not_seen():
 
 
 @pytest.mark.parametrize(
-    ("inside_out", "view"), [(False, "outside"), (True, "outside"), *slow((True, "within what is cut"))]
+    ("inside_out", "position"),
+    [(True, (0.1, 0.2, -3.0)), *slow((False, (0.1, 0.2, -3.0)), (True, (0.1, 0, -0.6)))],
 )
-def test_cut_faces_stay_smooth_under_empty_space_jitter(inside_out, view):
-    """As the volume's own faces do; under `Jitter` they do not."""
+def test_cut_faces_stay_smooth_under_empty_space_jitter(inside_out, position):
+    """Seen from outside, and from within what is cut away. Under `Jitter` they do not."""
     volume = scaled_phantom("linear", 32)
     colors = np.array([[0.2], [0.9], [0.4]]) * np.ones(3)
     transfer = jv.TransferFunction([-1.0, 0.0, 1.0], colors, [4.0, 9, 6])
-    ends = (-0.5, 0.6, -0.4, 0.5, -0.7, 0.6)
-    # seen through the hole in the corner of which it looks, or from outside
-    box = (-2, 0.6, -2, 0.5, -2, 0.6) if inside_out else ends
-    position = (-0.9, -0.8, -0.9) if view == "within what is cut" else (-3.0, -2.5, -3.2)
-    camera = jv.Camera(position, (0.3, 0.3, 0.3), (0, 0, 1), 24.0, size=(48, 48))
+    camera = jv.Camera(position, (0.1, 0.1, 0.3), (0, 1, 0), 16.0, size=(48, 48))
+    away = -1 if inside_out else 1
+    clip = jv.Clip(planes=[((0, 0, -0.2), (0.3 * away, 0.1 * away, away))], inside_out=inside_out)
     noise = {}
     for name, jitter in {"plain": (), "empty": (jv.EmptySpaceJitter(0),), "jitter": (jv.Jitter(0),)}.items():
-        march = jv.March(0.05, (*jitter, ALIGNED, jv.Clip(box, inside_out=inside_out)))
-        image = jv.render(volume, transfer, camera, march).image()
-        noise[name] = boundary_noise(image, np.asarray(jnp.any(image > 0, axis=-1)))
+        rendering = jv.render(volume, transfer, camera, jv.March(0.05, (*jitter, ALIGNED, clip)))
+        assert float(rendering.rgba[..., 3].min()) > 0.5
+        noise[name] = boundary_noise(rendering.image(), np.ones((48, 48), bool))
     assert noise["empty"] <= 1.05 * noise["plain"]
-    assert noise["jitter"] > 5 * noise["plain"]
+    assert noise["jitter"] > 20 * noise["plain"]
 
 
 @pytest.mark.parametrize("quadrature", ["left", *slow("midpoint", "preintegrated")])
@@ -275,35 +295,34 @@ def test_leaping_does_not_show(name, method, transforms):
 @pytest.mark.parametrize("method", ["hierarchy", *slow(*leaping.METHODS[1:])])
 def test_what_is_cut_away_is_leapt_over(method):
     """In a volume that is visible everywhere, there is nothing else to leap over."""
-    volume, transfer = constant(), uniform_transfer(0.3)
-    camera = around(volume)
-    counts = {}
-    for name, leaps in {"all": (), "leapt": (jv.SpaceLeaping(method, 4),)}.items():
-        clip = jv.Clip((-0.7, 0.7) * 3, inside_out=True)
-        rendering = jv.render(volume, transfer, camera, jv.March(0.02, (ALIGNED, clip, *leaps)))
-        counts[name] = np.asarray(rendering.samples).sum()
-        exact = kept_lengths(*rays_of(camera), oracle.planes_of((-0.7, 0.7) * 3), inside_out=True)
-        np.testing.assert_allclose(rendering.rgba[..., 3].reshape(-1), 1 - np.exp(-0.3 * exact), atol=1e-5)
-    assert counts["leapt"] < 0.7 * counts["all"]
-
-
-def rays_of(camera):
-    return (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
+    box = (-0.7, 0.7) * 3
+    clip = jv.Clip(box, inside_out=True)
+    camera = around(constant()).zoom(8)
+    march = jv.March(0.02, (ALIGNED, clip, jv.SpaceLeaping(method, 4)))
+    rendering = jv.render(constant(), uniform_transfer(0.3), camera, march)
+    exact = kept_lengths(*in_double(camera.rays()), oracle.planes_of(box), inside_out=True)
+    np.testing.assert_allclose(rendering.rgba[..., 3].reshape(-1), 1 - np.exp(-0.3 * exact), atol=1e-5)
+    # the cells in the gap, of which two thirds lie in blocks that are cut away as a whole
+    whole = kept_lengths(*in_double(camera.rays()), (), inside_out=False)
+    samples, gap = np.asarray(rendering.samples).reshape(-1), (whole - exact) / 0.02
+    assert np.all(samples < whole / 0.02 + 4 - 0.5 * gap)
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
 def test_no_cell_that_holds_anything_seen_is_taken_as_empty(inside_out):
     random, volume = np.random.default_rng(0), anisotropic_noise()
     visible = jnp.ones_like(Blocks.of(volume).low, bool)
+    low, high = (np.asarray(corner) for corner in volume.corners)
     for _ in range(20):
-        point = random.uniform(*(np.asarray(corner) for corner in volume.corners))
+        point = random.uniform(low, high)
         clip = jv.Clip(BOX, [PLANE, (point, random.normal(size=3))], inside_out=inside_out)
         space = jv.March(1.0, (clip,)).locate(volume)
         grid = space.occupancy(visible)
-        points = random.uniform(*(np.asarray(corner) for corner in volume.corners), (4000, 3))
+        points = random.uniform(low, high, (4000, 3))
         planes = oracle.planes_of(clip.box, zip(clip.origins, clip.normals, strict=True))
         inside_all = np.all([(points - p) @ n >= 0 for p, n in planes], axis=0)
-        cell = np.floor(np.stack(grid.cell(apart(jnp.asarray(points.T))), axis=-1)).astype(int)
+        x, y, z = jnp.asarray(points.T)
+        cell = np.floor(np.stack(grid.cell((x, y, z)), axis=-1)).astype(int)
         occupied = np.asarray(grid.occupied)[tuple(cell.T)]
         assert occupied[inside_all != inside_out].all()
         assert not occupied.all()
@@ -373,9 +392,9 @@ def test_gradients_are_central_differences(inside_out, adjoint):
             np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-7, err_msg=key)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("inside_out", "method"),
-    [(True, "hierarchy"), *slow((False, "hierarchy"), *((True, m) for m in leaping.METHODS[1:]))],
+    ("inside_out", "method"), [(False, "hierarchy"), *((True, method) for method in leaping.METHODS)]
 )
 def test_leaping_does_not_change_gradients(inside_out, method):
     """Of 8-bit voxels, in float32, by replay."""
@@ -391,35 +410,50 @@ def test_leaping_does_not_change_gradients(inside_out, method):
 # ---- under a toroidal map ----
 
 
+def hollow_rays(count=64):
+    """Rays through the hollow near side of a probe's sector."""
+    random = np.random.default_rng(0)
+    origins = np.array([30.0, -180.0, 20.0]) + random.normal(size=(count, 3)) * (9, 3, 3)
+    directions = np.array([17.0, 0, 36]) + random.normal(size=(count, 3)) * (6, 6, 1.5) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return origins.astype(np.float32), directions.astype(np.float32)
+
+
 @pytest.mark.parametrize("inside_out", [False, *slow(True)])
 def test_it_clips_a_swept_sector_in_the_world(inside_out):
-    """Its cuts and the gaps of the sector both count, wherever the two stand among the transforms: the length
-    that is left, by dense sampling."""
-    probe = toroidal.probe_of("across the middle")
+    """The length that is left, by dense sampling: also where a cut lies in a gap of the sector."""
+    probe, rays = toroidal.probe_of("across the middle"), hollow_rays()
     volume = jv.Volume(np.ones(toroidal.SHAPE, np.float32))
-    camera = toroidal.view(probe)
-    x, y, z = np.asarray(probe.center, float)
-    planes = [((x + 3, y, z - 6), (0.2, 1.0, 0.3)), ((x, y, z + 9), (0.1, 0.2, -1.0))]
-    clip = jv.Clip(planes=planes, inside_out=inside_out)
-    images = [
-        jv.render(volume, uniform_transfer(0.02), camera, jv.March(5.3, order))
-        for order in ((clip, ALIGNED, probe), (probe, ALIGNED, clip))
-    ]
-    np.testing.assert_array_equal(images[0].rgba, images[1].rgba)
-    lengths, gapped = [], 0
-    for origin, direction in zip(*rays_of(camera), strict=True):
-        pieces = toroidal.pieces_inside(origin, direction, toroidal.PROBES["across the middle"])
-        (first,), (last,) = oracle.side_interval(
-            origin[None], direction[None], [tuple(map(np.asarray, pair)) for pair in planes]
-        )
-        clipped = np.clip(np.minimum(pieces[:, 1], last) - np.maximum(pieces[:, 0], first), 0, None)
-        whole = pieces[:, 1] - pieces[:, 0]
-        lengths.append((whole - clipped if inside_out else clipped).sum())
-        gapped += len(pieces) > 1 and clipped.sum() > 0
-    assert gapped > 5
-    np.testing.assert_allclose(
-        images[0].rgba[..., 3].reshape(-1), 1 - np.exp(-0.02 * np.array(lengths)), atol=1e-5
-    )
+    within = dict.fromkeys(("gap and cut", "begins in a gap", "ends in a gap"), 0)
+    for planes in (
+        [((17, -4, 36), (0.2, 1.0, 0.3)), ((15, 30, 36), (0.1, -1, -0.2))],
+        [((17, 4, 36), (0.2, -1.0, 0.3)), ((15, -60, 36), (0.1, 1, -0.2))],
+    ):
+        march = jv.March(5.3, (jv.Clip(planes=planes, inside_out=inside_out), ALIGNED, probe))
+        rgba = jv.render_rays(volume, uniform_transfer(0.02), *rays, march).rgba
+        lengths = []
+        for origin, direction in zip(*in_double(rays), strict=True):
+            pieces = toroidal.pieces_inside(origin, direction, toroidal.PROBES["across the middle"])
+            (first,), (last,) = oracle.side_interval(
+                origin[None], direction[None], oracle.planes_of(None, planes)
+            )
+            clipped = np.clip(np.minimum(pieces[:, 1], last) - np.maximum(pieces[:, 0], first), 0, None)
+            whole = pieces[:, 1] - pieces[:, 0]
+            lengths.append((whole - clipped if inside_out else clipped).sum())
+            if len(pieces) > 1:
+                left, back = pieces[0, 1], pieces[1, 0]
+                within["gap and cut"] += 0 < clipped.sum() < whole.sum()
+                within["begins in a gap"] += left < first < back
+                within["ends in a gap"] += left < last < back
+        np.testing.assert_allclose(rgba[:, 3], 1 - np.exp(-0.02 * np.array(lengths)), atol=1e-5)
+    assert min(within.values()) > 5, within
+
+
+def test_its_place_among_other_transforms_does_not_show():
+    probe, clip = toroidal.probe_of("across the middle"), jv.Clip(EVERYWHERE, [PLANE])
+    volume = toroidal.noise_volume()
+    first, last = (jv.March(1.0, order).locate(volume) for order in ((clip, probe), (probe, clip)))
+    assert eqx.tree_equal(first, last)
 
 
 @pytest.mark.slow
@@ -442,28 +476,37 @@ def test_with_a_toroidal_map_engines_agree_and_leaping_does_not_show(inside_out)
 # ---- parameters ----
 
 
+@pytest.mark.slow
 def test_other_parameters_compile_nothing_again():
     transfer_class = counting()
     transfer = transfer_class(np.linspace(0, 1, 8), np.ones((8, 3)), np.full(8, 2.0))
-    volume = constant()
     traces = []
     for shift in (0.0, 0.1, 0.2):
-        clip = jv.Clip(np.add(CORNER, shift), [((shift, 0, 0), (1, shift, 0))], inside_out=True)
-        jv.render(volume, transfer, around(volume), jv.March(0.13, (ALIGNED, clip)))
+        clip = jv.Clip(np.add((0.5, 3, -3, -0.2, 0.4, 3), shift), [((shift, 0, 0), (1, shift, 0))])
+        jv.render(constant(), transfer, around(constant()), jv.March(0.13, (ALIGNED, clip)))
         traces.append(transfer_class.traces)
     assert len(set(traces)) == 1
 
 
-def test_nan_in_a_plane_reaches_image_and_gradient():
-    def loss(x):
-        clip = jv.Clip((-0.5, 0.5) * 3, inside_out=True)
-        clip = eqx.tree_at(lambda clip: clip.box, clip, clip.box.at[1].set(x))
-        march = jv.March(0.13, (ALIGNED, clip))
-        return jv.render(constant(), uniform_transfer(1.0), around(constant()), march).rgba.sum()
+def test_nan_in_a_plane_shows():
+    clip = jv.Clip(EVERYWHERE, [((0, 0, -9), (0, 0, 1))] * 2)
+    for where in (lambda clip: clip.box, lambda clip: clip.origins, lambda clip: clip.normals):
+        broken = eqx.tree_at(where, clip, where(clip) * jnp.nan)
+        march = jv.March(0.13, (ALIGNED, broken))
+        assert np.isnan(jv.render_rays(constant(), uniform_transfer(1.5), *random_rays(0), march).rgba).all()
 
-    assert np.isfinite(jax.grad(loss)(0.5))
-    assert np.isnan(loss(np.nan))
-    assert np.isnan(jax.grad(loss)(np.nan))
+
+@pytest.mark.parametrize("bad", ["box", "normal"])
+def test_traced_parameters_are_checked_where_they_are_used(bad):
+    @jax.jit
+    def box_of(x):
+        clip = jv.Clip((x, 1.0, 0.0, 1.0, 0.0, 1.0)) if bad == "box" else None
+        return jv.Clip(planes=[(jnp.zeros(3), x * jnp.ones(3))]).normals if clip is None else clip.box
+
+    good, wrong, message = (0.5, 1.5, "box must be") if bad == "box" else (1.0, 0.0, "must not be 0")
+    assert np.isfinite(box_of(good)).all()
+    with pytest.raises(RuntimeError, match=message):
+        box_of(wrong)
 
 
 UNIT = (0, 1, 0, 1, 0, 1)
@@ -473,7 +516,7 @@ BAD = {
     "corners": ((((0, 0, 0), (1, 1, 1)),), r"box must have shape \(6,\); got shape \(2, 3\)"),
     "corners in a row": (
         ((0, 0, 0, 1, 1, 1),),
-        "box must be .* each minimum below its maximum; got .0 0 0 1",
+        r"box must be .* each minimum below its maximum; got \[0\. 0\. 0\. 1\.",
     ),
     "NaN": (((0, 1, 0, 1, 0, np.nan),), "box must be finite"),
     "infinite": (((0, 1, 0, 1, 0, np.inf),), "box must be finite"),
