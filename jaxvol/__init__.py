@@ -62,6 +62,7 @@ from .transfer import TransferFunction as TransferFunction
 from .transforms import (
     AdaptiveSampling as AdaptiveSampling,
     AlphaCorrection as AlphaCorrection,
+    Clip as Clip,
     EarlyTermination as EarlyTermination,
     EmptySpaceJitter as EmptySpaceJitter,
     Jitter as Jitter,

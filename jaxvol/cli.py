@@ -17,13 +17,14 @@ from .camera import Camera
 from .display import image_file, save_image
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
-from .march import March
+from .march import March, Transform
 from .phantoms import phantom
 from .planning import plan
 from .presets import PRESETS, colormap, preset
 from .render import PLANNED, render
 from .transfer import TransferFunction
 from .transforms.alpha_correction import AlphaCorrection
+from .transforms.clip import Clip
 from .transforms.early_termination import EarlyTermination
 from .transforms.space_leaping import SpaceLeaping
 from .unseen import why_unseen
@@ -36,6 +37,7 @@ examples:
   jaxvol render engine_256x256x128_uint8.raw.gz --preset engine -o engine.png
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
+  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --clip-plane 128 128 64 1 -1 0 -o half.png
   jaxvol plan engine_256x256x128_uint8.raw.gz --preset engine --tolerance 0.001
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
   jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
@@ -254,6 +256,30 @@ def _view_options() -> argparse.ArgumentParser:
     )
     camera.add_argument("--parallel", action="store_true", help="orthographic camera; use with --direction")
     camera.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
+
+    clip = view.add_argument_group("clip", "show a part of the volume; box and planes in world coordinates")
+    clip.add_argument(
+        "--clip-box",
+        type=float,
+        nargs=6,
+        metavar=("X_MIN", "X_MAX", "Y_MIN", "Y_MAX", "Z_MIN", "Z_MAX"),
+        help="show what is inside this box",
+    )
+    clip.add_argument(
+        "--clip-plane",
+        type=float,
+        nargs=6,
+        action="append",
+        default=[],
+        metavar=("X", "Y", "Z", "NX", "NY", "NZ"),
+        help="show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) "
+        "points; may be given several times",
+    )
+    clip.add_argument(
+        "--clip-inside-out",
+        action="store_true",
+        help="cut away what is inside the box and on that side of all planes, and show the rest",
+    )
     view.add_argument(
         "--tolerance",
         type=float,
@@ -328,7 +354,7 @@ def _render(options: argparse.Namespace) -> None:
         image_file("--depth", options.depth, 0)
     volume, transfer, camera = _view(options)
     background = None if options.transparent else options.background
-    volume, march = _march(options, volume, transfer, camera)
+    volume, march = _march(options, volume, transfer, camera, _clip(options))
     _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
 
 
@@ -336,7 +362,8 @@ def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
     volume, transfer, camera = _view(options)
-    print(plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance))
+    tolerance = PLANNED if options.tolerance is None else options.tolerance
+    print(plan(volume, transfer, camera, tolerance, transforms=_clip(options)))
 
 
 def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera]:
@@ -359,17 +386,32 @@ def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera
 
 
 def _march(
-    options: argparse.Namespace, volume: Volume, transfer: TransferFunction, camera: Camera
+    options: argparse.Namespace,
+    volume: Volume,
+    transfer: TransferFunction,
+    camera: Camera,
+    clip: tuple[Transform, ...],
 ) -> tuple[Volume, March]:
     """The volume and its march: of the given step; without one, as planned."""
     if options.step is None:
-        found = plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance)
+        tolerance = PLANNED if options.tolerance is None else options.tolerance
+        found = plan(volume, transfer, camera, tolerance, transforms=clip)
         if not found.within:
             print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
         return found.volume, found.march
     if options.tolerance is not None:
         raise ValueError("--tolerance finds a step; leave out --step.")
-    return volume, March(options.step, FAST, "midpoint")
+    return volume, March(options.step, (*clip, *FAST), "midpoint")
+
+
+def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:
+    """What is cut away, if anything is."""
+    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    if options.clip_box is None and not planes:
+        if options.clip_inside_out:
+            raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
+        return ()
+    return (Clip(options.clip_box, planes, inside_out=options.clip_inside_out),)
 
 
 def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
@@ -444,5 +486,5 @@ def _picture(
         print(f"{save_image(depth, rendering.depth)}: distances, world length")
     if np.any(rendering.exhausted):
         print(f"{path}: incomplete: rays used up their {march.most_samples} samples; use a longer step")
-    if (why := why_unseen(volume, transfer, camera, rendering)) is not None:
+    if (why := why_unseen(volume, transfer, camera, march, rendering)) is not None:
         print(f"{path}: nothing is seen: {why}")

@@ -366,16 +366,16 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 def steps_across(volume: Volume, march: March) -> int:
     """Number of steps that suffices for any ray: across the volume's diagonal, and a few more for
     transforms."""
-    if is_traced(volume.spacing, march.lengths):
+    with jax.ensure_compile_time_eval():
+        diagonal = march.locate(volume).diagonal
+    if is_traced(march.step, diagonal):
         if march.max_samples is not None:
             return march.max_samples
         raise ValueError(
             "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
             "the length of a scan must be known before the program is compiled."
         )
-    with jax.ensure_compile_time_eval():
-        diagonal = float(march.locate(volume).diagonal)
-        steps = diagonal / float(march.step) if march.step > 0 else math.nan
+    steps = float(diagonal) / float(march.step) if march.step > 0 else math.nan
     if not math.isfinite(steps):  # then nothing is marched, and the image is NaN
         return 1
     # the first cell may begin a step early, one step finds the exit, and a jitter may shorten one more

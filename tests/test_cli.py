@@ -1,5 +1,6 @@
 """The command line, run as users run it."""
 
+import contextlib
 import json
 import re
 import signal
@@ -8,12 +9,15 @@ import sys
 import time
 import warnings
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.cli import main
+from jaxvol.metrics import rmse
 
 
 @pytest.fixture
@@ -129,6 +133,36 @@ def test_parallel_rays_are_asked_for_by_an_option(volume_file, tmp_path, monkeyp
     np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
 
 
+def test_clips_are_those_of_the_library(volume_file, tmp_path, monkeypatch):
+    """A box and two planes, inside out, at a given step and in a plan."""
+    volume, transfer, _, march = scene_of(volume_file)
+    planes = [((12, 0, 0), (1, 0.5, 0)), ((0, 0, 4), (0, 0, 1))]
+    words = ["--clip-box", 5, 30, -1, 20, -1, 30, "--clip-inside-out"]
+    for origin, normal in planes:
+        words += ["--clip-plane", *origin, *normal]
+    view = ["--preset", "engine", "--camera", 40, -30, 20, *[11.5] * 3, "--zoom", 1.5]
+    output = tmp_path / "x.npy"
+    clip = jv.Clip((5, 30, -1, 20, -1, 30), planes, inside_out=True)
+    camera = scene_of(volume_file)[2]
+    images = {}
+    for name, transforms in {"clipped": (clip,), "whole": ()}.items():
+        leaps = jv.SpaceLeaping(), *march.transforms
+        images[name] = jv.render(volume, transfer, camera, jv.March(0.4, (*transforms, *leaps), "midpoint"))
+    expected = images["clipped"].image((1, 1, 1))
+    assert render_file(volume_file, *view, *words, "-o", output) == 0
+    np.testing.assert_allclose(np.load(output), expected, atol=1e-5)
+    assert rmse(expected, images["whole"].image((1, 1, 1))) > 0.05
+    planned = []
+    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms: planned.append(transforms))
+    for command in ("plan", "render"):
+        monkeypatch.setattr("jaxvol.cli._picture", None)  # not called
+        with contextlib.suppress(TypeError, AttributeError):  # there is no plan to print or render
+            main([command, str(volume_file), *map(str, view), *map(str, words)])
+    for (given,) in planned:
+        assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), given, clip))
+    assert len(planned) == 2
+
+
 def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
     np.save(tmp_path / "v.npy", np.linspace(20, 90, 1000).reshape(10, 10, 10).astype(np.float32))
     shown = (["--preset", "ct_bone", "--clim", "20", "90"], None)
@@ -144,6 +178,14 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
         (
             ["--preset", "ct_bone", "--clim", "20", "90", "--unit-distance", "1e6"],
             r"nothing is seen: the opacity is at most .*\. Use a shorter unit distance",
+        ),
+        (
+            ["--preset", "ct_bone", "--clim", "20", "90", "--clip-box", *"050505", "--clip-inside-out"],
+            None,
+        ),
+        (
+            ["--preset", "ct_bone", "--clim", "20", "90", "--clip-plane", *["20"] * 3, *"100"],
+            "nothing is seen: no ray of the camera meets what the clip leaves of the volume",
         ),
         shown,
     ]:
@@ -240,6 +282,9 @@ BAD = {
     "size": (["FILE", "--size", "0", "5"], "size must be"),
     "camera": (["FILE", "--camera", "1", "1", "1", "1", "1", "1"], "position must differ from focal_point"),
     "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
+    "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
+    "no normal": (["FILE", "--clip-plane", *"111000"], "the normal of planes[0] must not be 0"),
+    "nothing to turn": (["FILE", "--clip-inside-out"], "--clip-inside-out goes with --clip-box or"),
     "shape": (["FILE", "--shape", "24", "24", "25"], "cut short"),
     "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
     "clim": (["FILE", "--preset", "engine", "--clim", "5", "4"], "clim must be"),

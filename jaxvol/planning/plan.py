@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool
 
 from .._util.checks import described, integer, is_traced
 from ..arguments import check_arguments
@@ -17,7 +17,7 @@ from ..lighting.shading import Lighting
 from ..march import March, Transform
 from ..occupancy import Blocks
 from ..rendering import Rendering
-from ..space import node_distance
+from ..space import Space, node_distance
 from ..transfer import Transfer
 from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..volume import Volume
@@ -138,7 +138,7 @@ def plan(
     - **`SpaceLeaping`**: kept where blocks are proven empty, in images that are composited "over". It does
       not change them; but extinctions of 0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
-      faces.
+      faces, and where a `Clip` cuts.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
     - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
@@ -158,7 +158,8 @@ def plan(
 
     - `volume`, `transfer`, `camera`: the scene. An image of another camera needs a plan of its own.
     - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
-    - `transforms`: those that are part of the scene, such as a `ToroidalMap`, or jitter. They are kept.
+    - `transforms`: those that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
+      kept.
     - `compositing`, `lighting`: as for `render`.
     - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, voxels keep
       their type, and simpler lightings without a gradient are left out. The tolerance is that of the image
@@ -184,7 +185,7 @@ def plan(
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
 
     over = isinstance(setting.compositing, Over)
-    proven, parts = _proven(np.asarray(visible), given, over=over)
+    proven, parts = _proven(visible, space, given, over=over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
     voxel = float(jnp.median(node_distance(space, visible.shape)))
 
@@ -256,22 +257,24 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
 
 
 def _proven(
-    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...], *, over: bool
+    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...], *, over: bool
 ) -> tuple[tuple[Transform, ...], list[Part]]:
     """Transforms that proofs decide on, from the blocks that may hold anything visible. `over`: whether cells
     are composited "over"."""
     found: list[Transform] = []
     parts = []
-    faces = sum(bool(np.take(visible, end, axis).any()) for axis in range(3) for end in (0, -1))
+    at_faces = space.visible_at_faces(visible)
+    faces = sum(map(bool, at_faces))
     if any(isinstance(each, AlphaCorrection) for each in given):
         parts.append(Part("AlphaCorrection", True, "part of the scene"))
     elif faces:
-        why = f"something may be visible at {faces} of the volume's 6 faces"
+        cut = "" if len(at_faces) == 6 else " and cuts"
+        why = f"something may be visible at {faces} of the volume's {len(at_faces)} faces{cut}"
         parts.append(Part("AlphaCorrection", True, why))
         found.append(AlphaCorrection())
     else:
         parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
-    empty = float(1 - visible.mean())
+    empty = float(np.mean(~np.asarray(visible)))
     leaps = over and empty >= EMPTY
     why = f"{empty:.1%} of the blocks hold nothing visible" if over else "it is for images composited over"
     parts.append(Part("SpaceLeaping", leaps, why))

@@ -11,7 +11,7 @@ rendered as acquired, without resampling: rays that are straight in the world ar
 """
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -143,10 +143,12 @@ class ToroidalMap(Transform):
 class _Sector(Space):
     """The space of a volume under a `ToroidalMap`."""
 
-    searches: ClassVar[bool] = True
-
     probe: ToroidalMap
     shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @property
+    def searches(self) -> bool:
+        return True
 
     @property
     def diagonal(self) -> Scalar:

@@ -13,6 +13,7 @@ from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks
 from jaxvol.planning import trials
 from jaxvol.planning.plan import _proven
+from jaxvol.space import Affine
 
 from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
 
@@ -92,10 +93,42 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, a
     data = np.zeros(volume.shape, np.float32)
     data[8:16, 8:16, 8:16] = 0.5
     data = np.roll(data, 8 * (1 if end else -1), axis)
-    visible = transfer.visible(Blocks.of(jv.Volume(data, volume.spacing)))
-    proven, parts = _proven(np.asarray(visible), (), over=True)
+    cube = jv.Volume(data, volume.spacing)
+    visible = transfer.visible(Blocks.of(cube))
+    proven, parts = _proven(visible, Affine(cube), (), over=True)
     assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
     assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible(sphere, inside_out):
+    volume, transfer, _ = sphere
+    visible = transfer.visible(Blocks.of(volume))
+    found = {}
+    for name, side in {"through the ball": 0.1, "around it": 0.9}.items():
+        clip = jv.Clip((-side, side, -0.9, 0.9, -0.9, 0.9), inside_out=inside_out)
+        space = jv.March(1.0, (clip,)).locate(volume)
+        proven, parts = _proven(visible, space, (clip,), over=True)
+        found[name] = parts[0]
+        assert (type(proven[0]) is jv.AlphaCorrection) == parts[0].kept
+    assert found["through the ball"].why == (
+        "something may be visible at 2 of the volume's 12 faces and cuts"
+    )
+    assert not found["around it"].kept
+
+
+@pytest.mark.slow
+def test_a_clipped_scene_is_within_its_tolerance(sphere):
+    volume, transfer, camera = sphere
+    clip = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
+    found = jv.plan(volume, transfer, camera, TOLERANCE, transforms=(clip,))
+    assert {"Clip", "AlphaCorrection"} <= transforms_of(found)
+    fine = jv.March(float(volume.spacing.min()) / 64, (jv.AlphaCorrection(), clip), "preintegrated")
+    image = jv.render(found.volume, transfer, camera, found.march)
+    truth = jv.render(volume, transfer, camera, fine)
+    assert (
+        max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1))) <= found.error <= TOLERANCE
+    )
 
 
 @pytest.mark.slow
