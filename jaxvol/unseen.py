@@ -1,5 +1,7 @@
 """Why is nothing visible in an image?"""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from ._util.vec3 import apart
 from .camera import Camera
+from .compositing import Compositing
+from .isosurface import Isosurface
+from .modes import Mode
 from .rendering import Rendering
 from .space import Affine, Ray, enter
 from .transfer import Transfer, TransferFunction
@@ -20,7 +25,13 @@ RAYS, POINTS = 4096, 128
 """Maximum number of rays, and number of points per ray, at which a volume is sampled."""
 
 
-def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, rendering: Rendering) -> str | None:
+def why_unseen(
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    rendering: Rendering,
+    compositing: Compositing[Any] | Mode = "over",
+) -> str | None:
     """Why an image of this scene shows nothing, and what to change; None if it shows something.
 
     An image shows nothing if no pixel's opacity reaches 1/510, half a level of an 8-bit image. Values are
@@ -43,6 +54,8 @@ def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, rendering: Re
         )
     low, high = float(values[hit].min()), float(values[hit].max())
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
+    if isinstance(compositing, Isosurface):
+        return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     shown = _shown(transfer)
     if shown is None:
         return f"{where}, and the transfer function shows none of them, or only under another label."
