@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -67,10 +68,9 @@ class Isosurface(Selection[Crossing]):
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         """What is looked for, by cells whose two ends are measured, up to the exit."""
         cut = () if march.ends_at_exit else (AlphaCorrection(),)
-        transforms = (*march.transforms, *cut)
-        return _Crossings(self.value), March(
-            march.step, transforms, "preintegrated", max_samples=march.max_samples
-        )
+        integrated = March(1.0, (*march.transforms, *cut), "preintegrated", max_samples=march.max_samples)
+        # not as an argument, which would be checked once more
+        return _Crossings(self.value), eqx.tree_at(lambda march: march.step, integrated, march.step)
 
     def begin(self, zero: Scalar, outputs: Outputs | None) -> Crossing:
         return Crossing(zero + jnp.inf, zero + jnp.inf, jnp.zeros(zero.shape, bool))

@@ -131,7 +131,7 @@ class Average(Weighting):
     Gradients are complete with `AlphaCorrection`: of the voxels, transfer function, camera, spacing and step,
     in every adjoint. Without, they miss the jumps of the exit (`render`).
 
-    **Raises:** `ValueError` for a thickness that is not a positive finite number; in a render, for a lighting,
+    **Raises:** `ValueError` for a thickness that is not a positive finite number. In a render, for a lighting
     and for a transfer function that reads more than the value: a mean lies nowhere.
 
     Source: VTK's AVERAGE_INTENSITY_BLEND.

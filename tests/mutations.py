@@ -719,8 +719,8 @@ MUTATIONS = [
     Mutation(
         "maximum: leaps over what may win, since it is invisible",
         "projections.py",
-        "return transfer.visible(Blocks(jnp.full_like(blocks.low, jnp.nanmin(blocks.low)), blocks.high, None))",
-        "return transfer.visible(blocks)",
+        "Blocks(jnp.full_like(blocks.low, jnp.nanmin(blocks.low)), blocks.high, None)",
+        "blocks",
         ("test_projections.py::test_what_is_invisible_of_one_label_may_hide_another",),
     ),
     Mutation(
@@ -731,10 +731,10 @@ MUTATIONS = [
         ("test_projections.py::test_they_are_those_of_numpy[random-maximum]",),
     ),
     Mutation(
-        "average: the last cell counts as a whole",
+        "average: cells weigh their opacity",
         "projections.py",
         "return -jnp.log1p(-alpha)  # the optical depth",
-        "return jnp.where(alpha > 0, jnp.max(alpha), alpha)",
+        "return alpha",
         ("test_projections.py::test_a_mean_of_linear_values_is_exact[around-midpoint]",),
     ),
     Mutation(
@@ -745,11 +745,11 @@ MUTATIONS = [
         ("test_projections.py::test_gradients_are_central_differences[average-replay]",),
     ),
     Mutation(
-        "isosurface: bisected by the value in front, which may round to the other side",
+        "isosurface: differentiated behind the crossing, where values may not change",
         "isosurface.py",
-        "(sampler.value(middle) >= self.value) == state.rises",
-        "(sampler.value(middle) >= self.value) != (sampler.value(front) >= self.value)",
-        ("test_isosurface.py::test_what_lies_on_the_value_is_not_below_it",),
+        "return jnp.where(state.rises, near, far)",
+        "return far",
+        ("test_isosurface.py::test_a_plateau_on_the_value_leaves_its_gradient",),
     ),
     Mutation(
         "isosurface: no derivative by the value",
