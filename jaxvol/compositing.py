@@ -169,8 +169,8 @@ class Weighting(Compositing[Composite]):
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         """The premultiplied colour and opacity of a ray that is not transparent, from its Σ w c and Σ w, once
-        for each ray after the march. It is differentiated by JAX. Not called unless overridden.
-        `classification`: of what was given, not of what was `marched`."""
+        for each ray after the march. It is differentiated by JAX, also of sums that are 0, which must not be
+        NaN. Not called unless overridden. `classification`: of what was given, not of what was `marched`."""
         return sums
 
     @property

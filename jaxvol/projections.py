@@ -164,7 +164,8 @@ class Average(Weighting):
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         if classification.light is not None:
             raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
-        mean = sums[0] / sums[3]
+        # the entries that fill up a chunk of pixels may be 0, and a derivative there must not be NaN
+        mean = sums[0] / jnp.where(sums[3] == 0, 1, sums[3])
         return layer(*classification.classify(classification.searched((mean,))), self.thickness)
 
 

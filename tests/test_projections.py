@@ -149,7 +149,7 @@ def test_leaps_do_not_show(mode, method):
     points = [(0.0, (0.2, 0.3, 0.8), 0.0), (60.0, (0.9, 0.4, 0.1), 0.0), (255.0, (1.0, 1.0, 1.0), 0.9)]
     if mode == "minimum":
         points = [(255 - value, *look) for value, *look in reversed(points)]
-    transfer, camera = jv.TransferFunction.from_points(points, 0.5), around(volume)
+    transfer, camera = jv.TransferFunction.from_points(points, 0.5), around(volume).zoom(2.0)
     for jitter in ((), (jv.EmptySpaceJitter(4),)):
         plain, leaping = (
             jv.render(volume, transfer, camera, jv.March(0.05, (*jitter, *more)), compositing=MODES[mode])
@@ -263,7 +263,7 @@ def test_what_an_average_cannot_have_is_refused():
         jv.render(
             *(labelled, jv.LabelTransferFunction({0: soft_transfer()}), camera, march), compositing="average"
         )
-    light = ScattererTemplates(Material(0.8, 0.1, 1.4), ConstantLight(1.0), templates=1, photons=2)
+    light = ScattererTemplates(Material(0.8, 0.1, 1.4), ConstantLight((1.0, 1.0, 1.0)), templates=1, photons=2)
     with pytest.raises(ValueError, match="lighting must be None"):
         jv.render(NOISE, soft_transfer(), camera, march, compositing="average", lighting=Deferred(light))
 
