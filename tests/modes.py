@@ -39,6 +39,12 @@ def same_images(found, expected, *, atol=1e-6):
     np.testing.assert_allclose(found.depth[finite], expected.depth[finite], rtol=max(atol, 1e-6))
 
 
+def ball_in_a_corner():
+    """A ball of 8-bit values, greatest in its middle, with much empty space around it."""
+    ball = jv.phantom("sphere", 12)
+    return jv.Volume((255 * np.pad(np.asarray(ball.data), ((2, 10),) * 3)).astype(np.uint8), ball.spacing)
+
+
 LEAVES = {
     "voxels": lambda scene: scene[0].data,
     "spacing": lambda scene: scene[0].spacing,
@@ -50,12 +56,12 @@ LEAVES = {
 """Differentiable leaves of a scene (volume, transfer function, camera, march, mode)."""
 
 
-def check_gradients(volume, mode, parameters, adjoint, *, constant=(), normals=False):
+def check_gradients(volume, mode, parameters, adjoint, *, constant=(), normals=False, quadrature="left"):
     """Asserts that the gradient of a loss of colours and depths (and normals) is that of central differences,
     in float64: of each leaf alone under replay, and of all of them together.
 
     `parameters`: leaves of the mode, by name. `constant`: those on which the loss does not depend."""
-    march = jv.March(0.11, (jv.AlphaCorrection(), jv.SpaceLeaping()), "midpoint", max_samples=64)
+    march = jv.March(0.11, (jv.AlphaCorrection(), jv.SpaceLeaping()), quadrature, max_samples=64)
     scene = volume, soft_transfer(), around(volume, (9, 8)), march, mode
     named = {**LEAVES, **{name: lambda s, of=of: of(s[4]) for name, of in parameters.items()}}
 

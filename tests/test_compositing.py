@@ -62,8 +62,8 @@ def test_over_is_the_same_back_to_front():
 
 def test_an_image_is_the_same_back_to_front():
     """A head, sample by sample from the back: C' = α c + (1 - α) C, in float64."""
-    volume, transfer, step = scaled_phantom("head"), soft_transfer(), 0.07
-    camera = around(volume)
+    volume, transfer, step = scaled_phantom("head"), soft_transfer(0.2), 0.07
+    camera = around(volume).zoom(2.0)
     origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
     low, spacing, values = (
         np.asarray(p, np.float64) for p in (volume.origin, volume.spacing, transfer.values)
@@ -81,6 +81,7 @@ def test_an_image_is_the_same_back_to_front():
         image = alpha[:, None] * own + (1 - alpha)[:, None] * image
     rendering = jv.render(volume, transfer, camera, jv.March(step, (jv.AlphaCorrection(),)))
     assert 0.1 < np.mean(image[:, 3] > 0.5) < 0.9
+    assert np.mean((image[:, 3] > 0.01) & (image[:, 3] < 0.5)) > 0.02
     np.testing.assert_allclose(np.asarray(rendering.rgba).reshape(-1, 4), image, atol=2e-5)
 
 
