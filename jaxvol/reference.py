@@ -282,29 +282,27 @@ def resolve(
 ) -> Pixel:
     """The pixel of a ray that is not transparent, from what its march found: by the compositing mode, or else
     by the lighting."""
-    march, volume, classification, compositing = pipeline
+    compositing = pipeline.compositing
     if isinstance(compositing, Selection):
-        return _selected(compositing, march, volume, classification, space, line, rgba, selected)
+        return _selected(compositing, pipeline, space, line, rgba, selected)
     if compositing.resolves:
         assert isinstance(compositing, Weighting)
-        found = compositing.resolved(classification, rgba)
+        found = compositing.resolved(pipeline.classification, rgba)
         check_answer(compositing, "resolved", found, rgba)
         return Pixel(found, depth)
     assert lighting is not None
-    return Pixel(lighting.shade_pixel(classification, space, line, rgba, depth), depth)
+    return Pixel(lighting.shade_pixel(pipeline.classification, space, line, rgba, depth), depth)
 
 
 def _selected(
     compositing: Selection[Any],
-    march: March,
-    volume: Volume,
-    classification: Classification,
+    pipeline: Pipeline,
     space: Space,
     line: Line,
     rgba: Float[Array, "4"],
     state: PyTree,
 ) -> Pixel:
-    ray = enter(space, *line)
+    ray, (march, volume, classification, _) = enter(space, *line), pipeline
     # 1, with a derivative: the selected depths are numbers of steps, and so grow with the step
     scale = march.step / jax.lax.stop_gradient(march.step)
     sampler = RaySampler(ray, classification, scale, partial(world_gradient, volume, space))

@@ -72,7 +72,9 @@ def check_gradients(volume, mode, parameters, adjoint, *, constant=(), normals=F
     assert hit.mean() > 0.2
     random = np.random.default_rng(3)
     weights = random.normal(size=(8, 9, 8))
-    ways = tuple(jnp.asarray(random.choice([-1.0, 1.0], leaf.shape)) for leaf in leaves(scene))
+    ways = {name: jnp.asarray(random.choice([-1.0, 1.0], of(scene).shape)) for name, of in named.items()}
+    ways["extinction"] *= scene[1].extinction > 0  # those of 0 stay 0, since none is negative
+    ways = tuple(ways.values())
 
     def loss(given, adjoint="replay"):
         moved = eqx.tree_at(leaves, scene, given)

@@ -145,7 +145,8 @@ def test_leaps_do_not_show(mode, method):
     volume = ball_in_a_corner()
     if mode == "minimum":
         volume = eqx.tree_at(lambda v: v.data, volume, 255 - volume.data)
-    points = [(0.0, (0.2, 0.3, 0.8), 0.0), (60.0, (0.9, 0.4, 0.1), 0.0), (255.0, (1.0, 1.0, 1.0), 0.9)]
+    dim = 0.3 if mode == "average" else 0.0
+    points = [(0.0, (0.2, 0.3, 0.8), dim), (60.0, (0.9, 0.4, 0.1), dim), (255.0, (1.0, 1.0, 1.0), 0.9)]
     if mode == "minimum":
         points = [(255 - value, *look) for value, *look in reversed(points)]
     transfer, camera = jv.TransferFunction.from_points(points, 0.5), around(volume).zoom(2.0)
