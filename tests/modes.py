@@ -73,7 +73,8 @@ def check_gradients(volume, mode, parameters, adjoint, *, constant=(), normals=F
     random = np.random.default_rng(3)
     weights = random.normal(size=(8, 9, 8))
     ways = {name: jnp.asarray(random.choice([-1.0, 1.0], of(scene).shape)) for name, of in named.items()}
-    ways["extinction"] *= scene[1].extinction > 0  # those of 0 stay 0, since none is negative
+    # extinctions of 0 stay 0, since none is negative
+    ways["extinction"] = jnp.where(scene[1].extinction > 0, ways["extinction"], 0)
     ways = tuple(ways.values())
 
     def loss(given, adjoint="replay"):
