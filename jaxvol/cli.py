@@ -8,16 +8,20 @@ import time
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from ._util.checks import output_file
 from .camera import Camera
+from .compositing import Compositing
 from .display import image_file, save_image
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
+from .isosurface import Isosurface
 from .march import March, Transform
+from .modes import MODES, Mode, compositing_of
 from .phantoms import phantom
 from .planning import plan
 from .presets import PRESETS, colormap, preset
@@ -38,6 +42,8 @@ examples:
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
   jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --clip-plane 128 128 64 1 -1 0 -o half.png
+  jaxvol render engine_256x256x128_uint8.raw.gz --cmap gray --compositing maximum -o mip.png
+  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --compositing isosurface --isovalue 170
   jaxvol plan engine_256x256x128_uint8.raw.gz --preset engine --tolerance 0.001
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
   jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
@@ -148,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
         "--depth",
         type=Path,
         metavar="FILE",
-        help="also write depth, the mean distance to what is visible, else infinite: .npy or .tif, float32",
+        help="also write depth, the (mean) distance to what is visible, else infinite: .npy or .tif, float32",
     )
     render_command.set_defaults(run=_render)
 
@@ -230,6 +236,17 @@ def _view_options() -> argparse.ArgumentParser:
     )
     appearance.add_argument(
         "--unit-distance", type=float, help="length to which opacities refer (default: 1)"
+    )
+
+    appearance.add_argument(
+        "--compositing",
+        choices=(*MODES, "isosurface"),
+        default="over",
+        help="how samples become a pixel: over (default), by emission and absorption; maximum, minimum, "
+        "average: that value of the ray, as classified; isosurface: where --isovalue is first crossed",
+    )
+    appearance.add_argument(
+        "--isovalue", type=float, metavar="VALUE", help="with --compositing isosurface: the value on it"
     )
 
     camera = view.add_argument_group("camera")
@@ -352,18 +369,39 @@ def _render(options: argparse.Namespace) -> None:
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
+    mode = _mode(options)
     volume, transfer, camera = _view(options)
     background = None if options.transparent else options.background
-    volume, march = _march(options, volume, transfer, camera, _clip(options))
-    _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
+    volume, march = _march(options, volume, transfer, camera, _clip(options), mode)
+    _picture(
+        *(volume, transfer, camera, march, options.output),
+        compositing=mode,
+        background=background,
+        depth=options.depth,
+    )
 
 
 def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
-    volume, transfer, camera = _view(options)
-    tolerance = PLANNED if options.tolerance is None else options.tolerance
-    print(plan(volume, transfer, camera, tolerance, transforms=_clip(options)))
+    mode = _mode(options)
+    print(plan(*_view(options), _tolerance(options), transforms=_clip(options), compositing=mode))
+
+
+def _mode(options: argparse.Namespace) -> Compositing[Any]:
+    """The compositing mode that the options name."""
+    shows_surface, value = options.compositing == "isosurface", options.isovalue
+    if shows_surface and value is None:
+        raise ValueError("--compositing isosurface needs the value on the surface: --isovalue VALUE.")
+    if value is not None and not shows_surface:
+        raise ValueError(
+            f"--isovalue goes with --compositing isosurface; got --compositing {options.compositing}."
+        )
+    return Isosurface(value) if shows_surface else compositing_of(options.compositing)
+
+
+def _tolerance(options: argparse.Namespace) -> float:
+    return PLANNED if options.tolerance is None else options.tolerance
 
 
 def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera]:
@@ -391,11 +429,12 @@ def _march(
     transfer: TransferFunction,
     camera: Camera,
     clip: tuple[Transform, ...],
+    mode: Compositing[Any],
 ) -> tuple[Volume, March]:
     """The volume and its march: of the given step; without one, as planned."""
     if options.step is None:
-        tolerance = PLANNED if options.tolerance is None else options.tolerance
-        found = plan(volume, transfer, camera, tolerance, transforms=clip)
+        scene = volume, transfer, camera
+        found = plan(*scene, _tolerance(options), transforms=clip, compositing=mode)
         if not found.within:
             print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
         return found.volume, found.march
@@ -467,12 +506,13 @@ def _picture(
     march: March,
     output: Path,
     *,
+    compositing: Compositing[Any] | Mode = "over",
     background: Sequence[float] | None = (1, 1, 1),
     depth: Path | None = None,
 ) -> None:
     """Render to files, with opacity if there is no background; print their paths and the time taken."""
     begun = time.perf_counter()
-    rendering = jax.block_until_ready(render(volume, transfer, camera, march))
+    rendering = jax.block_until_ready(render(volume, transfer, camera, march, compositing=compositing))
     took = time.perf_counter() - begun
     path = save_image(output, rendering.rgba if background is None else rendering.image(background))
     device = jax.devices()[0]
@@ -486,5 +526,5 @@ def _picture(
         print(f"{save_image(depth, rendering.depth)}: distances, world length")
     if np.any(rendering.exhausted):
         print(f"{path}: incomplete: rays used up their {march.most_samples} samples; use a longer step")
-    if (why := why_unseen(volume, transfer, camera, march, rendering)) is not None:
+    if (why := why_unseen(volume, transfer, camera, march, rendering, compositing)) is not None:
         print(f"{path}: nothing is seen: {why}")

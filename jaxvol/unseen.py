@@ -1,5 +1,7 @@
 """Why is nothing visible in an image?"""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,10 @@ from jaxtyping import Array, Bool, Float
 
 from ._util.vec3 import apart
 from .camera import Camera
+from .compositing import Compositing
+from .isosurface import Isosurface
 from .march import March
+from .modes import Mode
 from .rendering import Rendering
 from .space import Affine, Ray, Space, enter
 from .transfer import Transfer, TransferFunction
@@ -22,7 +27,12 @@ RAYS, POINTS = 4096, 128
 
 
 def why_unseen(
-    volume: Volume, transfer: Transfer, camera: Camera, march: March, rendering: Rendering
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    rendering: Rendering,
+    compositing: Compositing[Any] | Mode = "over",
 ) -> str | None:
     """Why an image of this scene shows nothing, and what to change; None if it shows something.
 
@@ -49,6 +59,8 @@ def why_unseen(
         )
     low, high = float(np.nanmin(values[hit])), float(np.nanmax(values[hit]))
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
+    if isinstance(compositing, Isosurface):
+        return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     shown = _shown(transfer)
     if shown is None:
         return f"{where}, and the transfer function shows none of them, or only under another label."

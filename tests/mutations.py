@@ -792,6 +792,63 @@ MUTATIONS = [
         "if True:  #",
         ("lighting/test_lighting.py::test_light_that_was_baked_inside_a_program_serves_outside",),
     ),
+    # projections and isosurfaces
+    Mutation(
+        "maximum: leaps over what may win, since it is invisible",
+        "projections.py",
+        "Blocks(jnp.full_like(blocks.low, jnp.nanmin(blocks.low)), blocks.high, None)",
+        "blocks",
+        ("test_projections.py::test_what_is_invisible_of_one_label_may_hide_another",),
+    ),
+    Mutation(
+        "maximum: of equal values, the farthest",
+        "projections.py",
+        "fragment.valid & ~(rank <= best)",
+        "fragment.valid & ~(rank < best)",
+        ("test_projections.py::test_they_are_those_of_numpy[random-maximum]",),
+    ),
+    Mutation(
+        "average: cells weigh their opacity",
+        "projections.py",
+        "return -jnp.log1p(-alpha)  # the optical depth",
+        "return alpha",
+        ("test_projections.py::test_a_mean_of_linear_values_is_exact[around-midpoint]",),
+    ),
+    Mutation(
+        "average: widths without their derivative",
+        "projections.py",
+        "        return worth\n",
+        "        return 0 * worth\n",
+        ("test_projections.py::test_gradients_are_central_differences[average-replay]",),
+    ),
+    Mutation(
+        "isosurface: differentiated behind the crossing, where values may not change",
+        "isosurface.py",
+        "return jnp.where(state.rises, near, far)",
+        "return far",
+        ("test_isosurface.py::test_a_plateau_on_the_value_leaves_its_gradient",),
+    ),
+    Mutation(
+        "isosurface: no derivative by the value",
+        "isosurface.py",
+        "missing = self.value - found",
+        "missing = -found",
+        ("test_isosurface.py::test_a_plateau_on_the_value_leaves_its_gradient",),
+    ),
+    Mutation(
+        "isosurface: what lies in the last part of a step is not looked for",
+        "isosurface.py",
+        "cut = () if march.ends_at_exit else (AlphaCorrection(),)",
+        "cut = ()",
+        ("test_isosurface.py::test_a_plane_is_exact_up_to_the_exit[left]",),
+    ),
+    Mutation(
+        "isosurface: normals point to greater values",
+        "isosurface.py",
+        "return -slopes *",
+        "return slopes *",
+        ("test_isosurface.py::test_normals_are_those_of_the_world",),
+    ),
     # gradients
     Mutation(
         "replay: wrong sign of the term from behind a sample",

@@ -19,6 +19,8 @@ import jaxvol as jv
 from jaxvol.cli import main
 from jaxvol.metrics import rmse
 
+from .scenes import slow
+
 
 @pytest.fixture
 def volume_file(tmp_path):
@@ -93,7 +95,7 @@ def render_file(volume_file, *words, size=("16", "16")):
 
 def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path, monkeypatch, capsys):
     calls = []
-    monkeypatch.setattr("jaxvol.cli.render", lambda *a: calls.append(a) or jv.render(*a))
+    monkeypatch.setattr("jaxvol.cli.render", lambda *a, **how: calls.append(a) or jv.render(*a, **how))
     output, depth = tmp_path / "a" / "x.png", tmp_path / "b" / "depth.tif"
     assert (
         render_file(volume_file, "--preset", "engine", "--transparent", "-o", output, "--depth", depth) == 0
@@ -107,6 +109,32 @@ def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path,
     np.testing.assert_array_equal(found[..., 3], (opacity * 255).round())
     np.testing.assert_array_equal(imread(depth), rendering.depth)
     assert np.isinf(imread(depth)).any()
+
+
+@pytest.mark.parametrize("name", ["maximum", *slow("minimum", "average", "isosurface")])
+def test_render_composites_as_asked_for(name, volume_file, tmp_path):
+    output = tmp_path / "x.npy"
+    own = ["--isovalue", "120"] if name == "isosurface" else []
+    look = ["--cmap", "gray", "--clim", "0", "255", "--unit-distance", "20"]
+    assert render_file(volume_file, *look, "--compositing", name, *own, "-o", output, "--transparent") == 0
+    volume = jv.load(volume_file)
+    transfer, camera = (
+        jv.colormap("gray", (0, 255), unit_distance=20),
+        jv.Camera.looking_at(volume, size=(16, 16)),
+    )
+    mode = jv.Isosurface(120.0) if own else name
+    march = jv.March(0.4, (jv.AlphaCorrection(),), "midpoint")
+    expected = jv.render(volume, transfer, camera, march, compositing=mode)
+    assert np.std(expected.rgba[..., 3]) > 1e-3
+    np.testing.assert_allclose(np.load(output), expected.rgba, atol=2e-5)
+
+
+def test_an_isosurface_that_no_ray_meets_says_why(volume_file, tmp_path, capsys):
+    words = ["--compositing", "isosurface", "--isovalue", "999", "-o", tmp_path / "x.png"]
+    assert render_file(volume_file, *words) == 0
+    assert re.search(
+        r"nothing is seen: .* from 0 to \d+.*, and none crosses .* 999\.", capsys.readouterr().out
+    )
 
 
 def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_path):
@@ -124,7 +152,7 @@ def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_
 def test_parallel_rays_are_asked_for_by_an_option(volume_file, tmp_path, monkeypatch):
     rendering = jv.render(*scene_of(volume_file))
     cameras = []
-    monkeypatch.setattr("jaxvol.cli.render", lambda *scene: cameras.append(scene[2]) or rendering)
+    monkeypatch.setattr("jaxvol.cli.render", lambda *scene, **how: cameras.append(scene[2]) or rendering)
     output = tmp_path / "x.png"
     assert render_file(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
     (camera,) = cameras
@@ -201,9 +229,9 @@ import jaxvol.cli
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
 render = jaxvol.cli.render
-def announced(*scene):
+def announced(*scene, **how):
     print("under way", flush=True)
-    return render(*scene)
+    return render(*scene, **how)
 jaxvol.cli.render = announced
 sys.exit(jaxvol.cli.main(sys.argv[1:]))
 """
@@ -288,6 +316,12 @@ BAD = {
     "shape": (["FILE", "--shape", "24", "24", "25"], "cut short"),
     "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
     "clim": (["FILE", "--preset", "engine", "--clim", "5", "4"], "clim must be"),
+    "no isovalue": (["FILE", "--compositing", "isosurface"], "--compositing isosurface needs the value"),
+    "isovalue": (["FILE", "--isovalue", "9"], "--isovalue goes with --compositing isosurface; got --comp"),
+    "infinite isovalue": (
+        ["FILE", "--compositing", "isosurface", "--isovalue", "inf"],
+        "value must be finite",
+    ),
 }
 
 

@@ -46,6 +46,7 @@ PINS = {
     "jitter behind cuts": Pin({0.03: 0.0}, {0.06: 0.0}),
     "gaps of rays under a toroidal map": Pin({3e-3: -0.0034}, {1e-3: 1.0}),
     "rays near the motor axis": Pin({1.0: 0.0, 1e-20: 0.0, 0.0: 0.0}),
+    "isosurfaces of thin sheets": Pin({1.02: 0.0}, {0.98: 0.02}),
     "energy of templates as printed": Pin({0.45: 0.697}, {0.55: 1.02}),
     "lopsided templates": Pin({2.0: 0.738}, {1.0: 1.32}),
     "long mean free paths": Pin({0.5: 0.152}, {2.0: 0.286}),

@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool
 from .._util.checks import described, integer, is_traced
 from ..arguments import check_arguments
 from ..camera import Camera
-from ..compositing import Compositing, Mode, Over, compositing_of
+from ..compositing import Compositing, Over
 from ..lighting.shading import Lighting
 from ..march import March, Transform
+from ..modes import Mode, compositing_of
 from ..occupancy import Blocks
 from ..rendering import Rendering
 from ..space import Space, node_distance
@@ -135,8 +136,8 @@ def plan(
     - **quadrature and strides**: `"preintegrated"` and `AdaptiveSampling` are tried where rays take many
       samples, and kept where they take so many fewer that they are faster, by what a sample costs on CPU
       (`planning/trials.py`: `RAY`, `SAMPLE`).
-    - **`SpaceLeaping`**: kept where blocks are proven empty, in images that are composited "over". It does
-      not change them; but extinctions of 0 have no gradient from what is leapt over.
+    - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
+      0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces, and where a `Clip` cuts.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
@@ -181,11 +182,11 @@ def plan(
     setting = Setting(volume, transfer, compositing_of(compositing))
     tolerance, given = _checked(tolerance, transforms, (setting, camera, lighting))
     space = March(1.0, given).locate(volume)
-    visible = transfer.visible(Blocks.of(volume))
+    visible = _occupied(setting, given)
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
 
     over = isinstance(setting.compositing, Over)
-    proven, parts = _proven(visible, space, given, over=over)
+    proven, parts = _proven(visible, space, given)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
     voxel = float(jnp.median(node_distance(space, visible.shape)))
 
@@ -256,11 +257,18 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     return number, given
 
 
+def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
+    """The blocks that may change a pixel."""
+    volume, transfer, mode = setting
+    if mode.resolves:
+        transfer, _ = mode.marched(transfer, March(1.0, given), volume)
+    return mode.occupied(transfer, Blocks.of(volume))
+
+
 def _proven(
-    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...], *, over: bool
+    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...]
 ) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that proofs decide on, from the blocks that may hold anything visible. `over`: whether cells
-    are composited "over"."""
+    """Transforms that proofs decide on, from the blocks that may hold anything visible."""
     found: list[Transform] = []
     parts = []
     at_faces = space.visible_at_faces(visible)
@@ -275,9 +283,8 @@ def _proven(
     else:
         parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
     empty = float(np.mean(~np.asarray(visible)))
-    leaps = over and empty >= EMPTY
-    why = f"{empty:.1%} of the blocks hold nothing visible" if over else "it is for images composited over"
-    parts.append(Part("SpaceLeaping", leaps, why))
+    leaps = empty >= EMPTY
+    parts.append(Part("SpaceLeaping", leaps, f"{empty:.1%} of the blocks hold nothing visible"))
     return (*found, *((SpaceLeaping(),) if leaps else ())), parts
 
 

@@ -137,7 +137,7 @@ class SectorFaces(eqx.Module):
         """
         x, y, z = point
         rho = hypot(y, z)
-        tori, cones, planes = jnp.minimum(rho, hypot(x, rho - self.a)), rho, None
+        tori, cones = jnp.minimum(rho, hypot(x, rho - self.a)), rho
 
         def clear(face: ToFace, near: Scalar | None) -> Scalar:
             # not to the face itself but past the tolerance, which a step along a grazed face hardly would
@@ -159,8 +159,8 @@ class SectorFaces(eqx.Module):
             return safe if inside else jnp.where(face.distance > 0, safe, 0)
 
         # it leaves at the first face that it passes, and has entered when it has passed all
-        kinds = tori, tori, cones, cones, planes, planes
-        return reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces, kinds))
+        near = tori, tori, cones, cones, None, None
+        return reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces, near))
 
     def _exact(self, origin: Vec3, direction: Vec3, t: Scalar) -> Scalar:
         """A crossing after one Newton step, which removes what the tolerance left, and carries the gradient

@@ -15,7 +15,7 @@ from jaxvol.planning import trials
 from jaxvol.planning.plan import _proven
 from jaxvol.space import Affine
 
-from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
+from ..scenes import scaled_phantom, slow, soft_transfer, uniform_transfer
 
 
 TOLERANCE = 0.01
@@ -95,7 +95,7 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, a
     data = np.roll(data, 8 * (1 if end else -1), axis)
     cube = jv.Volume(data, volume.spacing)
     visible = transfer.visible(Blocks.of(cube))
-    proven, parts = _proven(visible, Affine(cube), (), over=True)
+    proven, parts = _proven(visible, Affine(cube), ())
     assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
     assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
 
@@ -108,7 +108,7 @@ def test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible(sphere, i
     for name, side in {"through the ball": 0.1, "around it": 0.9}.items():
         clip = jv.Clip((-side, side, -0.9, 0.9, -0.9, 0.9), inside_out=inside_out)
         space = jv.March(1.0, (clip,)).locate(volume)
-        proven, parts = _proven(visible, space, (clip,), over=True)
+        proven, parts = _proven(visible, space, (clip,))
         found[name] = parts[0]
         assert (type(proven[0]) is jv.AlphaCorrection) == parts[0].kept
     assert found["through the ball"].why == (
@@ -290,3 +290,22 @@ def test_a_tolerance_without_auto_is_refused(sphere):
     volume, transfer, camera = sphere
     with pytest.raises(ValueError, match="tolerance goes with"):
         jv.render(volume, transfer, camera, jv.March(0.1), tolerance=0.1)
+
+
+@pytest.mark.parametrize("name", ["maximum", *slow("minimum", "average", "isosurface")])
+def test_other_modes_are_planned(sphere, name):
+    """They leap where the mode says that nothing shows; cells are cut where all of them count."""
+    volume, transfer, camera = sphere
+    mode = jv.Isosurface(0.4) if name == "isosurface" else name
+    found = jv.plan(volume, transfer, camera, 0.02, compositing=mode)
+    assert found.within
+    assert ("SpaceLeaping" in transforms_of(found)) == (name in ("maximum", "isosurface"))
+    assert "AlphaCorrection" in transforms_of(found) or name in ("maximum", "isosurface")
+    image, truth = (
+        jv.render(volume, transfer, camera, march, compositing=mode)
+        for march in (
+            found.march,
+            jv.March(float(volume.spacing[0]) / 32, (jv.AlphaCorrection(),), "midpoint"),
+        )
+    )
+    assert max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1))) <= 0.02
