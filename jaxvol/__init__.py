@@ -7,13 +7,7 @@ composited front to back into a `Rendering`.
 
 from . import lighting as lighting, metrics as metrics
 from .camera import Camera as Camera
-from .compositing import (
-    Compositing as Compositing,
-    FirstVisible as FirstVisible,
-    Over as Over,
-    Selection as Selection,
-    Weighting as Weighting,
-)
+from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
 from .display import (
     from_srgb as from_srgb,
     save_image as save_image,
@@ -41,6 +35,7 @@ from .fitting import (
     write_transfer as write_transfer,
 )
 from .formats import load as load
+from .isosurface import Isosurface as Isosurface
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .lighting import (
     Material as Material,
@@ -55,13 +50,16 @@ from .phantoms import (
 )
 from .planning import Plan as Plan, plan as plan
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
+from .projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .rendering import Rendering as Rendering
+from .selection import FirstVisible as FirstVisible, Selection as Selection
 from .transfer import TransferFunction as TransferFunction
 from .transforms import (
     AdaptiveSampling as AdaptiveSampling,
     AlphaCorrection as AlphaCorrection,
+    Clip as Clip,
     EarlyTermination as EarlyTermination,
     EmptySpaceJitter as EmptySpaceJitter,
     Jitter as Jitter,

@@ -8,22 +8,27 @@ import time
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from ._util.checks import output_file
 from .camera import Camera
+from .compositing import Compositing
 from .display import image_file, save_image
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
-from .march import March
+from .isosurface import Isosurface
+from .march import March, Transform
+from .modes import MODES, Mode, compositing_of
 from .phantoms import phantom
 from .planning import plan
 from .presets import PRESETS, colormap, preset
 from .render import PLANNED, render
 from .transfer import TransferFunction
 from .transforms.alpha_correction import AlphaCorrection
+from .transforms.clip import Clip
 from .transforms.early_termination import EarlyTermination
 from .transforms.space_leaping import SpaceLeaping
 from .unseen import why_unseen
@@ -36,6 +41,9 @@ examples:
   jaxvol render engine_256x256x128_uint8.raw.gz --preset engine -o engine.png
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
+  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --clip-plane 128 128 64 1 -1 0 -o half.png
+  jaxvol render engine_256x256x128_uint8.raw.gz --cmap gray --compositing maximum -o mip.png
+  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --compositing isosurface --isovalue 170
   jaxvol plan engine_256x256x128_uint8.raw.gz --preset engine --tolerance 0.001
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
   jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
@@ -146,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
         "--depth",
         type=Path,
         metavar="FILE",
-        help="also write depth, the mean distance to what is visible, else infinite: .npy or .tif, float32",
+        help="also write depth, the (mean) distance to what is visible, else infinite: .npy or .tif, float32",
     )
     render_command.set_defaults(run=_render)
 
@@ -230,6 +238,17 @@ def _view_options() -> argparse.ArgumentParser:
         "--unit-distance", type=float, help="length to which opacities refer (default: 1)"
     )
 
+    appearance.add_argument(
+        "--compositing",
+        choices=(*MODES, "isosurface"),
+        default="over",
+        help="how samples become a pixel: over (default), by emission and absorption; maximum, minimum, "
+        "average: that value of the ray, as classified; isosurface: where --isovalue is first crossed",
+    )
+    appearance.add_argument(
+        "--isovalue", type=float, metavar="VALUE", help="with --compositing isosurface: the value on it"
+    )
+
     camera = view.add_argument_group("camera")
     camera.add_argument(
         "--camera",
@@ -254,6 +273,30 @@ def _view_options() -> argparse.ArgumentParser:
     )
     camera.add_argument("--parallel", action="store_true", help="orthographic camera; use with --direction")
     camera.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
+
+    clip = view.add_argument_group("clip", "show a part of the volume; box and planes in world coordinates")
+    clip.add_argument(
+        "--clip-box",
+        type=float,
+        nargs=6,
+        metavar=("X_MIN", "X_MAX", "Y_MIN", "Y_MAX", "Z_MIN", "Z_MAX"),
+        help="show what is inside this box",
+    )
+    clip.add_argument(
+        "--clip-plane",
+        type=float,
+        nargs=6,
+        action="append",
+        default=[],
+        metavar=("X", "Y", "Z", "NX", "NY", "NZ"),
+        help="show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) "
+        "points; may be given several times",
+    )
+    clip.add_argument(
+        "--clip-inside-out",
+        action="store_true",
+        help="cut away what is inside the box and on that side of all planes, and show the rest",
+    )
     view.add_argument(
         "--tolerance",
         type=float,
@@ -326,17 +369,39 @@ def _render(options: argparse.Namespace) -> None:
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
+    mode = _mode(options)
     volume, transfer, camera = _view(options)
     background = None if options.transparent else options.background
-    volume, march = _march(options, volume, transfer, camera)
-    _picture(volume, transfer, camera, march, options.output, background=background, depth=options.depth)
+    volume, march = _march(options, volume, transfer, camera, _clip(options), mode)
+    _picture(
+        *(volume, transfer, camera, march, options.output),
+        compositing=mode,
+        background=background,
+        depth=options.depth,
+    )
 
 
 def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
-    volume, transfer, camera = _view(options)
-    print(plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance))
+    mode = _mode(options)
+    print(plan(*_view(options), _tolerance(options), transforms=_clip(options), compositing=mode))
+
+
+def _mode(options: argparse.Namespace) -> Compositing[Any]:
+    """The compositing mode that the options name."""
+    shows_surface, value = options.compositing == "isosurface", options.isovalue
+    if shows_surface and value is None:
+        raise ValueError("--compositing isosurface needs the value on the surface: --isovalue VALUE.")
+    if value is not None and not shows_surface:
+        raise ValueError(
+            f"--isovalue goes with --compositing isosurface; got --compositing {options.compositing}."
+        )
+    return Isosurface(value) if shows_surface else compositing_of(options.compositing)
+
+
+def _tolerance(options: argparse.Namespace) -> float:
+    return PLANNED if options.tolerance is None else options.tolerance
 
 
 def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera]:
@@ -359,17 +424,33 @@ def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera
 
 
 def _march(
-    options: argparse.Namespace, volume: Volume, transfer: TransferFunction, camera: Camera
+    options: argparse.Namespace,
+    volume: Volume,
+    transfer: TransferFunction,
+    camera: Camera,
+    clip: tuple[Transform, ...],
+    mode: Compositing[Any],
 ) -> tuple[Volume, March]:
     """The volume and its march: of the given step; without one, as planned."""
     if options.step is None:
-        found = plan(volume, transfer, camera, PLANNED if options.tolerance is None else options.tolerance)
+        scene = volume, transfer, camera
+        found = plan(*scene, _tolerance(options), transforms=clip, compositing=mode)
         if not found.within:
-            print(f"RMSE {found.error:.2g} rather than {found.tolerance:.2g}; jaxvol plan tells more")
+            print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
         return found.volume, found.march
     if options.tolerance is not None:
         raise ValueError("--tolerance finds a step; leave out --step.")
-    return volume, March(options.step, FAST, "midpoint")
+    return volume, March(options.step, (*clip, *FAST), "midpoint")
+
+
+def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:
+    """What is cut away, if anything is."""
+    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    if options.clip_box is None and not planes:
+        if options.clip_inside_out:
+            raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
+        return ()
+    return (Clip(options.clip_box, planes, inside_out=options.clip_inside_out),)
 
 
 def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
@@ -425,12 +506,13 @@ def _picture(
     march: March,
     output: Path,
     *,
+    compositing: Compositing[Any] | Mode = "over",
     background: Sequence[float] | None = (1, 1, 1),
     depth: Path | None = None,
 ) -> None:
     """Render to files, with opacity if there is no background; print their paths and the time taken."""
     begun = time.perf_counter()
-    rendering = jax.block_until_ready(render(volume, transfer, camera, march))
+    rendering = jax.block_until_ready(render(volume, transfer, camera, march, compositing=compositing))
     took = time.perf_counter() - begun
     path = save_image(output, rendering.rgba if background is None else rendering.image(background))
     device = jax.devices()[0]
@@ -444,5 +526,5 @@ def _picture(
         print(f"{save_image(depth, rendering.depth)}: distances, world length")
     if np.any(rendering.exhausted):
         print(f"{path}: incomplete: rays used up their {march.most_samples} samples; use a longer step")
-    if (why := why_unseen(volume, transfer, camera, rendering)) is not None:
+    if (why := why_unseen(volume, transfer, camera, march, rendering, compositing)) is not None:
         print(f"{path}: nothing is seen: {why}")

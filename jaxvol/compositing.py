@@ -2,24 +2,23 @@
 
 There are two kinds of compositing modes. A `Weighting` gives each cell a weight; the pixel is the sum of the
 cells' colours times their weights, and of the weights themselves, which is its opacity. A `Selection`
-compares the samples of a ray and chooses one depth, at which the pixel is then computed.
+(`selection.py`) compares the samples of a ray and chooses one depth, at which the pixel is then computed.
 """
 
 from abc import abstractmethod
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
+from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._util.checks import described
-from ._util.vec3 import Scalar, Vec3, along
-from .lighting.shading import Sample
+from ._util.vec3 import Scalar, Vec3
+from .march import Cell, March
 from .occupancy import Blocks
-from .space import Ray
 from .transfer import Classification, Measured, Transfer
 from .variation import Variation, Windows
+from .volume import Volume
 
 
 State = TypeVar("State")
@@ -32,16 +31,23 @@ class Fragment(NamedTuple):
     """A sample, as compositing sees it.
 
     - `alpha`: opacity of its cell; 0 past the ray's end.
-    - `depth`: past the ray's entry. `value`: of the volume.
+    - `depth`: of the sample, past the ray's entry. `cell`: the piece of the ray that it stands for.
+    - `measured`: what was read from the volume; for a weighting, the value alone.
     - `color`: as shaded; None for a selection, or where nobody asks for it.
     - `valid`: False for what is no sample: past the ray's end, in a gap of the volume, or of width 0.
     """
 
     alpha: Scalar
     depth: Scalar
-    value: Scalar
+    cell: Cell
+    measured: Measured
     color: Vec3 | None
     valid: Bool[Array, ""]
+
+    @property
+    def value(self) -> Scalar:
+        """The volume's value; of a cell that is integrated, the mean of those at its ends."""
+        return self.measured[0]
 
 
 class Compositing(eqx.Module, Generic[State]):
@@ -64,6 +70,16 @@ class Compositing(eqx.Module, Generic[State]):
         """Premultiplied colour and opacity; and the depth past the entry, if it is computed: infinite where
         nothing is visible."""
 
+    @property
+    def resolves(self) -> bool:
+        """Whether the pixel is computed after the march, from what that found."""
+        return False
+
+    def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
+        """The transfer function and the march by which rays are marched where the mode `resolves`: what its
+        cells show need not be what its pixels show. By default those that are given."""
+        return transfer, march
+
     @abstractmethod
     def transmittance(self, state: State) -> Scalar:
         """Of all cells so far: `Transform.stop` decides by it, and it is what shading is told."""
@@ -74,7 +90,7 @@ class Compositing(eqx.Module, Generic[State]):
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap
-        over the others, except those that hold NaN."""
+        over the others, except those that hold NaN. `transfer`: as `marched`."""
         return transfer.visible(blocks)
 
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:
@@ -125,7 +141,8 @@ class Weighting(Compositing[Composite]):
 
     Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. A cell here is a piece
     of one where transforms divide cells. `weight`, `slope` and `transmittance` work elementwise, on the
-    numbers of one ray or of many. Parameters are static fields: they have no gradient.
+    numbers of one ray or of many. Parameters are static fields, which have no gradient; or arrays, which have
+    one, if nothing but `resolved` depends on them.
     """
 
     @abstractmethod
@@ -149,6 +166,17 @@ class Weighting(Compositing[Composite]):
     def transmittance(self, state: Composite) -> Scalar:
         """By default 1: what is in front hides nothing."""
         return jnp.ones_like(state.opacity)
+
+    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+        """The premultiplied colour and opacity of a ray that is not transparent, from its Σ w c and Σ w, once
+        for each ray after the march. It is differentiated by JAX, also of sums that are 0, which must not be
+        NaN. Not called unless overridden. `classification`: of what was given, not of what was `marched`."""
+        return sums
+
+    @property
+    @final
+    def resolves(self) -> bool:
+        return type(self).resolved is not Weighting.resolved
 
     @final
     def begin(self, zero: Scalar, outputs: Outputs | None) -> Composite:
@@ -194,127 +222,3 @@ class Over(Weighting):
 
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:
         return transfer.variation(windows)
-
-
-class RaySampler(NamedTuple):
-    """Measures, classifies and shades what is on a ray. Depths are past the entry.
-
-    `depth_scale`: a factor for depths that stand for a number of steps. It is 1, and grows with the step.
-    """
-
-    ray: Ray
-    classification: Classification
-    depth_scale: Scalar | int = 1
-
-    def measured(self, depth: Scalar) -> Measured:
-        """The measured values at this depth, the volume's value first."""
-        return self.classification.at(self.ray.path(self.differentiable_depth(depth)))
-
-    def differentiable_depth(self, depth: Scalar) -> Scalar:
-        """The same depth, as a number to compute with, as in a fog: its derivative by the step is that of so
-        many steps."""
-        return depth * self.depth_scale
-
-    def color(
-        self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
-    ) -> Vec3:
-        """The colour of what was measured and classified at this depth, or around it, shaded where there is a
-        lighting. `transmittance`: between the place and the camera."""
-        color, extinction = classified
-        if self.classification.light is None:
-            return color
-        ray = self.ray
-        point = along(ray.entry, ray.direction, self.differentiable_depth(depth))
-        return self.classification.light(
-            Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
-        )
-
-    def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
-        """Colour, shaded where there is a lighting, and extinction at this depth, which nothing hides."""
-        measured = self.measured(depth)
-        classified = self.classification.classify(measured)
-        return self.color(depth, measured, classified, jnp.ones_like(depth)), classified[1]
-
-
-class Selection(Compositing[State]):
-    """A mode that compares the samples of a ray and chooses a depth. The pixel is computed from what is
-    there, once for each ray, after the march.
-
-    Gradients are those of `pixel`. What the march found is constant to them: the depths in its state stay the
-    same number of steps past the entry, while the ray, the step and what the ray meets change. They miss that
-    a pixel jumps where the choice does, and how the sample of a cell that is cut at a face moves with that
-    face. Parameters may have gradients, through `pixel`. The gradient of voxels takes an array of their size
-    for each fetch of `pixel`, for each chunk of 2048 pixels: slow for large volumes.
-    """
-
-    @abstractmethod
-    def depth(self, state: State) -> Scalar:
-        """The depth that is chosen, past the entry; infinite as long as there is none."""
-
-    @abstractmethod
-    def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
-        """Premultiplied colour and opacity, and the depth that is reported, of a ray for which a depth was
-        chosen. It is differentiated by JAX. Depths, of the state and in the answer, are numbers of steps to
-        it: to compute with one, take `sampler.differentiable_depth(depth)`."""
-
-    def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
-        depth = self.depth(state)
-        none, chosen = jnp.zeros_like(depth), (~jnp.isinf(depth)).astype(depth.dtype)
-        return jnp.stack([none, none, none, chosen]), depth
-
-    def transmittance(self, state: State) -> Scalar:
-        """1: what is in front hides nothing."""
-        return jnp.ones_like(self.depth(state))
-
-    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """By default all blocks: what is transparent may still be chosen."""
-        return jnp.ones(blocks.low.shape, bool)
-
-
-class FirstVisible(Selection[Scalar]):
-    """The first sample of positive opacity, shown opaque."""
-
-    def begin(self, zero: Scalar, outputs: Outputs | None) -> Scalar:
-        return jnp.full_like(zero, jnp.inf)
-
-    def add(self, state: Scalar, fragment: Fragment) -> Scalar:
-        return jnp.where((state == jnp.inf) & ~(fragment.alpha <= 0), fragment.depth, state)
-
-    def depth(self, state: Scalar) -> Scalar:
-        return state
-
-    def finished(self, state: Scalar) -> Bool[Array, ""]:
-        return state < jnp.inf
-
-    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        return transfer.visible(blocks)
-
-    def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
-        color, _ = sampler.shaded(state)
-        return jnp.stack([*color, jnp.ones_like(state)]), state
-
-
-Mode: TypeAlias = Literal["over"]
-"""The keys of `MODES`."""
-
-MODES: dict[str, type[Compositing[Any]]] = {"over": Over}
-
-
-def compositing_of(given: Mode | Any) -> Compositing[Any]:
-    """The mode of this name, or the mode itself.
-
-    **Raises:** `ValueError`, naming the argument, for anything else, and for a `Weighting` whose fields are
-    not all static."""
-    if isinstance(given, Weighting | Selection):
-        if isinstance(given, Weighting) and jax.tree.leaves(given):
-            raise ValueError(
-                "compositing must be a Weighting with static fields only, eqx.field(static=True); "
-                f"{described(given)} has others."
-            )
-        return given
-    if isinstance(given, str) and given in MODES:
-        return MODES[given]()
-    names = " or ".join(f'"{name}"' for name in MODES)
-    raise ValueError(
-        f"compositing must be {names}, or a jaxvol Weighting or Selection; got {described(given)}."
-    )

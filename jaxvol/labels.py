@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._util.checks import described, integer
+from ._util.checks import described, finite_array, integer, require
 from ._util.piecewise_linear import (
     clip_below,
     interpolate_row,
@@ -38,12 +39,19 @@ class LabelTransferFunction(Transfer):
     The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
     `AlphaCorrection(labels=True)` cuts cells there.
 
+    `with_visibility` and `with_opacity` hide labels, and make them fainter or denser. What is hidden is leapt
+    over, as all that is transparent. Other factors, or labels hidden and shown, compile nothing again.
+
     **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
     rendering a volume without labels.
     """
 
     stacked: TransferFunction
     """All functions, stacked along a leading axis for the label; the last is that of invisible labels."""
+    opacity: Float[Array, " labels"]
+    """Of each label, a factor of its extinction: see `with_opacity`. Differentiable."""
+    shown: Bool[Array, " labels"]
+    """Of each label, whether it is seen: see `with_visibility`."""
 
     def __init__(
         self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
@@ -57,6 +65,53 @@ class LabelTransferFunction(Transfer):
         hidden = TransferFunction(first.values, 0 * first.colors, 0 * first.extinction)
         each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
         self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+        self.opacity = jnp.ones(len(each), self.stacked.extinction.dtype)
+        self.shown = jnp.ones(len(each), bool)
+
+    def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
+        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
+        the opacity that it had. Other labels stay as they are.
+
+        **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
+        found = self.shown
+        for label, shown in self._changes("visible", visible):
+            if jnp.shape(shown) != () or not jnp.issubdtype(jnp.result_type(shown), bool):
+                raise ValueError(f"visible[{label}] must be True or False; got {described(shown)}.")
+            found = found.at[label].set(shown)
+        return eqx.tree_at(lambda transfer: transfer.shown, self, found)
+
+    def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
+        """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
+        keep theirs, which are 1 at first.
+
+        f is a factor of the extinction, at all values alike: what has the opacity α at f = 1 has
+        1 - (1 - α)^f, so that f = 0.5 makes 0.68 of 0.9, and 0.05 of 0.1. The image does not depend on the
+        step, and f may exceed 1. f is differentiable. Where it is 0, as where an extinction is, its
+        derivative misses what is leapt over (`SpaceLeaping`).
+
+        **Raises:** `ValueError` for labels beyond the last one, and for factors that are negative or not
+        finite."""
+        found = self.opacity
+        for label, factor in self._changes("opacity", opacity):
+            name = f"opacity[{label}]"
+            message = f"{name} must be at least 0; got {{got}}."
+            checked = require(finite_array(name, factor, ()), lambda factor: factor >= 0, message)
+            found = found.at[label].set(checked.astype(found.dtype))
+        return eqx.tree_at(lambda transfer: transfer.opacity, self, found)
+
+    def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
+        """Checked labels, each with what was given for it."""
+        if not isinstance(changes, Mapping):
+            raise ValueError(f"{name} must be by label, such as {{1: ...}}; got {described(changes)}.")
+        last = self.opacity.shape[0] - 2  # the one behind it stands for all without a function
+        return [(integer(f"{name}'s label", label, 0, last), each) for label, each in changes.items()]
+
+    @property
+    def _seen(self) -> TransferFunction:
+        """All functions, with the extinctions that are seen."""
+        factor = jnp.where(self.shown, self.opacity, 0)
+        extinction = self.stacked.extinction * factor[:, None]
+        return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 
     def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
         """The label at a grid coordinate."""
@@ -64,7 +119,7 @@ class LabelTransferFunction(Transfer):
 
     def classifier(self) -> Classify:
         """Look-up of colour and extinction, by label and value."""
-        tables = jax.vmap(TransferFunction.rows)(self.stacked)
+        tables = jax.vmap(TransferFunction.rows)(self._seen)
         unseen, points = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
@@ -81,7 +136,7 @@ class LabelTransferFunction(Transfer):
         """The means for the label in the middle of a cell: where it changes along one, `AlphaCorrection(
         labels=True)` cuts it."""
         stacked = jax.lax.stop_gradient(self.stacked.values)
-        tables = jax.vmap(TransferFunction.span_rows)(self.stacked)
+        tables = jax.vmap(TransferFunction.span_rows)(self._seen)
         unseen, spans = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
@@ -110,7 +165,7 @@ class LabelTransferFunction(Transfer):
 
     def _functions(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
         """Each label, with the control points and extinctions of its function, without their gradients."""
-        functions = jax.lax.stop_gradient(self.stacked)
+        functions = jax.lax.stop_gradient(self._seen)
         for label in range(functions.values.shape[0] - 1):
             yield label, functions.values[label], functions.extinction[label]
 

@@ -8,6 +8,7 @@ At each seam the answers of all transforms are combined, so that they compose.
 | seam | question | default answer |
 |---|---|---|
 | `locate` | which grid coordinate is this world point? | spacing and origin |
+| `clip` | which part of the volume is seen? | all of it |
 | `start` | how many steps past the entry is the first cell? | 0 |
 | `shift` | by what part of a step do samples after the first transparent one move? | 0 |
 | `empty_space` | where is nothing visible? | unknown |
@@ -136,6 +137,11 @@ class Transform(eqx.Module):
 
     def locate(self, space: Space, volume: Volume) -> Space:
         """The space in which rays meet the volume, in place of `space`."""
+        return space
+
+    def clip(self, space: Space) -> Space:
+        """The same space, of which a part is left out: rays are shorter, or have more gaps. Called once all
+        transforms have answered `locate`."""
         return space
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
@@ -298,12 +304,6 @@ class March(eqx.Module):
         return bool(self._overriding("shift"))
 
     @property
-    def lengths(self) -> tuple[Array, list[Transform]]:
-        """All on which the number of steps along a ray depends: the step, and transforms that change how long
-        rays are."""
-        return self.step, self._overriding("locate")
-
-    @property
     def looks_ahead(self) -> bool:
         """Whether any transform must know the scene before it is marched."""
         return bool(self._overriding("prepared"))
@@ -343,6 +343,9 @@ class March(eqx.Module):
         for transform in self.transforms:
             space = transform.locate(space, volume)
             _check_kind(transform, "locate", space, Space)
+        for transform in self.transforms:
+            space = transform.clip(space)
+            _check_kind(transform, "clip", space, Space)
         return space
 
     def start(self, ray: Ray) -> Scalar:
@@ -416,6 +419,8 @@ class March(eqx.Module):
             fits = first >= end
             if not self.ends_at_exit:
                 fits &= run.within(ray.length)
+                for left, back in ray.gaps:  # a shift may still move the run, by a step at most
+                    fits &= run.within(left) | (run.front - run.step >= back)
             for error, tolerated in predicted:
                 fits &= transmittance * error <= tolerated
             chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)

@@ -21,20 +21,14 @@ from ._util.trees import PyTree
 from ._util.vec3 import Scalar, Vec3, apart
 from ._util.xla import in_memory
 from .arguments import check_arguments
-from .compositing import (
-    Compositing,
-    Fragment,
-    Mode,
-    Outputs,
-    RaySampler,
-    Selection,
-    compositing_of,
-)
+from .compositing import Compositing, Fragment, Outputs, Weighting
 from .lighting.shading import Lighting, lit_classification
 from .march import Cell, March
+from .modes import Mode, compositing_of
 from .rendering import Details, Rendering
-from .space import Line, Ray, Space, enter, invalid
-from .transfer import Classification, Measured, Transfer
+from .selection import RaySampler, Selection
+from .space import Line, Ray, Space, enter, invalid, world_gradient
+from .transfer import Classification, Measured, Transfer, classification_of
 from .variation import Windows
 from .volume import Volume, without_voxels
 
@@ -173,17 +167,18 @@ def add(
     ray: Ray,
     at: Progress,
     piece: Cell,
-    value: Scalar,
+    measured: Measured,
     color: Vec3 | None,
     alpha: Scalar,
     *,
     alone: bool,
 ) -> Progress:
-    """Composites a piece of the next cell. A ray that is finished sees no more. `alone`: of `is_sample`."""
+    """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: of `Fragment`.
+    `alone`: of `is_sample`."""
     march, _, _, compositing = pipeline
     depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece, alone=alone)
     alpha = jnp.where(at.finished, 0, alpha)
-    fragment = Fragment(alpha, depth, value, color, taken & ray.contains(depth))
+    fragment = Fragment(alpha, depth, piece, measured, color, taken & ray.contains(depth))
     stats = at.stats
     if stats is not None:
         shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
@@ -236,7 +231,7 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
             transmittance = compositing.transmittance(after.composite)
             classified = classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
-        after = add(pipeline, ray, after, piece, measured[0], color, alphas[-1], alone=len(cut) == 1)
+        after = add(pipeline, ray, after, piece, measured, color, alphas[-1], alone=len(cut) == 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     after = move(march, ray, stop(pipeline, after), transparent, stride)
     if at.stride is None:  # a scan has as many steps as a ray may take
@@ -245,7 +240,7 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
 
 
 def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
-    """The rendering of a ray, with the outputs that it was begun with. A `Selection` leaves the pixel to
+    """The rendering of a ray, with the outputs that it was begun with. Modes that resolve leave the pixel to
     `resolve`."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
     rgba, depth = pipeline.compositing.end(at.composite)
@@ -264,7 +259,16 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
 
 def resolves(compositing: Compositing[Any], lighting: Lighting | None) -> bool:
     """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
-    return isinstance(compositing, Selection) or (lighting is not None and lighting.shades_pixels)
+    return compositing.resolves or (lighting is not None and lighting.shades_pixels)
+
+
+class Pixel(NamedTuple):
+    """What is computed after the march: premultiplied colour and opacity, the distance from the ray's origin,
+    infinite where nothing is visible, and a unit normal, if the mode has one."""
+
+    rgba: Float[Array, "4"]
+    depth: Scalar
+    normal: Float[Array, "3"] | None = None
 
 
 def resolve(
@@ -275,21 +279,44 @@ def resolve(
     rgba: Float[Array, "4"],
     depth: Scalar,
     selected: PyTree,
-) -> tuple[Float[Array, "4"], Scalar]:
-    """Pixel and depth of a ray that is not transparent, from what its march found: by the mode that selected
-    it, or else by the lighting."""
-    march, _, classification, compositing = pipeline
-    if not isinstance(compositing, Selection):
-        assert lighting is not None
-        return lighting.shade_pixel(classification, space, line, rgba, depth), depth
-    ray = enter(space, *line)
+) -> Pixel:
+    """The pixel of a ray that is not transparent, from what its march found: by the compositing mode, or else
+    by the lighting."""
+    compositing = pipeline.compositing
+    if isinstance(compositing, Selection):
+        return _selected(compositing, pipeline, space, line, rgba, selected)
+    if compositing.resolves:
+        assert isinstance(compositing, Weighting)
+        found = compositing.resolved(pipeline.classification, rgba)
+        check_answer(compositing, "resolved", found, rgba)
+        return Pixel(found, depth)
+    assert lighting is not None
+    return Pixel(lighting.shade_pixel(pipeline.classification, space, line, rgba, depth), depth)
+
+
+def _selected(
+    compositing: Selection[Any],
+    pipeline: Pipeline,
+    space: Space,
+    line: Line,
+    rgba: Float[Array, "4"],
+    state: PyTree,
+) -> Pixel:
+    ray, (march, volume, classification, _) = enter(space, *line), pipeline
     # 1, with a derivative: the selected depths are numbers of steps, and so grow with the step
     scale = march.step / jax.lax.stop_gradient(march.step)
-    found = compositing.pixel(RaySampler(ray, classification, scale), jax.lax.stop_gradient(selected))
-    check_answer(compositing, "pixel", found, (rgba, depth))
+    sampler = RaySampler(ray, classification, scale, partial(world_gradient, volume, space))
+    found = compositing.pixel(sampler, jax.lax.stop_gradient(state))
+    check_answer(compositing, "pixel", found, (rgba, rgba[3]))
     pixel, depth = found
+    normal = compositing.normal(sampler, depth)
+    if normal is not None:
+        check_answer(compositing, "normal", normal, rgba[:3])
     valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
-    return pixel * valid, ray.t_in + depth * scale
+    # a product with infinity would have the derivative NaN
+    seen = ~jnp.isinf(depth)
+    depth = jnp.where(seen, ray.t_in + jnp.where(seen, depth, 0) * scale, jnp.inf)
+    return Pixel(pixel * valid, depth, None if normal is None else normal * valid)
 
 
 def render_ray_reference(
@@ -331,10 +358,13 @@ def render_ray_reference(
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
-    later = resolves(mode, lighting)
+    pipeline = shown = Pipeline(march, volume, lit, mode)
+    if later := resolves(mode, lighting):
+        transfer, march = mode.marched(transfer, march, volume)
+        unlit = classification_of(transfer, volume, integrated=march.integrates)
+        pipeline = Pipeline(march, volume, unlit, mode)
     windows = Windows.of(volume) if march.looks_ahead else None
-    march = march.prepared(space, windows, partial(mode.variation, transfer))
-    pipeline = Pipeline(march, volume, lit._replace(light=None) if later else lit, mode)
+    pipeline = pipeline._replace(march=march.prepared(space, windows, partial(mode.variation, transfer)))
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(pipeline, ray, at), None
@@ -349,10 +379,10 @@ def render_ray_reference(
     given = jax.tree.map(
         lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), (rendering.depth, details.selected)
     )
-    pipeline = pipeline._replace(classification=lit)
-    rgba, depth = resolve(pipeline, lighting, space, line, rendering.rgba, *given)
-    rgba, depth = jnp.where(visible, rgba, 0), jnp.where(visible, depth, jnp.inf)
-    return replace(rendering, rgba=rgba, details=details._replace(depth=depth, selected=None))
+    found = resolve(shown, lighting, space, line, rendering.rgba, *given)
+    rgba, depth = jnp.where(visible, found.rgba, 0), jnp.where(visible, found.depth, jnp.inf)
+    normal = None if found.normal is None else jnp.where(visible, found.normal, 0)
+    return replace(rendering, rgba=rgba, details=details._replace(depth=depth, normal=normal, selected=None))
 
 
 def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
@@ -366,16 +396,16 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 def steps_across(volume: Volume, march: March) -> int:
     """Number of steps that suffices for any ray: across the volume's diagonal, and a few more for
     transforms."""
-    if is_traced(volume.spacing, march.lengths):
+    with jax.ensure_compile_time_eval():
+        diagonal = march.locate(volume).diagonal
+    if is_traced(march.step, diagonal):
         if march.max_samples is not None:
             return march.max_samples
         raise ValueError(
             "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
             "the length of a scan must be known before the program is compiled."
         )
-    with jax.ensure_compile_time_eval():
-        diagonal = float(march.locate(volume).diagonal)
-        steps = diagonal / float(march.step) if march.step > 0 else math.nan
+    steps = float(diagonal) / float(march.step) if march.step > 0 else math.nan
     if not math.isfinite(steps):  # then nothing is marched, and the image is NaN
         return 1
     # the first cell may begin a step early, one step finds the exit, and a jitter may shorten one more

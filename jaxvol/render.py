@@ -12,13 +12,14 @@ from ._util.checks import Arrayable, described, finite_array, require
 from ._util.sharding import shard_number
 from .arguments import check_arguments
 from .camera import Camera
-from .compositing import Compositing, Mode, compositing_of
+from .compositing import Compositing
 from .engine.adjoints import Adjoint
 from .engine.driver import Asked, render_scene
 from .engine.rays import OwnRays
 from .engine.scene import Scene
 from .lighting.shading import Lighting
 from .march import March
+from .modes import Mode, compositing_of
 from .planning import plan
 from .rendering import Rendering
 from .transfer import Transfer
@@ -50,8 +51,10 @@ def render(
     - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image,
       without transforms that are part of the scene (a `ToroidalMap`).
     - `tolerance`: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
-    - `compositing`: how the cells of a ray become a pixel: `"over"`, or a `Weighting` or `Selection`. Where
-      a `Selection` chooses a depth, no adjoint marches again: JAX differentiates what is computed there.
+    - `compositing`: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or `"average"`,
+      the projections of VTK (`Maximum` and its siblings take a `thickness`); an `Isosurface(value)`; or
+      another `Weighting` or `Selection`. Where a `Selection` chooses a depth, no adjoint marches again: JAX
+      differentiates what is computed there.
     - `lighting`: how samples are shaded, such as `lighting.ScattererTemplates`. Without, colours are those of
       the transfer function.
     - `outputs`: `"rgba"` computes the image and `exhausted` only, in some 5 % less time; `"all"` everything

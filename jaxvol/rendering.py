@@ -22,6 +22,7 @@ class Details(NamedTuple):
     samples: Int[Array, "*rays"] | None = None
     error: Float[Array, "*rays"] | None = None
     aligned: Bool[Array, "*rays"] | None = None
+    normal: Float[Array, "*rays 3"] | None = None
     selected: PyTree = None
 
 
@@ -42,9 +43,13 @@ class Rendering(eqx.Module):
       that end in `AlphaCorrection`, it is more than the true error in 97 % of the pixels or more, and several
       times as large. Infinite where nothing can be predicted. What is leapt over adds nothing to it, so that
       it may be somewhat smaller where rays leap.
+    - `normal`: of a mode that shows surfaces (`Isosurface`), the unit normal in the world; 0 where nothing is
+      visible.
 
-    The last four raise `AttributeError` where they were not asked for (`outputs="rgba"`), and `error` without
-    `AdaptiveSampling`.
+    The last five raise `AttributeError` where they were not asked for (`outputs="rgba"`), `error` without
+    `AdaptiveSampling`, and `normal` under other modes.
+
+    Modes other than `"over"` say what their depth is.
     """
 
     rgba: Float[Array, "*rays 4"]
@@ -66,6 +71,10 @@ class Rendering(eqx.Module):
     @property
     def error(self) -> Float[Array, "*rays"]:
         return self._detail("error", self.details.error, "give the march AdaptiveSampling, and ")
+
+    @property
+    def normal(self) -> Float[Array, "*rays 3"]:
+        return self._detail("normal", self.details.normal, "composite by an Isosurface, and ")
 
     def _detail(self, name: str, value: Array | None, more: str = "") -> Array:
         if value is None:

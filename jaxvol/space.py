@@ -6,7 +6,7 @@ different `Path`; the rest of the march is unaffected.
 """
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -33,8 +33,10 @@ Gap: TypeAlias = tuple[Scalar, Scalar]
 class Space(eqx.Module):
     """The mapping between the world and a volume's grid."""
 
-    searches: ClassVar[bool] = False
-    """Whether `interval` and `gaps` search, in a loop."""
+    @property
+    def searches(self) -> bool:
+        """Whether `interval` and `gaps` search, in a loop."""
+        return False
 
     @property
     @abstractmethod
@@ -52,7 +54,8 @@ class Space(eqx.Module):
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
         """Where a line is outside the grid between its entry and its exit, which lies `length` from there:
-        equally many gaps for every line, in order; those that it does not have begin at infinity."""
+        equally many gaps for every line, in any order; they may overlap, and those that it does not have
+        begin at infinity."""
         return ()
 
     @abstractmethod
@@ -66,6 +69,12 @@ class Space(eqx.Module):
     @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
         """World-space cells that may hold anything visible, from the visible blocks of the grid."""
+
+    def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
+        """For each face at which rays may enter or leave, whether anything visible may lie there, from the
+        visible blocks of the grid."""
+        faces = [jax.lax.index_in_dim(visible, end, axis) for axis in range(3) for end in (0, -1)]
+        return tuple(jnp.any(face) for face in faces)
 
     @abstractmethod
     def path(self, entry: Vec3, direction: Vec3) -> Path:

@@ -1,5 +1,7 @@
 """Why is nothing visible in an image?"""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,12 @@ from jaxtyping import Array, Bool, Float
 
 from ._util.vec3 import apart
 from .camera import Camera
+from .compositing import Compositing
+from .isosurface import Isosurface
+from .march import March
+from .modes import Mode
 from .rendering import Rendering
-from .space import Affine, Ray, enter
+from .space import Affine, Ray, Space, enter
 from .transfer import Transfer, TransferFunction
 from .volume import Volume
 
@@ -20,29 +26,41 @@ RAYS, POINTS = 4096, 128
 """Maximum number of rays, and number of points per ray, at which a volume is sampled."""
 
 
-def why_unseen(volume: Volume, transfer: Transfer, camera: Camera, rendering: Rendering) -> str | None:
+def why_unseen(
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    rendering: Rendering,
+    compositing: Compositing[Any] | Mode = "over",
+) -> str | None:
     """Why an image of this scene shows nothing, and what to change; None if it shows something.
 
     An image shows nothing if no pixel's opacity reaches 1/510, half a level of an 8-bit image. Values are
-    sampled along some 4096 rays, at 128 points each, on the volume's own grid.
+    sampled along some 4096 rays, at 128 points each.
     """
     opacity = float(np.asarray(rendering.rgba)[..., 3].max())
     if opacity >= LEAST:
         return None
-    hit, values = (np.asarray(part) for part in _values_along(volume, camera))
+    hit, values = _values_along(volume, camera, march.locate(volume))
     if not hit.any():
         low, high = (", ".join(f"{c:g}" for c in np.asarray(corner)) for corner in volume.corners)
+        extends = f"the volume, which extends from ({low}) to ({high})"
+        if _values_along(volume, camera, Affine(volume))[0].any():
+            return f"no ray of the camera meets what the clip leaves of {extends}. Change its box or planes."
         return (
-            f"no ray of the camera meets the volume, which extends from ({low}) to ({high}). Point the "
-            "camera at its center, as Camera.looking_at does."
+            f"no ray of the camera meets {extends}. Point the camera at its center, as Camera.looking_at "
+            "does."
         )
     if opacity > 0:
         return (
             f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, which raises the "
             "extinction, or higher opacities."
         )
-    low, high = float(values[hit].min()), float(values[hit].max())
+    low, high = float(np.nanmin(values[hit])), float(np.nanmax(values[hit]))
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
+    if isinstance(compositing, Isosurface):
+        return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     shown = _shown(transfer)
     if shown is None:
         return f"{where}, and the transfer function shows none of them, or only under another label."
@@ -71,9 +89,12 @@ def _shown(transfer: Transfer) -> list[tuple[float, float]] | None:
     return [(float(reach[a]), float(reach[b + 1])) for a, b in ends.reshape(-1, 2)]
 
 
-def _values_along(volume: Volume, camera: Camera) -> tuple[Bool[Array, " rays"], Float[Array, "rays points"]]:
-    """For some rays, preferably those that hit the volume: whether they hit, and the values along them."""
-    space, zero = Affine(volume), jnp.zeros((), jnp.int32)
+def _values_along(
+    volume: Volume, camera: Camera, space: Space
+) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "rays points"]]:
+    """For some rays, preferably those that hit the volume: whether they hit, and the values along them, NaN
+    in gaps."""
+    zero = jnp.zeros((), jnp.int32)
 
     @jax.jit
     def entered(origin: Float[Array, "n 3"], direction: Float[Array, "n 3"]) -> Ray:
@@ -82,9 +103,9 @@ def _values_along(volume: Volume, camera: Camera) -> tuple[Bool[Array, " rays"],
     @jax.jit
     def values(rays: Ray) -> Float[Array, "n points"]:
         def one(ray: Ray) -> Float[Array, " points"]:
-            return jax.vmap(lambda part: volume.value(ray.path(part * ray.length)))(
-                jnp.linspace(0, 1, POINTS)
-            )
+            depths = ray.length * jnp.linspace(0, 1, POINTS)
+            found = jax.vmap(lambda depth: volume.value(ray.path(depth)))(depths)
+            return jnp.where(ray.in_gap(depths), jnp.nan, found)
 
         return jax.vmap(one)(rays)
 
@@ -92,4 +113,4 @@ def _values_along(volume: Volume, camera: Camera) -> tuple[Bool[Array, " rays"],
     hit = rays.length > 0
     count = max(int(hit.sum()), 1)
     chosen = jnp.argsort(~hit, stable=True)[: count : -(-count // RAYS)]
-    return hit[chosen], values(jax.tree.map(lambda leaf: leaf[chosen], rays))
+    return np.asarray(hit[chosen]), np.asarray(values(jax.tree.map(lambda leaf: leaf[chosen], rays)))

@@ -56,6 +56,10 @@ class Mutation(NamedTuple):
         return text.replace(self.old, self.new)
 
 
+TO_AXIS = (
+    "transforms/test_toroidal_map.py::"
+    "test_rays_along_faces_and_across_the_axis_see_no_more_than_the_sector[touches the axis]"
+)
 LEAPING_GRADIENT = (
     "engine/test_gradient_matrix.py::test_leaping_does_not_change_replay_gradients[jittered-hierarchy-uint8]"
 )
@@ -95,9 +99,9 @@ MUTATIONS = [
     ),
     Mutation(
         "plan: faces at the far ends not looked at",
-        "planning/plan.py",
-        "for end in (0, -1))",
-        "for end in (1, 1))",
+        "space.py",
+        "for axis in range(3) for end in (0, -1)]",
+        "for axis in range(3) for end in (1, 1)]",
         ("planning/test_plan.py::test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face",),
     ),
     Mutation(
@@ -176,6 +180,58 @@ MUTATIONS = [
         "reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces))",
         "reduce(jnp.maximum, map(clear, to_faces))",
         ("transforms/test_toroidal_map.py::test_gaps_are_where_a_ray_is_outside_in_between",),
+    ),
+    Mutation(
+        "clip: what is cut away in front of a ray's entry is a gap",
+        "transforms/clip.py",
+        "first = jnp.where(cut & (enters <= begin + film), _later(near, leaves), near)",
+        "first = near",
+        ("transforms/test_clip.py::test_cut_faces_stay_smooth_under_empty_space_jitter",),
+    ),
+    Mutation(
+        "clip: cells are empty where their middle is cut away",
+        "transforms/clip.py",
+        "reach = 0.51 * dot((a, b, c), grid.size)",
+        "reach = 0 * dot((a, b, c), grid.size)",
+        (
+            "transforms/test_clip.py::test_no_cell_that_holds_anything_seen_is_taken_as_empty",
+            "transforms/test_clip.py::test_leaping_does_not_show",
+        ),
+    ),
+    Mutation(
+        "clip: gaps of a sector that begin before a cut and end behind it are lost",
+        "transforms/clip.py",
+        "gaps = self.inner.gaps(entry, direction, _later(length, far))",
+        "gaps = self.inner.gaps(entry, direction, length)",
+        ("transforms/test_clip.py::test_it_clips_a_swept_sector_in_the_world",),
+    ),
+    Mutation(
+        "clip: planes of a sector's world replaced by a map that comes later",
+        "march.py",
+        "            space = transform.clip(space)",
+        "            space = transform.clip(Affine(volume))",
+        ("transforms/test_clip.py::test_it_clips_a_swept_sector_in_the_world",),
+    ),
+    Mutation(
+        "plan: faces that a clip cuts not looked at",
+        "transforms/clip.py",
+        "return *self.inner.visible_at_faces(visible), *own",
+        "return self.inner.visible_at_faces(visible)",
+        ("planning/test_plan.py::test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible",),
+    ),
+    Mutation(
+        "labels: hidden ones are not leapt over",
+        "labels.py",
+        "functions = jax.lax.stop_gradient(self._seen)",
+        "functions = jax.lax.stop_gradient(self.stacked)",
+        ("test_labels.py::test_hidden_labels_are_leapt_over",),
+    ),
+    Mutation(
+        "alignment: the last end of a gap in the list taken for the farthest",
+        "transforms/alpha_correction.py",
+        "last = jnp.where(here & (last < depth), depth, last)",
+        "last = jnp.where(here, depth, last)",
+        ("transforms/test_clip.py::test_gaps_may_come_in_any_order",),
     ),
     Mutation(
         "alignment: cells are not cut at gaps",
@@ -277,6 +333,27 @@ MUTATIONS = [
         "jnp.where((steps > 0) & ~at.finished, a, b), moved, at)",
         "jnp.where(steps > 0, a, b), moved, at)",
         (LEAPING_GRADIENT,),
+    ),
+    Mutation(
+        "shift: whole segments are taken although rays may still shift",
+        "engine/batch.py",
+        "(limited | jnp.any(job.shifts(state[0])))",
+        "limited",
+        ("engine/test_tiling.py::test_batches_that_are_refilled_do_not_show_where_rays_may_shift",),
+    ),
+    Mutation(
+        "shift: only the first group's shifts count",
+        "engine/batch.py",
+        "jnp.any(job.shifts(state[0]))",
+        "jnp.any(job.shifts(state[0])[:1])",
+        ("engine/test_tiling.py::test_batches_that_are_refilled_do_not_show_where_rays_may_shift",),
+    ),
+    Mutation(
+        "toroidal map: the search for a face ends too early",
+        "transforms/sector_faces.py",
+        "STEPS = 256",
+        "STEPS = 8",
+        (TO_AXIS,),
     ),
     Mutation(
         "leap: range of visible cells ends one cell too early",
@@ -714,6 +791,63 @@ MUTATIONS = [
         "with jax.ensure_compile_time_eval():  #",
         "if True:  #",
         ("lighting/test_lighting.py::test_light_that_was_baked_inside_a_program_serves_outside",),
+    ),
+    # projections and isosurfaces
+    Mutation(
+        "maximum: leaps over what may win, since it is invisible",
+        "projections.py",
+        "Blocks(jnp.full_like(blocks.low, jnp.nanmin(blocks.low)), blocks.high, None)",
+        "blocks",
+        ("test_projections.py::test_what_is_invisible_of_one_label_may_hide_another",),
+    ),
+    Mutation(
+        "maximum: of equal values, the farthest",
+        "projections.py",
+        "fragment.valid & ~(rank <= best)",
+        "fragment.valid & ~(rank < best)",
+        ("test_projections.py::test_they_are_those_of_numpy[random-maximum]",),
+    ),
+    Mutation(
+        "average: cells weigh their opacity",
+        "projections.py",
+        "return -jnp.log1p(-alpha)  # the optical depth",
+        "return alpha",
+        ("test_projections.py::test_a_mean_of_linear_values_is_exact[around-midpoint]",),
+    ),
+    Mutation(
+        "average: widths without their derivative",
+        "projections.py",
+        "        return worth\n",
+        "        return 0 * worth\n",
+        ("test_projections.py::test_gradients_are_central_differences[average-replay]",),
+    ),
+    Mutation(
+        "isosurface: differentiated behind the crossing, where values may not change",
+        "isosurface.py",
+        "return jnp.where(state.rises, near, far)",
+        "return far",
+        ("test_isosurface.py::test_a_plateau_on_the_value_leaves_its_gradient",),
+    ),
+    Mutation(
+        "isosurface: no derivative by the value",
+        "isosurface.py",
+        "missing = self.value - found",
+        "missing = -found",
+        ("test_isosurface.py::test_a_plateau_on_the_value_leaves_its_gradient",),
+    ),
+    Mutation(
+        "isosurface: what lies in the last part of a step is not looked for",
+        "isosurface.py",
+        "cut = () if march.ends_at_exit else (AlphaCorrection(),)",
+        "cut = ()",
+        ("test_isosurface.py::test_a_plane_is_exact_up_to_the_exit[left]",),
+    ),
+    Mutation(
+        "isosurface: normals point to greater values",
+        "isosurface.py",
+        "return -slopes *",
+        "return slopes *",
+        ("test_isosurface.py::test_normals_are_those_of_the_world",),
     ),
     # gradients
     Mutation(

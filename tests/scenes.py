@@ -132,7 +132,23 @@ TRANSFORMS: dict[str, tuple[jv.Transform, ...]] = {
 
 TRANSFORMS["front residual, aligned"] = (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())
 
-FEW = ["plain", "aligned", "empty-space jittered, aligned, terminated", "front residual, aligned"]
+# They cut all of `VOLUMES`; the cameras inside of these lie inside the box, two of them before the plane.
+BOX, PLANE = (-0.45, 0.9, -0.9, 0.3, -0.7, 1.9), ((0.6, -0.4, 0.8), (-0.6, 0.8, -0.3))
+TRANSFORMS["clipped, aligned"] = (jv.Clip(BOX, [PLANE]), jv.AlphaCorrection())
+TRANSFORMS["hollowed, empty-space jittered, aligned"] = (
+    jv.Clip(BOX, [PLANE], inside_out=True),
+    jv.EmptySpaceJitter(4),
+    jv.AlphaCorrection(),
+)
+
+FEW = [
+    "plain",
+    "aligned",
+    "empty-space jittered, aligned, terminated",
+    "front residual, aligned",
+    "clipped, aligned",
+    "hollowed, empty-space jittered, aligned",
+]
 """Names of a few sets that together contain every transform."""
 
 

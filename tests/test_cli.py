@@ -1,5 +1,6 @@
 """The command line, run as users run it."""
 
+import contextlib
 import json
 import re
 import signal
@@ -8,12 +9,17 @@ import sys
 import time
 import warnings
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.cli import main
+from jaxvol.metrics import rmse
+
+from .scenes import slow
 
 
 @pytest.fixture
@@ -67,10 +73,19 @@ def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
     assert np.abs(imread(output) - np.asarray(jv.to_srgb(linear)) * 255).max() <= 1
 
 
-def test_render_needs_nothing_but_a_file(volume_file, tmp_path):
+def test_render_needs_nothing_but_a_file_and_plan_says_how(volume_file, tmp_path, capsys):
     output = tmp_path / "out.png"
     assert main(["render", str(volume_file), "-o", str(output), "--size", "16", "16"]) == 0
     assert imread(output).std() > 5
+    capsys.readouterr()
+    assert main(["plan", str(volume_file), "--size", "16", "16", "--tolerance", str(1 / 255)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"step [\d.e-]+, (midpoint|preintegrated)", printed)
+    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping", "voxels as uint8"):
+        assert word in printed
+    for bad in ("0", "nan", "2"):
+        assert main(["plan", str(volume_file), "--tolerance", bad]) == 2
+        assert "tolerance must be" in capsys.readouterr().err
 
 
 def render_file(volume_file, *words, size=("16", "16")):
@@ -80,7 +95,7 @@ def render_file(volume_file, *words, size=("16", "16")):
 
 def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path, monkeypatch, capsys):
     calls = []
-    monkeypatch.setattr("jaxvol.cli.render", lambda *a: calls.append(a) or jv.render(*a))
+    monkeypatch.setattr("jaxvol.cli.render", lambda *a, **how: calls.append(a) or jv.render(*a, **how))
     output, depth = tmp_path / "a" / "x.png", tmp_path / "b" / "depth.tif"
     assert (
         render_file(volume_file, "--preset", "engine", "--transparent", "-o", output, "--depth", depth) == 0
@@ -94,6 +109,32 @@ def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path,
     np.testing.assert_array_equal(found[..., 3], (opacity * 255).round())
     np.testing.assert_array_equal(imread(depth), rendering.depth)
     assert np.isinf(imread(depth)).any()
+
+
+@pytest.mark.parametrize("name", ["maximum", *slow("minimum", "average", "isosurface")])
+def test_render_composites_as_asked_for(name, volume_file, tmp_path):
+    output = tmp_path / "x.npy"
+    own = ["--isovalue", "120"] if name == "isosurface" else []
+    look = ["--cmap", "gray", "--clim", "0", "255", "--unit-distance", "20"]
+    assert render_file(volume_file, *look, "--compositing", name, *own, "-o", output, "--transparent") == 0
+    volume = jv.load(volume_file)
+    transfer, camera = (
+        jv.colormap("gray", (0, 255), unit_distance=20),
+        jv.Camera.looking_at(volume, size=(16, 16)),
+    )
+    mode = jv.Isosurface(120.0) if own else name
+    march = jv.March(0.4, (jv.AlphaCorrection(),), "midpoint")
+    expected = jv.render(volume, transfer, camera, march, compositing=mode)
+    assert np.std(expected.rgba[..., 3]) > 1e-3
+    np.testing.assert_allclose(np.load(output), expected.rgba, atol=2e-5)
+
+
+def test_an_isosurface_that_no_ray_meets_says_why(volume_file, tmp_path, capsys):
+    words = ["--compositing", "isosurface", "--isovalue", "999", "-o", tmp_path / "x.png"]
+    assert render_file(volume_file, *words) == 0
+    assert re.search(
+        r"nothing is seen: .* from 0 to \d+.*, and none crosses .* 999\.", capsys.readouterr().out
+    )
 
 
 def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_path):
@@ -111,13 +152,43 @@ def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_
 def test_parallel_rays_are_asked_for_by_an_option(volume_file, tmp_path, monkeypatch):
     rendering = jv.render(*scene_of(volume_file))
     cameras = []
-    monkeypatch.setattr("jaxvol.cli.render", lambda *scene: cameras.append(scene[2]) or rendering)
+    monkeypatch.setattr("jaxvol.cli.render", lambda *scene, **how: cameras.append(scene[2]) or rendering)
     output = tmp_path / "x.png"
     assert render_file(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
     (camera,) = cameras
     assert camera.parallel_scale is not None
     away = np.asarray(camera.focal_point - camera.position)
     np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
+
+
+def test_clips_are_those_of_the_library(volume_file, tmp_path, monkeypatch):
+    """A box and two planes, inside out, at a given step and in a plan."""
+    volume, transfer, _, march = scene_of(volume_file)
+    planes = [((12, 0, 0), (1, 0.5, 0)), ((0, 0, 4), (0, 0, 1))]
+    words = ["--clip-box", 5, 30, -1, 20, -1, 30, "--clip-inside-out"]
+    for origin, normal in planes:
+        words += ["--clip-plane", *origin, *normal]
+    view = ["--preset", "engine", "--camera", 40, -30, 20, *[11.5] * 3, "--zoom", 1.5]
+    output = tmp_path / "x.npy"
+    clip = jv.Clip((5, 30, -1, 20, -1, 30), planes, inside_out=True)
+    camera = scene_of(volume_file)[2]
+    images = {}
+    for name, transforms in {"clipped": (clip,), "whole": ()}.items():
+        leaps = jv.SpaceLeaping(), *march.transforms
+        images[name] = jv.render(volume, transfer, camera, jv.March(0.4, (*transforms, *leaps), "midpoint"))
+    expected = images["clipped"].image((1, 1, 1))
+    assert render_file(volume_file, *view, *words, "-o", output) == 0
+    np.testing.assert_allclose(np.load(output), expected, atol=1e-5)
+    assert rmse(expected, images["whole"].image((1, 1, 1))) > 0.05
+    planned = []
+    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms: planned.append(transforms))
+    for command in ("plan", "render"):
+        monkeypatch.setattr("jaxvol.cli._picture", None)  # not called
+        with contextlib.suppress(TypeError, AttributeError):  # there is no plan to print or render
+            main([command, str(volume_file), *map(str, view), *map(str, words)])
+    for (given,) in planned:
+        assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), given, clip))
+    assert len(planned) == 2
 
 
 def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
@@ -136,6 +207,14 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys):
             ["--preset", "ct_bone", "--clim", "20", "90", "--unit-distance", "1e6"],
             r"nothing is seen: the opacity is at most .*\. Use a shorter unit distance",
         ),
+        (
+            ["--preset", "ct_bone", "--clim", "20", "90", "--clip-box", *"050505", "--clip-inside-out"],
+            None,
+        ),
+        (
+            ["--preset", "ct_bone", "--clim", "20", "90", "--clip-plane", *["20"] * 3, *"100"],
+            "nothing is seen: no ray of the camera meets what the clip leaves of the volume",
+        ),
         shown,
     ]:
         assert render_file(tmp_path / "v.npy", *words, "-o", tmp_path / "x.png") == 0
@@ -150,9 +229,9 @@ import jaxvol.cli
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
 render = jaxvol.cli.render
-def announced(*scene):
+def announced(*scene, **how):
     print("under way", flush=True)
-    return render(*scene)
+    return render(*scene, **how)
 jaxvol.cli.render = announced
 sys.exit(jaxvol.cli.main(sys.argv[1:]))
 """
@@ -231,9 +310,18 @@ BAD = {
     "size": (["FILE", "--size", "0", "5"], "size must be"),
     "camera": (["FILE", "--camera", "1", "1", "1", "1", "1", "1"], "position must differ from focal_point"),
     "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
+    "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
+    "no normal": (["FILE", "--clip-plane", *"111000"], "the normal of planes[0] must not be 0"),
+    "nothing to turn": (["FILE", "--clip-inside-out"], "--clip-inside-out goes with --clip-box or"),
     "shape": (["FILE", "--shape", "24", "24", "25"], "cut short"),
     "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
     "clim": (["FILE", "--preset", "engine", "--clim", "5", "4"], "clim must be"),
+    "no isovalue": (["FILE", "--compositing", "isosurface"], "--compositing isosurface needs the value"),
+    "isovalue": (["FILE", "--isovalue", "9"], "--isovalue goes with --compositing isosurface; got --comp"),
+    "infinite isovalue": (
+        ["FILE", "--compositing", "isosurface", "--isovalue", "inf"],
+        "value must be finite",
+    ),
 }
 
 

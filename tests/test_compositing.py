@@ -5,12 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
-from jaxvol.compositing import compositing_of
+from jaxvol.modes import compositing_of
 
+from . import oracle
 from .engine.test_gradient_matrix import scene_of
-from .scenes import in_float64, uniform_transfer
+from .scenes import around, in_float64, scaled_phantom, soft_transfer, uniform_transfer
 
 
 class Additive(jv.Weighting):
@@ -56,6 +58,31 @@ def test_over_is_the_same_back_to_front():
         moment = alphas[number] * number + (1 - alphas[number]) * moment
     np.testing.assert_allclose(rgba, behind, atol=1e-6)
     np.testing.assert_allclose(depth, moment / behind[3], rtol=1e-5)
+
+
+def test_an_image_is_the_same_back_to_front():
+    """A head, sample by sample from the back: C' = α c + (1 - α) C, in float64."""
+    volume, transfer, step = scaled_phantom("head"), soft_transfer(0.2), 0.07
+    camera = around(volume).zoom(2.0)
+    origins, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays())
+    low, spacing, values = (
+        np.asarray(p, np.float64) for p in (volume.origin, volume.spacing, transfer.values)
+    )
+    t_in, t_out = oracle.box_interval(origins, directions, low, low + (np.array(volume.shape) - 1) * spacing)
+    image = np.zeros((len(origins), 4))
+    for k in reversed(range(int(np.max(t_out - t_in) / step) + 1)):
+        t = t_in + k * step
+        width = np.clip(t_out - t, 0, step)  # of a cell that is cut at the exit
+        where = (origins + np.where(width > 0, t, 0)[:, None] * directions - low) / spacing
+        value = map_coordinates(np.asarray(volume.data, np.float64), where.T, order=1, mode="nearest")
+        looks = [np.interp(value, values, np.asarray(c, np.float64)) for c in transfer.colors.T]
+        alpha = 1 - np.exp(-np.interp(value, values, np.asarray(transfer.extinction, np.float64)) * width)
+        own = np.stack([*looks, np.ones_like(value)], axis=-1)
+        image = alpha[:, None] * own + (1 - alpha)[:, None] * image
+    rendering = jv.render(volume, transfer, camera, jv.March(step, (jv.AlphaCorrection(),)))
+    assert 0.1 < np.mean(image[:, 3] > 0.5) < 0.9
+    assert np.mean((image[:, 3] > 0.01) & (image[:, 3] < 0.5)) > 0.02
+    np.testing.assert_allclose(np.asarray(rendering.rgba).reshape(-1, 4), image, atol=2e-5)
 
 
 def test_nothing_visible_is_infinitely_far():
@@ -151,7 +178,7 @@ def test_adjoints_of_a_mode_of_ones_own_agree(method):
 
 def test_bad_modes_are_named():
     with pytest.raises(
-        ValueError, match="compositing must be \"over\", or a jaxvol Weighting or Selection; got 'under'"
+        ValueError, match=r'compositing must be one of "over", "maximum", .* or Selection; got \'under\''
     ):
         compositing_of("under")
     with pytest.raises(ValueError, match="got the class Over"):

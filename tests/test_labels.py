@@ -1,9 +1,13 @@
 """Transfer functions per label, and cells cut at the boundaries between labels."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.fitting.constraints import Free
+from jaxvol.occupancy import Blocks
 
 from .scenes import slow
 
@@ -124,6 +128,86 @@ def test_faces_of_a_frog_stay_smooth_under_jitter():
     assert cut.mean() < jittered.mean() / 3
 
 
+FINE = jv.March(0.01, (jv.AlphaCorrection(labels=True),))
+THREE = [plain(RED, 0.1), plain(GREEN, 0.3), plain(BLUE, 0.2)]
+
+
+def test_labels_are_hidden_and_shown_again_with_their_opacity():
+    volume = layers(4, 5, 6)  # 3.5, 5 and 5.5 long
+    transfer = jv.LabelTransferFunction(THREE).with_opacity({0: 2.0, 1: 0.5})
+    for hidden in ({0: False}, {1: False, 2: False}, {1: True}, {}):
+        rgba = along_x(volume, transfer.with_visibility(hidden), FINE).rgba[0]
+        factors = np.array([2.0, 0.5, 1.0]) * [hidden.get(label, True) for label in range(3)]
+        depths = np.array([3.5 * 0.1, 5 * 0.3, 5.5 * 0.2]) * factors
+        before = np.exp(-np.concatenate([[0], np.cumsum(depths)[:-1]]))
+        np.testing.assert_allclose(rgba[:3], before * (1 - np.exp(-depths)), atol=2e-5)
+    away = transfer.with_visibility({0: False, 1: False}).with_visibility({0: True, 1: True})
+    again = along_x(volume, away.with_opacity({0: 1.0, 1: 1}), FINE).rgba
+    np.testing.assert_array_equal(again, along_x(volume, jv.LabelTransferFunction(THREE), FINE).rgba)
+
+
+def test_an_opacity_factor_is_that_of_a_layer_s_optical_depth():
+    """Whatever the value: 1 - (1 - α)^f."""
+    volume = layers(4, 4)
+    ramp = jv.TransferFunction.from_points([(0, RED, 0.0), (100, RED, 0.5), (255, RED, 0.9)])
+    thin = jv.LabelTransferFunction({1: ramp}).with_opacity({1: 0.3})
+    alpha = float(along_x(volume, thin, FINE).rgba[0, 3])
+    assert alpha == pytest.approx(1 - 0.5 ** (0.3 * 3.5), abs=2e-5)
+
+
+@pytest.mark.parametrize("quadrature", ["midpoint", *slow("preintegrated")])
+def test_gradients_of_opacity_are_those_of_the_closed_form(quadrature):
+    volume = layers(4, 5, 6)
+
+    def red(factors, adjoint):
+        transfer = jv.LabelTransferFunction(THREE).with_opacity({0: factors[0], 1: factors[1]})
+        march = jv.March(0.7, FINE.transforms, quadrature)
+        rays = [[-1.0, 1.0, 1.0]], [[1.0, 0.0, 0.0]]
+        return jv.render_rays(volume, transfer, *rays, march, adjoint=adjoint).rgba[0, 1]
+
+    # the green layer, behind the red one: exp(-0.35 f) (1 - exp(-1.5 g))
+    f, g = 0.8, 0.4
+    before, behind = np.exp(-0.35 * f), np.exp(-1.5 * g)
+    exact = [-0.35 * before * (1 - behind), 1.5 * before * behind]
+    for adjoint in ("replay", "forward", "direct"):
+        take = jax.jacfwd if adjoint == "forward" else jax.grad
+        found = take(lambda factors, a=adjoint: red(factors, a))(jnp.array([f, g]))
+        np.testing.assert_allclose(found, exact, rtol=1e-4)
+
+
+def test_hidden_labels_are_leapt_over():
+    volume = layers(16, 16, 16)
+    blocks = Blocks.of(volume)
+    transfer = jv.LabelTransferFunction(THREE)
+    for hidden in (transfer.with_visibility({1: False}), transfer.with_opacity({1: 0.0})):
+        seen = np.asarray(hidden.visible(blocks))
+        assert seen[:4].all()
+        assert seen[8:].all()
+        assert not seen[5:7].any()
+        assert np.all((np.asarray(hidden.majorant(blocks)) > 0) == seen)
+    faint = transfer.with_opacity({1: 0.25}).majorant(blocks)
+    np.testing.assert_allclose(faint[5:7], 0.075, rtol=1e-5)
+
+
+def test_changes_compile_nothing_again():
+    volume, traces = layers(4, 5, 6), []
+
+    @jax.jit
+    def image(transfer):
+        traces.append(transfer)
+        return along_x(volume, transfer, jv.March(0.3, (jv.SpaceLeaping(),))).rgba
+
+    transfer = jv.LabelTransferFunction(THREE)
+    for each in (transfer, transfer.with_visibility({1: False}), transfer.with_opacity({2: 0.1})):
+        image(each)
+    assert len(traces) == 1
+
+
+def test_a_fit_leaves_visibility_and_opacity_as_they_are():
+    free, start = Free.of(jv.LabelTransferFunction(THREE), None, None)
+    assert {name.split("[")[0] for name in free.names(start)} == {".stacked.colors", ".stacked.extinction"}
+
+
 UNLABELLED = jv.Volume(np.zeros((4, 3, 3), np.uint8))
 ONE = plain(RED, 1.0)
 CUTTING = jv.March(0.1, (jv.AlphaCorrection(labels=True),))
@@ -134,6 +218,26 @@ BAD = {
     "negative": (lambda: jv.LabelTransferFunction({-1: ONE}), "functions' label must be .*got -1"),
     "a colour": (lambda: jv.LabelTransferFunction([ONE, "red"]), r"functions\[1\] must be .*got 'red'"),
     "many labels": (lambda: jv.LabelTransferFunction([ONE] * 257), "of labels 0 to 255; got 257"),
+    "no label to hide": (
+        lambda: jv.LabelTransferFunction([ONE, ONE]).with_visibility({2: False}),
+        "visible's label must be an integer from 0 to 1; got 2",
+    ),
+    "a list to hide": (
+        lambda: jv.LabelTransferFunction([ONE]).with_visibility([False]),
+        "visible must be by label.*got a list",
+    ),
+    "half hidden": (
+        lambda: jv.LabelTransferFunction([ONE]).with_visibility({0: 0.5}),
+        r"visible\[0\] must be True or False; got 0.5",
+    ),
+    "negative opacity": (
+        lambda: jv.LabelTransferFunction([ONE]).with_opacity({0: -0.1}),
+        r"opacity\[0\] must be at least 0; got -0.1",
+    ),
+    "opacity that is NaN": (
+        lambda: jv.LabelTransferFunction([ONE]).with_opacity({0: np.nan}),
+        r"opacity\[0\] must be finite",
+    ),
     "no labels to classify by": (
         lambda: along_x(UNLABELLED, jv.LabelTransferFunction([ONE]), jv.March(0.1)),
         "labels are needed here",

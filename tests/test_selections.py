@@ -12,6 +12,7 @@ from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
 
+from .modes import check_gradients, reference_image
 from .scenes import CAMERAS, anisotropic_noise, around, in_float64, slow, soft_transfer, uniform_transfer
 
 
@@ -88,27 +89,6 @@ MODES = {
     "maximum": Maximum(),
     "isosurface": Isosurface(jnp.asarray(0.45)),
 }
-
-
-def reference_image(volume, transfer, camera, march, mode, lighting=None):
-    """rgba and depth of every pixel, ray by ray."""
-    column, row = jnp.meshgrid(*(jnp.arange(n) for n in camera.size))
-    rays = jnp.vectorize(lambda x, y: tuple(part for end in camera.ray(x, y) for part in end))
-    x, y, z, *direction = rays(column, row)
-
-    @jax.jit
-    @jax.vmap
-    @jax.vmap
-    def one(origin, direction, column, row):
-        rendering = jv.render_ray_reference(
-            *(volume, transfer, origin, direction, march),
-            pixel=(column, row),
-            compositing=mode,
-            lighting=lighting,
-        )
-        return rendering.rgba, rendering.depth
-
-    return one(jnp.stack([x, y, z], -1), jnp.stack(direction, -1), column, row)
 
 
 def test_a_maximum_is_that_of_the_samples():
@@ -286,7 +266,7 @@ def test_a_selection_names_the_wrong_mode_of_differentiation():
 
 def test_first_hits_are_refused_where_something_else_is_selected():
     march = jv.March(0.11, (jv.SpaceLeaping("min_distance"),))
-    with pytest.raises(ValueError, match="Maximum may select"):
+    with pytest.raises(ValueError, match="Maximum may show"):
         jv.render(NOISE, soft_transfer(), around(NOISE), march, compositing=Maximum())
 
 
@@ -328,57 +308,15 @@ class Fog(Maximum):
         return rgba * jnp.exp(-0.3 * sampler.differentiable_depth(depth)), depth
 
 
-def leaves(scene):
-    """Voxels, spacing, colours, extinction, camera position, step, and the value of an isosurface."""
-    volume, transfer, camera, march, mode = scene
-    found = volume.data, volume.spacing, transfer.colors, transfer.extinction, camera.position, march.step
-    return (*found, mode.value) if isinstance(mode, Isosurface) else found
-
-
 @pytest.mark.parametrize("mode", ["fog", *slow("isosurface")])
 @pytest.mark.parametrize("adjoint", ["replay", *slow("forward", "direct")])
 def test_gradients_are_central_differences(mode, adjoint):
-    """Of colours and depths, by each leaf alone under replay, and by all of them together."""
+    """Of colours and depths. An isosurface is opaque, and its root is that of any step."""
     with in_float64():
         volume = jv.Volume(np.asarray(NOISE.data, np.float64), NOISE.spacing)
-        march = jv.March(0.11, (jv.AlphaCorrection(), jv.SpaceLeaping()), max_samples=64)
-        shown = Fog() if mode == "fog" else Isosurface(jnp.asarray(0.45, jnp.float64))
-        scene = volume, soft_transfer(), around(volume, (9, 8)), march, shown
-        hit = np.isfinite(jv.render(*scene[:4], compositing=shown).depth)
-        assert hit.mean() > 0.2
-        random = np.random.default_rng(3)
-        weights = random.normal(size=(8, 9, 5))
-        ways = tuple(jnp.asarray(random.choice([-1.0, 1.0], leaf.shape)) for leaf in leaves(scene))
-
-        def loss(given, adjoint="replay"):
-            moved = eqx.tree_at(leaves, scene, given)
-            image = jv.render(*moved[:4], compositing=moved[4], adjoint=adjoint)
-            depth = jnp.where(hit, image.depth, 0)
-            return jnp.sum(image.rgba * weights[..., :4]) + jnp.sum(depth * weights[..., 4])
-
-        def difference(part, h=1e-7):
-            ends = [
-                loss(
-                    tuple(
-                        leaf + sign * h * way if k in part else leaf
-                        for k, (leaf, way) in enumerate(zip(leaves(scene), ways, strict=True))
-                    )
-                )
-                for sign in (1, -1)
-            ]
-            return float(ends[0] - ends[1]) / (2 * h)
-
-        everything = range(len(ways))
-        if adjoint == "forward":
-            slope = jax.jvp(lambda given: loss(given, "forward"), (leaves(scene),), (ways,))[1]
+        if mode == "fog":
+            check_gradients(volume, Fog(), {}, adjoint)
         else:
-            gradient = jax.grad(lambda given: loss(given, adjoint))(leaves(scene))
-            slopes = [float(jnp.vdot(part, way)) for part, way in zip(gradient, ways, strict=True)]
-            slope = sum(slopes)
-            if adjoint == "replay":
-                found = [difference({k}) for k in everything]
-                np.testing.assert_allclose(slopes, found, rtol=1e-5, atol=1e-5)
-                # an isosurface is opaque, and its root is that of any step
-                constant = [k for k in everything if abs(slopes[k]) < 1e-9]
-                assert constant == ([3, 5] if mode == "isosurface" else [])
-        np.testing.assert_allclose(slope, difference(set(everything)), rtol=1e-5)
+            own = {"value": lambda mode: mode.value}
+            shown = Isosurface(jnp.asarray(0.45, jnp.float64))
+            check_gradients(volume, shown, own, adjoint, constant={"extinction", "step"})

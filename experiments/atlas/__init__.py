@@ -1,6 +1,6 @@
 """Where do the methods of jaxvol fail? The entries of the failure atlas, a file for each family of them."""
 
-from . import adaptive, fits, labels, leaping, light, opacity, precision, probe, sampling
+from . import adaptive, clips, fits, labels, leaping, light, opacity, precision, probe, sampling, surfaces
 from .entry import Entry
 
 
@@ -11,7 +11,9 @@ FAMILIES = {
     "space leaping": leaping.ENTRIES,
     "float types": precision.ENTRIES,
     "faces of labels": labels.ENTRIES,
+    "clips": clips.ENTRIES,
     "toroidal maps": probe.ENTRIES,
+    "isosurfaces": surfaces.ENTRIES,
     "scatterer templates": light.ENTRIES,
     "fits": fits.ENTRIES,
 }

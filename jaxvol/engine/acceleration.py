@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
 from .._util.checks import check_answer
-from ..compositing import FirstVisible, Selection
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
+from ..selection import FirstVisible
 from ..transfer import classification_of
 from ..variation import Windows
 from ..volume import Volume
@@ -62,10 +62,10 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         return march.empty_space(occupancy, None)
 
     def first_hit(index: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
-        if isinstance(compositing, Selection) and not isinstance(compositing, FirstVisible):
+        if compositing.resolves and not isinstance(compositing, FirstVisible):
             name = type(compositing).__name__
             raise ValueError(
-                f'SpaceLeaping("min_distance") starts rays at what is visible first; {name} may select what '
+                f'SpaceLeaping("min_distance") starts rays at what is visible first; {name} may show what '
                 "lies before. Use another method."
             )
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)

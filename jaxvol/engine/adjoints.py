@@ -44,7 +44,7 @@ class AbstractAdjoint(eqx.Module):
     def resolve(
         self, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
     ) -> Array:
-        """Pixels and their depths (*rays, 5), where they are computed after the march."""
+        """Pixels as `resolve_image` returns them, where they are computed after the march."""
         return _resolve(scene, options, acceleration, found)
 
 

@@ -7,9 +7,9 @@ import jax
 
 from .._util.sharding import varying
 from .._util.trees import strong
-from ..compositing import Selection
 from ..reference import resolves
-from ..rendering import Details, Rendering
+from ..rendering import Rendering
+from ..selection import Selection
 from .acceleration import VolumeAcceleration
 from .adjoints import AbstractAdjoint, Adjoint, adjoint_of
 from .image import RenderOptions
@@ -47,12 +47,18 @@ def _resolved(
     scene: Scene, options: RenderOptions, how: AbstractAdjoint, acceleration: VolumeAcceleration
 ) -> Rendering:
     """The rays are marched without light, and pixels computed from what that found."""
-    all_ = options.outputs == "all"
-    unlit, options = scene._replace(lighting=None), replace(options, outputs="all" if all_ else "depth")
-    if isinstance(scene.compositing, Selection):  # the choice is a constant
+    all_, compositing = options.outputs == "all", scene.compositing
+    options = replace(options, outputs="all" if all_ else "depth")
+    transfer, march = compositing.marched(scene.transfer, scene.march, scene.volume)
+    # the march does not depend on parameters of the mode, or what it finds is a constant
+    unlit = Scene(scene.volume, transfer, scene.source, march, jax.lax.stop_gradient(compositing))
+    if isinstance(compositing, Selection):
         unlit = jax.lax.stop_gradient(unlit)
     rendering = how.render(unlit, options, acceleration)
     details = rendering.details
     pixels = how.resolve(scene, options, acceleration, (rendering.rgba, rendering.depth, details.selected))
-    details = details._replace(depth=pixels[..., 4], selected=None) if all_ else Details()
+    if not all_:
+        return Rendering(pixels[..., :4], rendering.exhausted)
+    normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
+    details = details._replace(depth=pixels[..., 4], normal=normal, selected=None)
     return Rendering(pixels[..., :4], rendering.exhausted, details)

@@ -157,7 +157,8 @@ def _cotangents(
     scene: Scene, total: Total, of_source: PyTree, pull_shader: Callable[[PyTree], Any] | None
 ) -> Any:
     """The cotangents of a scene's parts; 0 for those that are not asked for."""
-    volume, transfer, source, march, compositing, _ = scene  # compositing has no leaves
+    volume, transfer, source, march, compositing, _ = scene
+    compositing = zeros_of(compositing)  # a march does not depend on its parameters
     parts = without_voxels(volume), transfer, source, march
     sums = total.volume, total.transfer, of_source, total.march
     of_volume, of_transfer, of_source, of_march = (

@@ -1,6 +1,6 @@
 """Computes pixels after the march, by chunks of those that are not transparent.
 
-For modes that select a depth, and for lightings that shade pixels: `reference.resolve` says what of each.
+For modes that resolve, and for lightings that shade pixels: `reference.resolve` says what of each.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from .._util.compaction import in_front
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar
 from ..reference import resolve
+from ..selection import Selection
 from ..space import Line
 from .acceleration import VolumeAcceleration
 from .image import RenderOptions, fault_of, pipeline_of
@@ -21,52 +22,59 @@ from .rays import lines_at
 from .scene import Scene
 
 
+NUMBERS = 5
+"""Of a pixel: its colour, opacity and depth; three more where there is a normal."""
+
 Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]
 """What a march found, of rays: `Rendering.rgba`, `Rendering.depth` and `Details.selected`."""
 
 
 def resolve_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
-) -> Float[Array, "*rays 5"]:
-    """Pixels and their depths, from what the march found."""
+) -> Float[Array, "*rays numbers"]:
+    """Pixels, their depths, and their normals where these are asked for, from what the march found."""
     scene = acceleration.packed(scene)
     space, pipeline = pipeline_of(scene, acceleration)
+    mode = scene.compositing
+    with_normal = isinstance(mode, Selection) and mode.has_normal and options.outputs == "all"
 
-    def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, "5"]:
-        rgba, depth = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)
-        return jnp.concatenate([rgba, depth[None]])
+    def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, " numbers"]:
+        pixel = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)
+        normal = [pixel.normal] if with_normal and pixel.normal is not None else []
+        return jnp.concatenate([pixel.rgba, pixel.depth[None], *normal])
 
-    def some(indices: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk 5"]:
+    def some(indices: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk numbers"]:
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
-    resolved = of_visible(some, options.tiling.chunk, found)
+    resolved = of_visible(some, options.tiling.chunk, found, NUMBERS + 3 * with_normal)
     return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
 
 
 def of_visible(
-    some: Callable[..., Float[Array, "chunk 5"]], size: int, found: Found
-) -> Float[Array, "*rays 5"]:
-    """Pixels and depths by `some(indices, *found)`, called for `size` visible pixels at a time. Transparent
-    pixels stay 0, at infinite depth."""
+    some: Callable[..., Float[Array, "chunk numbers"]], size: int, found: Found, numbers: int = NUMBERS
+) -> Float[Array, "*rays numbers"]:
+    """Pixels of so many numbers by `some(indices, *found)`, called for `size` visible pixels at a time.
+    Transparent pixels stay 0, at infinite depth."""
     shape = found[1].shape
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
-    nothing = jnp.zeros((visible.size, 5), flat[0].dtype).at[:, 4].set(jnp.inf)
+    nothing = jnp.zeros((visible.size, numbers), flat[0].dtype).at[:, 4].set(jnp.inf)
     if visible.size == 0:
-        return nothing.reshape(*shape, 5)
+        return nothing.reshape(*shape, numbers)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
     chosen, count = in_front(visible, size), jnp.sum(visible, dtype=jnp.int32)
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
-    def computed(indices: Int[Array, " chunk"]) -> Float[Array, "chunk 5"]:
+    def computed(indices: Int[Array, " chunk"]) -> Float[Array, "chunk numbers"]:
         indices = jnp.minimum(indices, visible.size - 1)
         return some(indices, *jax.tree.map(lambda leaf: leaf[indices], flat))
 
-    def chunk(start: Int[Array, ""]) -> Float[Array, "chunk 5"]:
+    def chunk(start: Int[Array, ""]) -> Float[Array, "chunk numbers"]:
         indices = jax.lax.dynamic_slice_in_dim(chosen, start, size)
-        return jax.lax.cond(start < count, computed, lambda _: jnp.zeros((size, 5), nothing.dtype), indices)
+        none = jnp.zeros((size, numbers), nothing.dtype)
+        return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
-    pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, 5)
-    return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, 5)
+    pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, numbers)
+    return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)

@@ -20,9 +20,9 @@ from jaxtyping import Array, Bool, Int
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
 from .._util.xla import in_memory
-from ..compositing import Selection
 from ..march import RUN, Cell, March
 from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
+from ..selection import Selection
 from ..space import Ray
 from ..transfer import Classification, Measured
 from .tiling import Tiling
@@ -95,15 +95,15 @@ def march_segment(
         taken, shifted = in_memory(always(at), partial(_taken, march), at, every.opacity)
         samples = _without(every, taken, ray)
     colors: list[Vec3] | list[None]
+    values = [read[:1] for read in every.measured]
     if isinstance(pipeline.compositing, Selection):
-        colors = [None] * len(every.cells)
+        colors, values = [None] * len(every.cells), every.measured
     elif classification.light is None:
         colors = _colors(pipeline, at, every.measured)
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
         )
-    values = [read[0] for read in every.measured]
     cells = tuple(zip(every.cells, values, colors, every.opacity, strict=True))
 
     def composited(ray: Ray, at: Progress, taken: Bool[Array, ""] | None, cell: Any) -> Progress:

@@ -11,6 +11,7 @@ import numpy as np
 
 from .._util.trees import PyTree
 from ..camera import Camera
+from ..labels import LabelTransferFunction
 from ..lighting import Material
 from ..march import March
 from ..transfer import TransferFunction
@@ -121,6 +122,11 @@ def _of_transfer(transfer: TransferFunction) -> PyTree:
     return eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), transfer, bounds)
 
 
+def _of_labels(transfer: LabelTransferFunction) -> PyTree:
+    # factors of the extinctions, which are free themselves
+    return eqx.tree_at(lambda t: t.stacked, _fixed(transfer), _of_transfer(transfer.stacked))
+
+
 def _of_volume(volume: Volume) -> PyTree:
     data = Unconstrained() if eqx.is_inexact_array(volume.data) else Fixed()
     return eqx.tree_at(lambda v: v.data, _fixed(volume), data)
@@ -136,6 +142,7 @@ def _fixed(node: Any) -> PyTree:
 
 _DEFAULTS: dict[type, Callable[[Any], PyTree]] = {
     TransferFunction: _of_transfer,
+    LabelTransferFunction: _of_labels,
     Camera: Pose,
     Volume: _of_volume,
     March: _fixed,

@@ -25,9 +25,10 @@ from jaxtyping import Array, Float, Int
 from .._util.checks import Arrayable, described, finite, finite_array
 from .._util.trees import PyTree
 from ..camera import Camera, rows_of
-from ..compositing import Compositing, Mode, compositing_of
+from ..compositing import Compositing
 from ..lighting.shading import Lighting
 from ..march import March
+from ..modes import Mode, compositing_of
 from ..render import Adjoint, render
 from ..transfer import Transfer
 from ..volume import Volume

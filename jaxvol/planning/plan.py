@@ -7,17 +7,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool
 
 from .._util.checks import described, integer, is_traced
 from ..arguments import check_arguments
 from ..camera import Camera
-from ..compositing import Compositing, Mode, Over, compositing_of
+from ..compositing import Compositing, Over
 from ..lighting.shading import Lighting
 from ..march import March, Transform
+from ..modes import Mode, compositing_of
 from ..occupancy import Blocks
 from ..rendering import Rendering
-from ..space import node_distance
+from ..space import Space, node_distance
 from ..transfer import Transfer
 from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..volume import Volume
@@ -47,11 +48,15 @@ EMPTY = 0.05
 OPAQUE = 0.01
 """Part of the pixels that become opaque, below which there is nothing to end early."""
 
-WORTHWHILE = 24
-"""Samples of a pixel, by the midpoint rule, below which nothing else can be faster by more than some 15 %;
-unless steps are shorter than FAIR voxels, of which cells that are integrated may need few."""
+WORTHWHILE = 16
+"""Samples of a pixel, by the midpoint rule, below which cells that are integrated save no more than 16 %,
+even if they are four times as long; they may be longer where steps are shorter than FAIR voxels."""
 
 FAIR = 0.5
+
+TOGETHER = 0.4
+"""What a sample takes in an image, of what it takes in patches, which lie apart and so share no cached
+voxels: the median of 21 images of `experiments.planning`, between 0.18 and 0.72."""
 
 HALVED = 3
 """How often the step is halved at most because light changes along a ray."""
@@ -72,8 +77,10 @@ class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
     - `march`, `volume`, `lighting`: what to pass to `render`.
-    - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels.
-    - `seconds`: predicted for one image on this machine, once compiled. `samples`: predicted for each pixel.
+    - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels; where
+      nothing could be proven to be within the tolerance, just above it.
+    - `seconds`: predicted for one image on this machine, once compiled, to within a factor of some 2.
+      `samples`: predicted for each pixel.
     - `parts`: what was kept or left out, and why.
     - `probed`: seconds that planning took, compilation included.
     """
@@ -95,11 +102,12 @@ class Plan(NamedTuple):
 
     def __str__(self) -> str:
         transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
-        missed = "" if self.within else "NOT WITHIN THE TOLERANCE: "
+        missed = "" if self.within else "NOT PROVEN TO BE WITHIN THE TOLERANCE: "
+        rmse = f"RMSE {self.error:.2g} predicted" if self.within else "RMSE unknown"
         head = (
             f"{missed}step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}\n"
-            f"RMSE {self.error:.2g} predicted, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a "
-            f"pixel; some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
+            f"{rmse}, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a pixel; "
+            f"some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
         )
         wide = max(len(part.name) for part in self.parts)
         lines = [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
@@ -128,18 +136,18 @@ def plan(
     - **quadrature and strides**: `"preintegrated"` and `AdaptiveSampling` are tried where rays take many
       samples, and kept where they take so many fewer that they are faster, by what a sample costs on CPU
       (`planning/trials.py`: `RAY`, `SAMPLE`).
-    - **`SpaceLeaping`**: kept where blocks are proven empty, in images that are composited "over". It does
-      not change them; but extinctions of 0 have no gradient from what is leapt over.
+    - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
+      0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
-      faces.
+      faces, and where a `Clip` cuts.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
     - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
-      no voxel changes, or the image by less than an eighth of the tolerance and than what all else leaves of
-      it; else to float16, on the same terms.
-    - **lighting**: the first of `Lighting.simpler` that is within the tolerance, compared with
-      `Lighting.smooth` (so many templates as given, blended: the noise that these have themselves does not
-      count); the step is halved as long as that changes the lit image by more than what is left.
+      no voxel changes; or if the image changes by less than an eighth of the tolerance, and by less than all
+      other errors leave of it. If neither, to float16, on the same terms.
+    - **lighting**: the first of `Lighting.simpler`, of what was given and of `Lighting.smooth` that is within
+      the tolerance, compared with the last (as many templates as were given, blended: their own noise does
+      not count); the step is halved as long as that changes the lit image by more than what is left.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
     estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
@@ -151,7 +159,8 @@ def plan(
 
     - `volume`, `transfer`, `camera`: the scene. An image of another camera needs a plan of its own.
     - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
-    - `transforms`: those that are part of the scene, such as a `ToroidalMap`, or jitter. They are kept.
+    - `transforms`: those that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
+      kept.
     - `compositing`, `lighting`: as for `render`.
     - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, voxels keep
       their type, and simpler lightings without a gradient are left out. The tolerance is that of the image
@@ -159,8 +168,8 @@ def plan(
     - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
       `seconds`.
 
-    **Returns:** a `Plan`. If no step is within the tolerance, down to 1/256 of a voxel, `Plan.within` is
-    False and `Plan.parts` says so.
+    **Returns:** a `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which
+    takes images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
 
     **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
     (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
@@ -173,11 +182,11 @@ def plan(
     setting = Setting(volume, transfer, compositing_of(compositing))
     tolerance, given = _checked(tolerance, transforms, (setting, camera, lighting))
     space = March(1.0, given).locate(volume)
-    visible = transfer.visible(Blocks.of(volume))
+    visible = _occupied(setting, given)
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
 
     over = isinstance(setting.compositing, Over)
-    proven, parts = _proven(np.asarray(visible), given, over=over)
+    proven, parts = _proven(visible, space, given)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
     voxel = float(jnp.median(node_distance(space, visible.shape)))
 
@@ -248,26 +257,34 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     return number, given
 
 
+def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
+    """The blocks that may change a pixel."""
+    volume, transfer, mode = setting
+    if mode.resolves:
+        transfer, _ = mode.marched(transfer, March(1.0, given), volume)
+    return mode.occupied(transfer, Blocks.of(volume))
+
+
 def _proven(
-    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...], *, over: bool
+    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...]
 ) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that proofs decide on, from the blocks that may hold anything visible. `over`: whether cells
-    are composited "over"."""
+    """Transforms that proofs decide on, from the blocks that may hold anything visible."""
     found: list[Transform] = []
     parts = []
-    faces = sum(bool(np.take(visible, end, axis).any()) for axis in range(3) for end in (0, -1))
+    at_faces = space.visible_at_faces(visible)
+    faces = sum(map(bool, at_faces))
     if any(isinstance(each, AlphaCorrection) for each in given):
         parts.append(Part("AlphaCorrection", True, "part of the scene"))
     elif faces:
-        why = f"something may be visible at {faces} of the volume's 6 faces"
+        cut = "" if len(at_faces) == 6 else " and cuts"
+        why = f"something may be visible at {faces} of the volume's {len(at_faces)} faces{cut}"
         parts.append(Part("AlphaCorrection", True, why))
         found.append(AlphaCorrection())
     else:
         parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
-    empty = float(1 - visible.mean())
-    leaps = over and empty >= EMPTY
-    why = f"{empty:.1%} of the blocks hold nothing visible" if over else "it is for images composited over"
-    parts.append(Part("SpaceLeaping", leaps, why))
+    empty = float(np.mean(~np.asarray(visible)))
+    leaps = empty >= EMPTY
+    parts.append(Part("SpaceLeaping", leaps, f"{empty:.1%} of the blocks hold nothing visible"))
     return (*found, *((SpaceLeaping(),) if leaps else ())), parts
 
 
@@ -281,7 +298,8 @@ def _marched(trials: Trials, parts: list[Part], *, lit: bool) -> tuple[Trial, Tr
         parts.append(Part(name, True, "the image is not finite, or rays use up their samples"))
         return uniform, truth
     if uniform.error > trials.goal:
-        parts.append(Part(name, True, f"{step:.2g} voxels, the shortest tried: not within the tolerance"))
+        why = f"{step:.2g} voxels, the shortest tried: not proven to be within the tolerance"
+        parts.append(Part(name, True, why))
         return uniform, truth
     parts.append(Part(name, True, f"{step:.3g} voxels, {uniform.kind}: RMSE {uniform.error:.2g}"))
     if uniform.kind == "preintegrated":
@@ -316,7 +334,7 @@ def _lit(
     smooth = probe.render(setting, chosen.march, lighting.smooth)
     tried = [(each.lighting, each.what) for each in lighting.simpler if each.has_gradient or not gradients]
     left, found = goal - chosen.error, []
-    for other, what in (*tried, (lighting, "as given")):
+    for other, what in (*tried, (lighting, "as given"), (lighting.smooth, "as given, without its noise")):
         error = probe.distance(probe.render(setting, chosen.march, other), smooth)
         found.append((error if math.isfinite(error) else math.inf, other, what))
         if error <= left:
@@ -367,8 +385,8 @@ def _fastest(trials: Trials, march: March, lighting: Lighting | None = None) -> 
 
 
 def _seconds(trials: Trials, chosen: Trial) -> float:
-    """Time of an image on this machine. What a sample costs is taken from two steps, so that calls, which
-    take as long for a few pixels as for an image, do not count."""
+    """Time of an image on this machine, to within a factor of some 2. What a sample costs is taken from two
+    steps, so that calls, which take as long for a few pixels as for an image, do not count."""
     times, samples = [], []
     for step in trials.steps("midpoint"):
         times.append(_fastest(trials, trials.march(step)))
@@ -377,7 +395,7 @@ def _seconds(trials: Trials, chosen: Trial) -> float:
     if samples[0] <= 1.1 * samples[1]:  # nothing is seen
         return times[1] * pixels * trials.probe.share / trials.probe.inside.size
     a_sample = max(times[0] - times[1], 0.0) / (samples[0] - samples[1])
-    return a_sample * (chosen.cost - RAY * (1 - trials.probe.share)) * pixels
+    return TOGETHER * a_sample * (chosen.cost - RAY * (1 - trials.probe.share)) * pixels
 
 
 def _written(transform: Transform) -> str:

@@ -24,7 +24,7 @@ cores), whose ratios they predict within 9 % in the mean, 28 % at most."""
 
 COARSEST, FINE, FINEST = 2.0, 1 / 32, 1 / 256
 """Voxels of the longest step that is tried, and of the shortest: with the midpoint rule where cells can be
-integrated, too, and otherwise."""
+integrated, too, and otherwise. A step is proven by images of a half and a quarter of it."""
 
 LONGEST = 8
 """Steps of the longest cell under adaptive sampling, the shortest of which are half as long as uniform
@@ -92,11 +92,12 @@ class Trials:
 
     def uniform(self) -> tuple[Trial, Truth]:
         """The longest steps within the goal: by the midpoint rule; or integrated, where that takes more than
-        32 steps of a voxel, or cannot be proven with them. And what they were compared with."""
+        8 steps of a voxel, or cannot be proven with them. And what they were compared with."""
         found, truth = self._longest("midpoint", FINE if self.integrable else FINEST)
         if found.error > self.goal and self.integrable and math.isfinite(found.error):
             found, truth = self._longest("preintegrated", FINEST)
-            found = min(found, *self._sampled(truth), key=lambda each: each.cost)
+            tried = found, *self._sampled(truth)
+            found = min(tried, key=lambda each: (each.error > self.goal, each.cost))
         return found, truth
 
     def _sampled(self, truth: Truth) -> Iterator[Trial]:
@@ -110,7 +111,7 @@ class Trials:
 
     def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Trial, Truth]:
         """The longest steps within the goal, compared with steps of a quarter of them or less. If there are
-        none, the finest."""
+        none, the finest, whose error is not known: just `beyond`, or more."""
         steps = [COARSEST, COARSEST / 2, COARSEST / 4]
         while True:
             truth = Truth.of(self.probe, [self.image(step, quadrature) for step in steps])
@@ -120,7 +121,6 @@ class Trials:
                 break
             steps.append(steps[-1] / 2)
         if error > self.goal and math.isfinite(error):
-            # its error is not known well enough
             best, error = steps[-1], max(truth.own, math.nextafter(self.beyond, math.inf))
         elif best < COARSEST:
             best, error = self._between(best, error, truth, quadrature)

@@ -2,6 +2,7 @@
 
 from .adaptive_sampling import AdaptiveSampling as AdaptiveSampling
 from .alpha_correction import AlphaCorrection as AlphaCorrection
+from .clip import Clip as Clip
 from .early_termination import EarlyTermination as EarlyTermination
 from .jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
 from .space_leaping import SpaceLeaping as SpaceLeaping

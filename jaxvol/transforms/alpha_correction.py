@@ -33,8 +33,9 @@ class AlphaCorrection(Transform):
     the width e up to the exact exit: its opacity becomes `1 - exp(-extinction e)`, which is the paper's
     `1 - (1 - α)^(e/d)`. A volume of constant extinction is rendered exactly at any step.
 
-    Where a ray leaves the volume and re-enters it, as under `ToroidalMap`, cells are cut at both ends of such
-    a gap, too. Of a cell that holds several gaps, only the first and the last end of them are cut.
+    Where a ray leaves the volume and re-enters it, as under `ToroidalMap` or where `Clip` cuts something out,
+    cells are cut at both ends of such a gap, too. Of a cell that holds several gaps, only the first and the
+    last end of them are cut.
 
     With this transform, the image is continuous in the camera and in everything else that moves the exit,
     and its gradient is complete. Without it, the image jumps when a sample crosses the exit, and the
@@ -99,7 +100,8 @@ def _gap_faces(cell: Cell, ray: Ray) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
     found = jnp.zeros_like(cell.cut)
     for depth in (end for gap in ray.gaps for end in gap):
         here = (depth > cell.front) & (depth < cell.front + cell.width)
-        first, last = jnp.where(here & ~found, depth, first), jnp.where(here, depth, last)
+        first = jnp.where(here & ~(found & (first < depth)), depth, first)
+        last = jnp.where(here & (last < depth), depth, last)
         found |= here
     return first, last, found
 

@@ -88,7 +88,9 @@ class Jitter(Transform):
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
         offset = self.noise(ray.pixel, steps.dtype)
-        return steps + (offset - 1 if self.front_residual else offset)
+        if self.front_residual:  # of 0, which leaves nothing out, there is no cell of its own
+            offset = jnp.where(offset > 0, offset - 1, 0)
+        return steps + offset
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         if not self.front_residual:

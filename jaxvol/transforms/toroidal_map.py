@@ -11,7 +11,7 @@ rendered as acquired, without resampling: rays that are straight in the world ar
 """
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,8 +37,9 @@ class ToroidalMap(Transform):
     The volume's own spacing and origin have no meaning under this map; world coordinates are the probe's,
     with the origin on the motor axis. The world is empty outside the swept sector. A ray may leave the sector
     and re-enter it, as through its hollow near side. Of such gaps two are found; what a third one hides is
-    taken for material, and a ray that is nowhere farther outside than 2e-6 of the probe's size counts as
-    inside. `AlphaCorrection` cuts cells at both ends of gaps.
+    taken for material. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside,
+    and so may one that runs along a face at less than 1e-5 of it. `AlphaCorrection` cuts cells at both ends
+    of gaps.
 
     **Arguments:**
 
@@ -50,8 +51,10 @@ class ToroidalMap(Transform):
     - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
       b + first > 0.
 
-    All are differentiable. Values and gradients are finite everywhere; where an angle has no gradient, on
-    the motor axis (y = z = 0) and at the apex (x = R = 0), it is taken as 0.
+    All are differentiable, once: second derivatives miss how entries, exits and gaps curve. Values and
+    gradients are finite everywhere; where an angle has no gradient, on the motor axis (y = z = 0) and at the
+    apex (x = R = 0), it is taken as 0, and so is that of an entry or exit whose ray meets its face at less
+    than 0.06 degrees.
 
     Where it fails, and where not: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".
@@ -140,10 +143,12 @@ class ToroidalMap(Transform):
 class _Sector(Space):
     """The space of a volume under a `ToroidalMap`."""
 
-    searches: ClassVar[bool] = True
-
     probe: ToroidalMap
     shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @property
+    def searches(self) -> bool:
+        return True
 
     @property
     def diagonal(self) -> Scalar:

@@ -27,6 +27,9 @@ SHAPE = (26, 21, 31)
 SIZE = (37, 21)
 """More than one beam of 16 x 16 pixels along each axis."""
 
+BOX, PLANE = (0.5, 1.8, -0.2, 1.2, 0.3, 1.6), ((0.6, 0.5, 0.6), (0.5, -0.2, 0.6))
+"""A clip that leaves a part of each blob, on either side of it."""
+
 SETS = {
     "plain": ("left", ()),
     "aligned": ("midpoint", (jv.AlphaCorrection(),)),
@@ -35,6 +38,11 @@ SETS = {
     "integrated": ("preintegrated", (jv.EmptySpaceJitter(4), jv.AlphaCorrection())),
     "adaptive": ("midpoint", (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.AdaptiveSampling(0.03))),
     "residual": ("midpoint", (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())),
+    "clipped": ("midpoint", (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.Clip(BOX, [PLANE]))),
+    "hollowed": (
+        "left",
+        (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.Clip(BOX, [PLANE], inside_out=True)),
+    ),
 }
 
 EXACT = ["hierarchy", "distance", "beam"]
@@ -234,7 +242,10 @@ def test_no_leap_shows_in_a_gradient_whatever_is_rendered(method):
 FORWARD = [
     *(("jittered", method, "uint8") for method in METHODS),
     *(("moving", method, "uint8") for method in METHODS),
-    *((name, "hierarchy", "uint8") for name in ("plain", "aligned", "integrated", "residual")),
+    *(
+        (name, "hierarchy", "uint8")
+        for name in ("plain", "aligned", "integrated", "residual", "clipped", "hollowed")
+    ),
     *(("moving", "hierarchy", dtype) for dtype in TYPES[1:]),
 ]
 

@@ -77,6 +77,26 @@ def test_one_ray_and_none_are_rays_too():
     assert none.rgba.shape == (0, 20, 4)
 
 
+@pytest.mark.parametrize("leaps", [False, True])
+def test_batches_that_are_refilled_do_not_show_where_rays_may_shift(leaps):
+    """Batches of 8 groups, of which some have shifted when others join them, against one of all groups."""
+    nodes = np.arange(48)
+    x, y, z = np.meshgrid(nodes, nodes, nodes, indexing="ij")
+    cut = np.hypot(y - 20, z - 20) < 15  # reaches both faces across x; other rays begin in empty space
+    volume = jv.Volume(np.where(cut | (np.hypot(x - 30, y - 38) < 6), 200 + x, 0).astype(np.uint8))
+    transfer = jv.TransferFunction.from_points([(190, (0, 0, 0), 0.0), (250, (1, 0.5, 0.2), 0.3)])
+    camera = jv.Camera.looking_at(volume, (1.0, 0.3, 0.2), size=(64, 64))
+    march = jv.March(0.9, (jv.EmptySpaceJitter(5), *((jv.SpaceLeaping(),) if leaps else ())))
+    scene = Scene(volume, transfer, camera, march)
+    whole = render_scene(scene, "rgba", "replay", Tiling(batch=4096))
+    assert float(np.mean(whole.rgba[..., 3] > 0)) > 0.2
+    few = render_scene(scene, "rgba", "replay", Tiling(batch=8, tile=64))
+    np.testing.assert_allclose(few.rgba, whole.rgba, atol=1e-6)
+    # the number of samples being limited, no segment is taken whole
+    careful = scene._replace(march=jv.March(march.step, march.transforms, max_samples=256))
+    np.testing.assert_allclose(render_scene(careful, "rgba", "replay").rgba, whole.rgba, atol=1e-6)
+
+
 @pytest.mark.parametrize("adjoint", ["replay", "forward", "direct"])
 def test_adjoints_share_one_image(adjoint):
     volume = anisotropic_noise()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol import compositing
+from jaxvol import selection
 from jaxvol._util.vec3 import apart
 from jaxvol.engine import visible_samples
 from jaxvol.engine.resolve import of_visible
@@ -1116,7 +1116,7 @@ def test_one_opaque_surface_is_lit_as_its_samples_are():
 def test_without_lighting_nothing_of_it_is_in_the_program(monkeypatch):
     """All lighting goes through these names, which the programs of lit images call."""
     called = []
-    for module in (lighting_shading, compositing, visible_samples):
+    for module in (lighting_shading, selection, visible_samples):
         for name in ("shade_sample", "shaded_colors", "Chosen", "Sample"):
             if hasattr(module, name):
                 original = getattr(module, name)

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
+from jaxvol.lighting import ConstantLight, Deferred, DirectionalLight, ScattererTemplates
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks
 from jaxvol.planning import trials
 from jaxvol.planning.plan import _proven
+from jaxvol.space import Affine
 
-from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
+from ..scenes import scaled_phantom, slow, soft_transfer, uniform_transfer
 
 
 TOLERANCE = 0.01
@@ -92,10 +93,42 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face(sphere, a
     data = np.zeros(volume.shape, np.float32)
     data[8:16, 8:16, 8:16] = 0.5
     data = np.roll(data, 8 * (1 if end else -1), axis)
-    visible = transfer.visible(Blocks.of(jv.Volume(data, volume.spacing)))
-    proven, parts = _proven(np.asarray(visible), (), over=True)
+    cube = jv.Volume(data, volume.spacing)
+    visible = transfer.visible(Blocks.of(cube))
+    proven, parts = _proven(visible, Affine(cube), ())
     assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
     assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible(sphere, inside_out):
+    volume, transfer, _ = sphere
+    visible = transfer.visible(Blocks.of(volume))
+    found = {}
+    for name, side in {"through the ball": 0.1, "around it": 0.9}.items():
+        clip = jv.Clip((-side, side, -0.9, 0.9, -0.9, 0.9), inside_out=inside_out)
+        space = jv.March(1.0, (clip,)).locate(volume)
+        proven, parts = _proven(visible, space, (clip,))
+        found[name] = parts[0]
+        assert (type(proven[0]) is jv.AlphaCorrection) == parts[0].kept
+    assert found["through the ball"].why == (
+        "something may be visible at 2 of the volume's 12 faces and cuts"
+    )
+    assert not found["around it"].kept
+
+
+@pytest.mark.slow
+def test_a_clipped_scene_is_within_its_tolerance(sphere):
+    volume, transfer, camera = sphere
+    clip = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
+    found = jv.plan(volume, transfer, camera, TOLERANCE, transforms=(clip,))
+    assert {"Clip", "AlphaCorrection"} <= transforms_of(found)
+    fine = jv.March(float(volume.spacing.min()) / 64, (jv.AlphaCorrection(), clip), "preintegrated")
+    image = jv.render(found.volume, transfer, camera, found.march)
+    truth = jv.render(volume, transfer, camera, fine)
+    assert (
+        max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1))) <= found.error <= TOLERANCE
+    )
 
 
 @pytest.mark.slow
@@ -133,6 +166,9 @@ def test_colours_above_1_let_rays_end_later(sphere):
     found = jv.plan(volume, bright, camera, TOLERANCE)
     assert found.within
     assert error_of(found, volume, bright, camera) <= TOLERANCE
+    for each in found.march.transforms:
+        if isinstance(each, jv.EarlyTermination):
+            assert each.opacity_left < TOLERANCE / 16
 
 
 @pytest.mark.slow
@@ -162,7 +198,8 @@ def test_what_cannot_be_reached_is_said(sphere, monkeypatch):
     monkeypatch.setattr(trials, "FINEST", 0.5)
     found = plan_of(sphere, 2e-4)
     assert not found.within
-    assert "not within the tolerance" in str(found)
+    assert "not proven to be within the tolerance" in str(found)
+    assert "RMSE unknown" in str(found)
     volume, transfer, camera = sphere
     with pytest.warns(UserWarning, match="may not be within"):
         jv.render(volume, transfer, camera, "auto", tolerance=2e-4)
@@ -191,6 +228,19 @@ def test_light_is_simpler_where_that_looks_the_same(sphere):
         kept = kept.lighting
     assert isinstance(kept, ScattererTemplates)
     assert not kept.baked
+
+
+@pytest.mark.slow
+def test_light_without_its_noise_is_the_last_resort(sphere):
+    """One template for each pixel is too noisy for this tolerance, and so is all that is simpler and has
+    gradients."""
+    volume, transfer, camera = sphere
+    sun = DirectionalLight((1, 0.3, 0.2), (30, 30, 30))
+    light = ScattererTemplates(jv.Material(0.3, 0.1, 1.4), sun, templates=2)
+    found = jv.plan(volume, transfer, camera, 0.004, lighting=light, gradients=True)
+    assert isinstance(found.lighting, ScattererTemplates)
+    assert found.lighting.blend
+    assert not light.blend
 
 
 @pytest.mark.slow
@@ -240,3 +290,22 @@ def test_a_tolerance_without_auto_is_refused(sphere):
     volume, transfer, camera = sphere
     with pytest.raises(ValueError, match="tolerance goes with"):
         jv.render(volume, transfer, camera, jv.March(0.1), tolerance=0.1)
+
+
+@pytest.mark.parametrize("name", ["maximum", *slow("minimum", "average", "isosurface")])
+def test_other_modes_are_planned(sphere, name):
+    """They leap where the mode says that nothing shows; cells are cut where all of them count."""
+    volume, transfer, camera = sphere
+    mode = jv.Isosurface(0.4) if name == "isosurface" else name
+    found = jv.plan(volume, transfer, camera, 0.02, compositing=mode)
+    assert found.within
+    assert ("SpaceLeaping" in transforms_of(found)) == (name in ("maximum", "isosurface"))
+    assert "AlphaCorrection" in transforms_of(found) or name in ("maximum", "isosurface")
+    image, truth = (
+        jv.render(volume, transfer, camera, march, compositing=mode)
+        for march in (
+            found.march,
+            jv.March(float(volume.spacing[0]) / 32, (jv.AlphaCorrection(),), "midpoint"),
+        )
+    )
+    assert max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1))) <= 0.02

@@ -302,6 +302,48 @@ def test_gaps_are_where_a_ray_is_outside_in_between(name):
     assert most == {"twice": 2, "across the middle": 1}.get(name, most)
 
 
+def rays_along(probe, heights):
+    """Rays outside a sector, along generators of its faces of σ at these heights, and of β; and some through
+    the motor axis in the plane across it."""
+    a, b, beta, sigma, gamma = probe
+    size = abs(a) + b + gamma[1]
+    to_world = jv.ToroidalMap(*probe).to_world
+    origins, directions = [], []
+    for height in heights:
+        for face in (0, 1):
+            for axis in (0, 1):
+                at = [np.mean(beta), np.mean(sigma), gamma[0]]
+                at[axis] = (beta, sigma)[axis][face]
+                near, far = (np.asarray(to_world(jnp.asarray([*at[:2], g]))) for g in gamma)
+                inner = np.asarray(to_world(jnp.asarray([np.mean(beta), np.mean(sigma), np.mean(gamma)])))
+                along = (far - near) / np.linalg.norm(far - near)
+                away = near - inner - along * ((near - inner) @ along)
+                origins.append(near + height * size * away / np.linalg.norm(away) - size * along)
+                directions.append(along)
+    for angle in np.linspace(0, 2 * np.pi, 23):
+        direction = np.array([0, np.sin(angle), np.cos(angle)])
+        origins.append(-3 * size * direction)
+        directions.append(direction)
+    return np.array(origins), np.array(directions)
+
+
+@pytest.mark.parametrize("name", [*PROBES, "touches the axis"])
+def test_rays_along_faces_and_across_the_axis_see_no_more_than_the_sector(name):
+    """Every piece of a ray that counts as inside is inside, but for a part of the probe's size."""
+    angles = (np.pi / 2 - 0.61, np.pi / 2 + 0.61), (np.pi / 2 - 0.7, np.pi / 2 + 0.7)
+    probe = PROBES.get(name, (-10.0, 10.0, *angles, (0.0, 50.0)))
+    size = abs(probe[0]) + probe[1] + probe[4][1]
+    origins, directions = rays_along(probe, (1e-4, 1e-3, 1e-2))
+    a, b, *ranges = probe
+    rays = rays_of(jv.ToroidalMap(a, b, *ranges), jnp.float32(origins), jnp.float32(directions))
+    gaps = np.asarray(rays.gaps).transpose(2, 0, 1)
+    for i in range(len(origins)):
+        pieces = pieces_inside(origins[i], directions[i], probe, 8 * size, dense=8001)
+        gap = np.clip(gaps[i], 0, rays.length[i])
+        seen = float(rays.length[i] - np.sum(gap[:, 1] - gap[:, 0]))
+        assert abs(seen - np.sum(pieces[:, 1] - pieces[:, 0])) < 1e-3 * size, (i, seen, pieces)
+
+
 def world_of_clipped(points, probe):
     """Vectors from points to the nearest points (in β, σ, γ) of the sector."""
     a, b, *ranges = probe
