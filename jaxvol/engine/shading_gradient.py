@@ -13,23 +13,11 @@ from jaxtyping import Array, Float, Int
 from .._util.trees import PyTree, added
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxel_fetch import cubes_of_zeros, scatter_add
-from ..lighting.shading import Shading, Surroundings, shade_sample
+from ..lighting.shading import Shader, Surroundings, shade_sample
 from ..reference import Pipeline
 from ..space import Ray
 from .segment import Samples
 from .visible_samples import Weights, samples_of, visible
-
-
-class Shader(NamedTuple):
-    """What shades the samples of an image."""
-
-    shading: Shading
-    around: Surroundings
-
-    @property
-    def leaves(self) -> PyTree:
-        """All that has a gradient, except the transfer function and the voxels."""
-        return self.shading, self.around.space
 
 
 class ShadingTotal(NamedTuple):

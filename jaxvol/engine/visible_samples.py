@@ -88,7 +88,7 @@ def shaded_colors(
 
     def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
         samples = samples_of(chosen, indices, pipeline, ray, cells, measured, weights)
-        return chosen.put(colors, indices, jax.vmap(light)(samples))
+        return chosen.put(colors, indices, light(samples))
 
     none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
     return chosen.split(chosen.fold(one, (none, none, none)), len(alphas))

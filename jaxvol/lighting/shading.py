@@ -1,11 +1,11 @@
 """How is a classified sample shaded? The interface of lightings.
 
 Shading comes between the transfer function and compositing. A user passes a `Lighting`; it makes a `Shading`
-for each image; and engines call `shade_sample`, which adds up terms for points around a sample, one by one.
+for each image, which adds up terms for points around a sample, one by one; and engines call the `Shader`.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._util.sharding import varying
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxel_fetch import Recording
@@ -66,32 +67,25 @@ class Surroundings(eqx.Module):
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
 
-    def at(self, point: Vec3) -> ClassifiedPoint:
-        """What is at a world point."""
-        inside, coordinate, measured = self._measured(point)
-
-        def found(measured: Measured) -> tuple[Vec3, Scalar]:
-            return self.transfer.classification(self.volume).classify(measured)
-
-        color, extinction = self._in_memory(found, measured)
-        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
-
-    def extinction(self, point: Vec3) -> Scalar:
-        """The extinction at a world point."""
-        inside, _, measured = self._measured(point)
-        return inside * self.transfer.classification(self.volume).classify(measured)[1]
-
-    def _measured(self, point: Vec3) -> tuple[Scalar, Vec3, Measured]:
-        coordinate = self.space.coordinate(point)
+    def at(self, *points: Vec3) -> list[ClassifiedPoint]:
+        """What is at world points. All are fetched before any is classified."""
         classification = self.transfer.classification(self.volume)
-        x, y, z = (
-            jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
-            for c, n in zip(coordinate, self.volume.shape, strict=True)
-        )
-        return x * y * z, coordinate, self._in_memory(classification.at, coordinate)
+        coordinates = [self.space.coordinate(point) for point in points]
 
-    def _in_memory(self, f: Callable[[Any], Any], argument: Any) -> Any:
-        return f(argument) if self.live is None else in_memory(self.live, f, argument)
+        def measured(coordinates: list[Vec3]) -> list[Measured]:
+            return [classification.at(coordinate) for coordinate in coordinates]
+
+        def classified(coordinate: Vec3, measured: Measured) -> ClassifiedPoint:
+            x, y, z = (
+                jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
+                for c, n in zip(coordinate, self.volume.shape, strict=True)
+            )
+            inside, (color, extinction) = x * y * z, classification.classify(measured)
+            return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
+
+        # fetches cannot be recorded inside a branch
+        fetch = measured if self.live is None else partial(in_memory, self.live, measured)
+        return list(map(classified, coordinates, fetch(coordinates)))
 
 
 class Shading(eqx.Module):
@@ -105,6 +99,11 @@ class Shading(eqx.Module):
     def terms(self) -> int:
         """The number of terms."""
         return 0
+
+    def needed(self, transmittance: Scalar) -> Int[Array, ""]:
+        """How many terms, from the first one on, may add anything to samples behind this transmittance or
+        less. By default all."""
+        return jnp.asarray(self.terms, jnp.int32)
 
     @abstractmethod
     def about(self, around: Surroundings, sample: Sample) -> PyTree:
@@ -175,8 +174,25 @@ def lit_classification(
     if lighting is None:
         return classification
     around = Surroundings(volume, transfer, space)
-    shading = lighting.shading(around)
-    return classification._replace(light=lambda sample: shade_sample(shading, around, sample)[0])
+    return classification._replace(light=Shader(lighting.shading(around), around))
+
+
+class Shader(NamedTuple):
+    """What shades the samples of an image."""
+
+    shading: Shading
+    around: Surroundings
+
+    @property
+    def leaves(self) -> PyTree:
+        """All that has a gradient, except the transfer function and the voxels."""
+        return self.shading, self.around.space
+
+    def __call__(self, sample: Sample) -> Vec3:
+        """The shaded colour of a sample, or those of many along one axis."""
+        if sample.extinction.ndim == 0:
+            return shade_sample(self.shading, self.around, sample)[0]
+        return shade_samples(self.shading, self.around, sample)
 
 
 def shade_sample(
@@ -187,6 +203,16 @@ def shade_sample(
     `perturbations`: None, and then no voxels are returned; or, for a gradient of the voxels, those of
     `Recording`. Perturbations and voxels are arrays with a leading axis over the terms."""
     shared = shading.about(around, sample)
+    if shading.terms == 0:
+        return shading.color(sample, shared, None), None if perturbations is None else []
+    sums, bases = _all_terms(shading, around, sample, shared, perturbations)
+    return shading.color(sample, shared, sums), bases
+
+
+def _all_terms(
+    shading: Shading, around: Surroundings, sample: Sample, shared: PyTree, perturbations: Any = None
+) -> tuple[PyTree, Any]:
+    """The sum of a sample's terms, and the first voxels of the cubes that they fetched."""
 
     # The backward pass computes each term again, so that memory holds the intermediate values of one term,
     # not of all.
@@ -201,9 +227,42 @@ def shade_sample(
         added = shading.term(here, sample, shared, number)
         return jax.tree.map(jnp.add, sums, added), bases
 
-    if shading.terms == 0:
-        return shading.color(sample, shared, None), None if perturbations is None else []
-    term = jax.eval_shape(lambda: shading.term(around, sample, shared, jnp.zeros((), jnp.int32)))
-    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
-    sums, bases = jax.lax.scan(one, none, (jnp.arange(shading.terms), perturbations))
-    return shading.color(sample, shared, sums), bases
+    first = jax.eval_shape(partial(shading.term, around, sample, shared), jnp.zeros((), jnp.int32))
+    return jax.lax.scan(one, _zeros(first), (jnp.arange(shading.terms), perturbations))
+
+
+def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
+    """The shaded colours of samples along one axis. Terms that none of them needs are left out."""
+    shared, sums = jax.vmap(partial(shading.about, around))(samples), None
+    if shading.terms > 0:
+        sums = _needed_terms(shading, around, samples, shared)
+    return jax.vmap(shading.color)(samples, shared, sums)
+
+
+@eqx.filter_custom_jvp
+def _needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
+    """The sums of the terms that any of these samples needs. Their derivative is that of all terms: a term of
+    0 may have one, and JAX cannot differentiate this loop in reverse."""
+
+    def terms(number: Int[Array, ""]) -> PyTree:
+        here = Surroundings(around.volume, around.transfer, around.space, number >= 0)
+        return jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))(samples, shared, number)
+
+    def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
+        return jax.tree.map(jnp.add, sums, terms(number))
+
+    needed = shading.needed(jnp.max(samples.transmittance))
+    none = varying(_zeros(jax.eval_shape(terms, jnp.zeros((), jnp.int32))), samples)
+    return jax.lax.fori_loop(0, needed, add, none)
+
+
+@_needed_terms.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    def all_(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
+        return jax.vmap(lambda *each: _all_terms(shading, around, *each)[0])(samples, shared)
+
+    return eqx.filter_jvp(all_, primals, tangents)
+
+
+def _zeros(shapes: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

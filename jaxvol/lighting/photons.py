@@ -1,0 +1,220 @@
+"""What does each photon of a template add to the light of a sample?
+
+Each photon marks a place from which light is scattered to the sample: photons on the lit side that are not
+hidden make the sample bright, photons inside matter add the colour found there.
+
+Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
+volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
+"""
+
+import functools
+import math
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._util.noise import hashed_uniforms
+from .._util.vec3 import Scalar, Vec3, along, scaled
+from .._util.xla import gather
+from .lights import ConstantLight, Light, LocatedLight
+from .materials import Material, Optics, shares, smoothstep, step
+from .shading import ClassifiedPoint, Sample, Shading, Surroundings
+from .template import ScattererTemplate
+
+
+Occlusion = Literal["soft", "hard"]
+
+EDGE = 0.1
+"""With soft occlusion, a material fades in and out over this fraction of its value range."""
+
+LIT_SIDE_COSINE = 0.25
+"""With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
+
+WHITE = 4 / (3 * math.pi)
+"""Factor from irradiance to radiance, by which opaque white matter that absorbs nothing is as bright as the
+light around it. Of the photons around a sample on a flat face, half are outside, where the light comes from,
+and half are inside and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c in light of
+radiance L."""
+
+
+class _Shared(NamedTuple):
+    """What is common to all photons of a sample."""
+
+    shares: tuple[Scalar, ...]
+    parts: tuple[Scalar, ...]
+    """The shares, normalized to sum to 1 if any is above 0."""
+    optics: Optics
+    template: Int[Array, ""] | None
+    """None: there is one for each material."""
+    lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
+    """For each light: direction to it, distance and irradiance. Direction None: from all sides."""
+
+
+class TemplateShading(Shading):
+    """Templates prepared for one image.
+
+    - `templates`: (materials, templates, photons). Where there are several for a material, each pixel uses
+      one, drawn by `seed`. `blended`: how many were blended into each; their photons are skipped as they
+      would be in their own templates.
+    - `optics`: of the materials.
+    - `cutoff`: None: no photon is skipped.
+    """
+
+    materials: tuple[Material, ...]
+    lights: tuple[Light, ...]
+    templates: ScattererTemplate
+    optics: Optics
+    cutoff: Float[Array, ""] | None
+    blended: int = eqx.field(static=True)
+    occlusion: Occlusion = eqx.field(static=True)
+    reach: tuple[float, ...] = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+
+    @property
+    def terms(self) -> int:
+        return self.templates.intensity.shape[-1]
+
+    @property
+    def _soft(self) -> bool:
+        return self.occlusion == "soft"
+
+    def needed(self, transmittance: Scalar) -> Int[Array, ""]:
+        intensity = jax.lax.stop_gradient(self.templates.intensity)
+        brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
+        skipped = brightest <= 0
+        if self.cutoff is not None:
+            skipped |= transmittance * brightest * self.blended < self.cutoff
+        return jnp.sum(~skipped, dtype=jnp.int32)  # NaN is not skipped
+
+    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
+        edge = EDGE if self._soft else 0.0
+        return shares(self.materials, around.volume, coordinate, value, edge=edge)
+
+    def about(self, around: Surroundings, sample: Sample) -> _Shared:
+        material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
+        template = None
+        if (count := self.templates.intensity.shape[1]) > 1:
+            u, _, _ = hashed_uniforms(*sample.pixel, jnp.uint32(self.seed), jnp.float32)
+            template = (u * count).astype(jnp.int32)
+        lights = []
+        for light in self.lights:
+            if isinstance(light, ConstantLight):
+                r, g, b = (jnp.pi * radiance for radiance in light.radiance)
+                lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
+            elif isinstance(light, LocatedLight):
+                lights.append(tuple(light.at(sample.point)))
+        total = sum(material_shares)
+        parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
+        default = Optics(*(jnp.ones_like(total),) * 3)
+        return _Shared(material_shares, parts, _blend(self.optics, parts, default), template, tuple(lights))
+
+    def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
+        offset, intensity = self._photon(shared, number)
+        if self.cutoff is not None:
+            skipped = sample.transmittance * intensity * self.blended < self.cutoff
+            intensity = jnp.where(skipped, 0, intensity)
+        if len(self.materials) == 1:
+            at_photon, *further = around.at(*self._places(sample, offset))
+            shares, optics = self._shares_at(around, at_photon, shared)
+            scale = intensity
+        else:
+            [first] = around.at(_beside(sample, offset))
+            shares, optics = self._shares_at(around, first, shared)
+            own = shared.optics
+            # refraction into another material stretches the template by the ratio of the speeds of light
+            offset = scaled(offset, own.refractive_index / optics.refractive_index)
+            at_photon, *further = around.at(*self._places(sample, offset))
+            ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
+            scale = intensity * jnp.where(own.opacity == 0, 0, ratio)
+        if self._soft:  # the opacity of one mean free path there
+            matter = -jnp.expm1(-at_photon.extinction * optics.mean_free_path)
+        else:
+            matter = step(at_photon.extinction, 0.0)
+        inner = scaled(at_photon.color, scale * sum(shares) * matter)
+
+        seen = intensity * self._visible(offset, [each.extinction for each in (at_photon, *further)])
+        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
+        return brightness, inner
+
+    def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
+        brightness, inner = sums
+        # 1 from a material's soft edge inwards: an unlit part of the colour would look like emission
+        matter = jnp.minimum(2 * sum(shared.shares), 1)
+        scale = matter * WHITE * shared.optics.reflectance
+        red, green, blue = (
+            c * (1 - matter)
+            + scale
+            * (c + s)
+            * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, shared.lights, strict=True))
+            for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
+        )
+        return red, green, blue
+
+    def _photon(self, shared: _Shared, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
+        """Offset and intensity of a photon of the sample's material, or of several blended by their parts."""
+
+        def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
+            return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
+
+        x = y = z = intensity = jnp.zeros_like(shared.parts[0])
+        for m, part in enumerate(shared.parts):
+            dx, dy, dz = (of_sample(self.templates.offset[m, :, number, i]) for i in range(3))
+            intensity = intensity + part * of_sample(self.templates.intensity[m, :, number])
+            x, y, z = x + part * dx, y + part * dy, z + part * dz
+        return (x, y, z), intensity
+
+    def _places(self, sample: Sample, offset: Vec3) -> list[Vec3]:
+        """Where a photon lies, and where else it is tested for occlusion."""
+        return [_beside(sample, offset, times) for times in (1.0, *self.reach)]
+
+    def _shares_at(
+        self, around: Surroundings, place: ClassifiedPoint, shared: _Shared
+    ) -> tuple[tuple[Scalar, ...], Optics]:
+        """Shares of the materials at a photon, and their optics; outside of all materials the sample's."""
+        found = self._shares(around, place.coordinate, place.value)
+        found = tuple(place.inside * share for share in found)
+        return found, _blend(self.optics, found, shared.optics)
+
+    def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
+        """Visibility of a photon from the sample, from the extinctions at `_places`."""
+        if not self._soft:
+            clear = (1 - step(extinction, 0.0) for extinction in extinctions)
+            return functools.reduce(jnp.multiply, clear)
+        pieces = np.diff([0.0, 1.0, *self.reach])
+        depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
+        return jnp.exp(-depth * _norm(offset))
+
+    def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
+        """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
+        if toward is None:
+            return jnp.ones_like(offset[0])
+        length = _norm(offset)
+        closer = sum(p * d for p, d in zip(offset, toward, strict=True))
+        # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
+        near = closer - length**2 / (2 * distance)
+        if not self._soft:
+            return step(near, 0.0)
+        return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
+
+
+def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
+    return along(sample.point, offset, jnp.full_like(offset[0], times))
+
+
+def _norm(offset: Vec3) -> Scalar:
+    x, y, z = offset
+    return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, jnp.finfo(x.dtype).tiny ** 0.5))
+
+
+def _blend(optics: Optics, shares: tuple[Scalar, ...], rest: Optics) -> Optics:
+    """Optics averaged over the materials at a point, weighted by their shares; `rest` fills up to 1."""
+    remaining = 1 - sum(shares)
+    blended = (
+        sum(share * each[m] for m, share in enumerate(shares)) + remaining * other
+        for each, other in zip(optics, rest, strict=True)
+    )
+    return Optics(*blended)
