@@ -62,6 +62,8 @@ class TemplateShading(Shading):
       would be in their own templates.
     - `optics`: of the materials.
     - `cutoff`: None: no photon is skipped.
+    - `given`: whether the templates are a user's own, in which an intensity of 0 may have a derivative. Of
+      those that were grown, a photon that has faded out, and its derivative with it, is 0.
     """
 
     materials: tuple[Material, ...]
@@ -70,6 +72,7 @@ class TemplateShading(Shading):
     optics: Optics
     cutoff: Float[Array, ""] | None
     blended: int = eqx.field(static=True)
+    given: bool = eqx.field(static=True)
     occlusion: Occlusion = eqx.field(static=True)
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
@@ -82,10 +85,10 @@ class TemplateShading(Shading):
     def _soft(self) -> bool:
         return self.occlusion == "soft"
 
-    def needed(self, transmittance: Scalar) -> Int[Array, ""]:
+    def needed(self, transmittance: Scalar, *, derivative: bool = False) -> Int[Array, ""]:
         intensity = jax.lax.stop_gradient(self.templates.intensity)
         brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
-        skipped = brightest <= 0
+        skipped = jnp.zeros(self.terms, bool) if derivative and self.given else brightest <= 0
         if self.cutoff is not None:
             skipped |= transmittance * brightest * self.blended < self.cutoff
         return jnp.sum(~skipped, dtype=jnp.int32)  # NaN is not skipped

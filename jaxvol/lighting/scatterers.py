@@ -293,7 +293,8 @@ class ScattererTemplates(Lighting):
         optics: Optics = jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
         return TemplateShading(
             *(self.materials, self.lights, self.grown(blend=blend), optics, cutoff),
-            *(self.templates if blend else 1, self.occlusion, self.reach, self.seed),
+            *(self.templates if blend else 1, self.given is not None),
+            *(self.occlusion, self.reach, self.seed),
         )
 
     def _bake(self, around: Surroundings) -> BakedLighting:

@@ -5,6 +5,7 @@ for each image, which adds up terms for points around a sample, one by one; and 
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,12 +17,11 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.sharding import varying
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
-from .._util.voxel_fetch import Recording
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
 from ..transfer import Classification, Measured, Transfer, classification_of
-from ..volume import Volume, with_fetch
+from ..volume import Volume
 
 
 class Sample(NamedTuple):
@@ -67,6 +67,10 @@ class Surroundings(eqx.Module):
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
 
+    def in_memory_by(self, live: Bool[Array, ""]) -> "Surroundings":
+        """The same, with all that is fetched put in memory."""
+        return Surroundings(self.volume, self.transfer, self.space, live)
+
     def at(self, *points: Vec3) -> list[ClassifiedPoint]:
         """What is at world points. All are fetched before any is classified."""
         classification = self.transfer.classification(self.volume)
@@ -100,9 +104,9 @@ class Shading(eqx.Module):
         """The number of terms."""
         return 0
 
-    def needed(self, transmittance: Scalar) -> Int[Array, ""]:
+    def needed(self, transmittance: Scalar, *, derivative: bool = False) -> Int[Array, ""]:
         """How many terms, from the first one on, may add anything to samples behind this transmittance or
-        less. By default all."""
+        less, or, for the `derivative`, to one of its parts. By default all."""
         return jnp.asarray(self.terms, jnp.int32)
 
     @abstractmethod
@@ -190,79 +194,66 @@ class Shader(NamedTuple):
 
     def __call__(self, sample: Sample) -> Vec3:
         """The shaded colour of a sample, or those of many along one axis."""
-        if sample.extinction.ndim == 0:
-            return shade_sample(self.shading, self.around, sample)[0]
-        return shade_samples(self.shading, self.around, sample)
+        shade = shade_sample if sample.extinction.ndim == 0 else shade_samples
+        return shade(self.shading, self.around, sample)
 
 
-def shade_sample(
-    shading: Shading, around: Surroundings, sample: Sample, perturbations: Any = None
-) -> tuple[Vec3, Any]:
-    """The shaded colour of a sample, and the first voxels of the cubes that its terms fetched.
-
-    `perturbations`: None, and then no voxels are returned; or, for a gradient of the voxels, those of
-    `Recording`. Perturbations and voxels are arrays with a leading axis over the terms."""
+def shade_sample(shading: Shading, around: Surroundings, sample: Sample) -> Vec3:
+    """The shaded colour of a sample."""
     shared = shading.about(around, sample)
+    return shading.color(sample, shared, _all_terms(shading, around, sample, shared))
+
+
+def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: PyTree) -> PyTree:
+    """The sums of a sample's terms; None where there are none."""
     if shading.terms == 0:
-        return shading.color(sample, shared, None), None if perturbations is None else []
-    sums, bases = _all_terms(shading, around, sample, shared, perturbations)
-    return shading.color(sample, shared, sums), bases
-
-
-def _all_terms(
-    shading: Shading, around: Surroundings, sample: Sample, shared: PyTree, perturbations: Any = None
-) -> tuple[PyTree, Any]:
-    """The sum of a sample's terms, and the first voxels of the cubes that they fetched."""
+        return None
 
     # The backward pass computes each term again, so that memory holds the intermediate values of one term,
     # not of all.
     @jax.checkpoint
-    def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
-        number, perturbations = each
-        volume, live, bases = around.volume, number >= 0, None
-        if perturbations is not None:
-            bases, live = [], None
-            volume = with_fetch(volume, Recording(perturbations, bases))
-        here = Surroundings(volume, around.transfer, around.space, live)
-        added = shading.term(here, sample, shared, number)
-        return jax.tree.map(jnp.add, sums, added), bases
+    def add(sums: PyTree, number: Int[Array, ""]) -> tuple[PyTree, None]:
+        added = shading.term(around.in_memory_by(number >= 0), sample, shared, number)
+        return jax.tree.map(jnp.add, sums, added), None
 
-    first = jax.eval_shape(partial(shading.term, around, sample, shared), jnp.zeros((), jnp.int32))
-    return jax.lax.scan(one, _zeros(first), (jnp.arange(shading.terms), perturbations))
+    term = partial(shading.term, around, sample, shared)
+    return jax.lax.scan(add, zeros_like_result(term), jnp.arange(shading.terms))[0]
 
 
 def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
     """The shaded colours of samples along one axis. Terms that none of them needs are left out."""
-    shared, sums = jax.vmap(partial(shading.about, around))(samples), None
-    if shading.terms > 0:
-        sums = _needed_terms(shading, around, samples, shared)
+    shared = jax.vmap(partial(shading.about, around))(samples)
+    sums = needed_terms(shading, around, samples, shared)
     return jax.vmap(shading.color)(samples, shared, sums)
 
 
 @eqx.filter_custom_jvp
-def _needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
-    """The sums of the terms that any of these samples needs. Their derivative is that of all terms: a term of
-    0 may have one, and JAX cannot differentiate this loop in reverse."""
+def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
+    """The sums of the terms that any of these samples needs; None where there are none. Their derivative is
+    that of all terms: a term of 0 may have one, and JAX cannot differentiate this loop in reverse."""
+    if shading.terms == 0:
+        return None
 
     def terms(number: Int[Array, ""]) -> PyTree:
-        here = Surroundings(around.volume, around.transfer, around.space, number >= 0)
+        here = around.in_memory_by(number >= 0)
         return jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))(samples, shared, number)
 
     def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
         return jax.tree.map(jnp.add, sums, terms(number))
 
     needed = shading.needed(jnp.max(samples.transmittance))
-    none = varying(_zeros(jax.eval_shape(terms, jnp.zeros((), jnp.int32))), samples)
-    return jax.lax.fori_loop(0, needed, add, none)
+    return jax.lax.fori_loop(0, needed, add, varying(zeros_like_result(terms), samples))
 
 
-@_needed_terms.def_jvp
+@needed_terms.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
     def all_(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
-        return jax.vmap(lambda *each: _all_terms(shading, around, *each)[0])(samples, shared)
+        return jax.vmap(partial(_all_terms, shading, around))(samples, shared)
 
     return eqx.filter_jvp(all_, primals, tangents)
 
 
-def _zeros(shapes: PyTree) -> PyTree:
+def zeros_like_result(of_number: Callable[[Int[Array, ""]], PyTree]) -> PyTree:
+    """Zeros of the shapes of what a function of a term's number returns."""
+    shapes = jax.eval_shape(of_number, jnp.zeros((), jnp.int32))
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

@@ -106,7 +106,7 @@ def test_samples_shaded_together_are_shaded_as_each_alone(occlusion):
         shader = shader_of(templates(occlusion=occlusion, cutoff=0.03))
         samples = samples_in(shader.around, bright * np.linspace(0.2, 1, 32))
         together = jax.jit(shader)(samples)
-        alone = jax.jit(jax.vmap(lambda s, of=shader: shade_sample(of.shading, of.around, s)[0]))(samples)
+        alone = jax.jit(jax.vmap(lambda s, of=shader: shade_sample(of.shading, of.around, s)))(samples)
         np.testing.assert_allclose(together, alone, atol=1e-6)
         assert (np.max(together) > 0.01) == (bright > 0.05)
 
@@ -118,7 +118,7 @@ def test_derivatives_of_samples_shaded_together_are_those_of_each_alone():
     def seen(intensity, samples, *, together):
         given = eqx.tree_at(lambda t: t.intensity, TEMPLATES, intensity)
         shader = shader_of(templates(given=given))
-        each = jax.vmap(lambda s: shade_sample(shader.shading, shader.around, s)[0])
+        each = jax.vmap(lambda s: shade_sample(shader.shading, shader.around, s))
         return jnp.sum(jnp.stack((shader if together else each)(samples)) ** 2)
 
     def derivatives(together):
