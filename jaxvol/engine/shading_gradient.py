@@ -15,7 +15,7 @@ from .._util.sharding import varying
 from .._util.trees import PyTree, added
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
-from ..lighting.shading import Sample, Shader, Surroundings, needed_terms
+from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
 from ..reference import Pipeline
 from ..space import Ray
 from ..volume import with_fetch
@@ -148,7 +148,7 @@ def _chunk_vjp(
         if voxels is not None:
             _, bases = jax.eval_shape(term, parts, [], jnp.zeros((), jnp.int32))
             perturbations = cubes_of_zeros(bases, cotangent[0].dtype)
-        needed = shading.needed(jnp.max(samples.transmittance), derivative=True)
+        needed = terms_above(shading.thresholds(derivative=True), samples.transmittance)
         start = varying((of_parts, voxels), samples)
         of_parts, voxels = jax.lax.fori_loop(0, needed, add, start)
     more_of_leaves, more_of_samples = pull_about(of_parts.shared)

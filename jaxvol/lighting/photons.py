@@ -9,6 +9,7 @@ volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
 
 import functools
 import math
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -20,9 +21,10 @@ from jaxtyping import Array, Float, Int
 from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along, scaled
 from .._util.xla import gather
+from ..transfer import Measured
 from .lights import ConstantLight, Light, LocatedLight
 from .materials import Material, Optics, shares, smoothstep, step
-from .shading import ClassifiedPoint, Sample, Shading, Surroundings
+from .shading import Sample, Shading, Surroundings
 from .template import ScattererTemplate
 
 
@@ -52,6 +54,21 @@ class _Shared(NamedTuple):
     """None: there is one for each material."""
     lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
     """For each light: direction to it, distance and irradiance. Direction None: from all sides."""
+
+
+class _There(NamedTuple):
+    """At a photon's place: how much its colour counts there, and the mean free path."""
+
+    scale: Scalar
+    mean_free_path: Scalar
+
+
+class _Photon(NamedTuple):
+    """A photon, placed around a sample; and what is `there`, if that is known before its place is fetched."""
+
+    offset: Vec3
+    intensity: Scalar
+    there: _There | None
 
 
 class TemplateShading(Shading):
@@ -85,13 +102,22 @@ class TemplateShading(Shading):
     def _soft(self) -> bool:
         return self.occlusion == "soft"
 
-    def needed(self, transmittance: Scalar, *, derivative: bool = False) -> Int[Array, ""]:
+    def thresholds(self, *, derivative: bool = False) -> Float[Array, " photons"]:
         intensity = jax.lax.stop_gradient(self.templates.intensity)
         brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
-        skipped = jnp.zeros(self.terms, bool) if derivative and self.given else brightest <= 0
+        least = jnp.zeros_like(brightest)
         if self.cutoff is not None:
-            skipped |= transmittance * brightest * self.blended < self.cutoff
-        return jnp.sum(~skipped, dtype=jnp.int32)  # NaN is not skipped
+            # a little less, so that rounding leaves out no photon that `_photon` does not skip
+            least = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
+        return least if derivative and self.given else jnp.where(brightest <= 0, jnp.inf, least)
+
+    @property
+    def has_dark_samples(self) -> bool:
+        return self.cutoff is not None
+
+    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
+        material = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
+        return scaled(sample.color, 1 - _matter(material))
 
     def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
         edge = EDGE if self._soft else 0.0
@@ -116,37 +142,20 @@ class TemplateShading(Shading):
         return _Shared(material_shares, parts, _blend(self.optics, parts, default), template, tuple(lights))
 
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
-        offset, intensity = self._photon(shared, number)
-        if self.cutoff is not None:
-            skipped = sample.transmittance * intensity * self.blended < self.cutoff
-            intensity = jnp.where(skipped, 0, intensity)
-        if len(self.materials) == 1:
-            at_photon, *further = around.at(*self._places(sample, offset))
-            shares, optics = self._shares_at(around, at_photon, shared)
-            scale = intensity
-        else:
-            [first] = around.at(_beside(sample, offset))
-            shares, optics = self._shares_at(around, first, shared)
-            own = shared.optics
-            # refraction into another material stretches the template by the ratio of the speeds of light
-            offset = scaled(offset, own.refractive_index / optics.refractive_index)
-            at_photon, *further = around.at(*self._places(sample, offset))
-            ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
-            scale = intensity * jnp.where(own.opacity == 0, 0, ratio)
-        if self._soft:  # the opacity of one mean free path there
-            matter = -jnp.expm1(-at_photon.extinction * optics.mean_free_path)
-        else:
-            matter = step(at_photon.extinction, 0.0)
-        inner = scaled(at_photon.color, scale * sum(shares) * matter)
-
-        seen = intensity * self._visible(offset, [each.extinction for each in (at_photon, *further)])
-        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
-        return brightness, inner
+        # in stages, each of which is stored: XLA would compute it again for each of its uses
+        photon = around.stored(self._photon, sample, shared, number)
+        if len(self.materials) > 1:
+            read = around.stored(lambda photon: around.fetched([_beside(sample, photon.offset)]), photon)
+            photon = around.stored(partial(self._refracted, around), sample, shared, photon, *read)
+        read = around.stored(lambda photon: around.fetched(self._places(sample, photon)), photon)
+        seen, shows = around.stored(partial(self._weights, around), sample, shared, photon, read)
+        brightness = tuple(seen * self._lit_side(photon.offset, *light[:2]) for light in shared.lights)
+        color, _ = around.transfer.classification(around.volume).classify(read[0])
+        return brightness, scaled(color, shows)
 
     def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
         brightness, inner = sums
-        # 1 from a material's soft edge inwards: an unlit part of the colour would look like emission
-        matter = jnp.minimum(2 * sum(shared.shares), 1)
+        matter = _matter(shared.shares)
         scale = matter * WHITE * shared.optics.reflectance
         red, green, blue = (
             c * (1 - matter)
@@ -157,8 +166,9 @@ class TemplateShading(Shading):
         )
         return red, green, blue
 
-    def _photon(self, shared: _Shared, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
-        """Offset and intensity of a photon of the sample's material, or of several blended by their parts."""
+    def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
+        """A photon of the sample's material, or of several blended by their parts; of intensity 0 if it is
+        skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
@@ -168,18 +178,52 @@ class TemplateShading(Shading):
             dx, dy, dz = (of_sample(self.templates.offset[m, :, number, i]) for i in range(3))
             intensity = intensity + part * of_sample(self.templates.intensity[m, :, number])
             x, y, z = x + part * dx, y + part * dy, z + part * dz
-        return (x, y, z), intensity
+        if self.cutoff is not None:
+            skipped = sample.transmittance * intensity * self.blended < self.cutoff
+            intensity = jnp.where(skipped, 0, intensity)
+        return _Photon((x, y, z), intensity, None)
 
-    def _places(self, sample: Sample, offset: Vec3) -> list[Vec3]:
+    def _refracted(
+        self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon, read: Measured
+    ) -> _Photon:
+        """The photon, moved by refraction into the material at its place. `read`: what was fetched there."""
+        shares, optics = self._shares_at(around, _beside(sample, photon.offset), read, shared)
+        own = shared.optics
+        # the template is stretched by the ratio of the speeds of light
+        offset = scaled(photon.offset, own.refractive_index / optics.refractive_index)
+        ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
+        scale = jnp.where(own.opacity == 0, 0, ratio)
+        return _Photon(offset, photon.intensity, _There(scale * sum(shares), optics.mean_free_path))
+
+    def _places(self, sample: Sample, photon: _Photon) -> list[Vec3]:
         """Where a photon lies, and where else it is tested for occlusion."""
-        return [_beside(sample, offset, times) for times in (1.0, *self.reach)]
+        return [_beside(sample, photon.offset, times) for times in (1.0, *self.reach)]
+
+    def _weights(
+        self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon, read: list[Measured]
+    ) -> tuple[Scalar, Scalar]:
+        """How much of a photon is seen, and how much the colour at its place counts. `read`: what was fetched
+        at `_places`."""
+        places = self._places(sample, photon)
+        extinctions = [around.classified(*each).extinction for each in zip(places, read, strict=True)]
+        there = photon.there
+        if there is None:
+            shares, optics = self._shares_at(around, places[0], read[0], shared)
+            there = _There(sum(shares), optics.mean_free_path)
+        if self._soft:  # the opacity of one mean free path there
+            matter = -jnp.expm1(-extinctions[0] * there.mean_free_path)
+        else:
+            matter = step(extinctions[0], 0.0)
+        visible = self._visible(photon.offset, extinctions)
+        return photon.intensity * visible, photon.intensity * there.scale * matter
 
     def _shares_at(
-        self, around: Surroundings, place: ClassifiedPoint, shared: _Shared
+        self, around: Surroundings, place: Vec3, read: Measured, shared: _Shared
     ) -> tuple[tuple[Scalar, ...], Optics]:
-        """Shares of the materials at a photon, and their optics; outside of all materials the sample's."""
-        found = self._shares(around, place.coordinate, place.value)
-        found = tuple(place.inside * share for share in found)
+        """Shares of the materials at a place, and their optics; outside of all materials the sample's."""
+        there = around.classified(place, read)
+        found = self._shares(around, there.coordinate, there.value)
+        found = tuple(there.inside * share for share in found)
         return found, _blend(self.optics, found, shared.optics)
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
@@ -206,6 +250,12 @@ class TemplateShading(Shading):
 
 def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
     return along(sample.point, offset, jnp.full_like(offset[0], times))
+
+
+def _matter(shares: tuple[Scalar, ...]) -> Scalar:
+    """How far a sample is in any material: 1 from a material's soft edge inwards, since an unlit part of its
+    colour would look like emission."""
+    return jnp.minimum(2 * sum(shares), 1)
 
 
 def _norm(offset: Vec3) -> Scalar:

@@ -7,7 +7,7 @@ for each image, which adds up terms for points around a sample, one by one; and 
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -22,6 +22,9 @@ from ..march import March
 from ..space import Line, Space
 from ..transfer import Classification, Measured, Transfer, classification_of
 from ..volume import Volume
+
+
+T = TypeVar("T")
 
 
 class Sample(NamedTuple):
@@ -68,28 +71,28 @@ class Surroundings(eqx.Module):
     recorded inside one."""
 
     def in_memory_by(self, live: Bool[Array, ""]) -> "Surroundings":
-        """The same, with all that is fetched put in memory."""
+        """The same, with what is `stored` put in memory."""
         return Surroundings(self.volume, self.transfer, self.space, live)
 
-    def at(self, *points: Vec3) -> list[ClassifiedPoint]:
-        """What is at world points. All are fetched before any is classified."""
+    def stored(self, f: Callable[..., T], *arguments: Any) -> T:
+        """`f(*arguments)`, computed once for all its uses. The arguments are put in memory, too."""
+        return f(*arguments) if self.live is None else in_memory(self.live, f, *arguments)
+
+    def fetched(self, points: list[Vec3]) -> list[Measured]:
+        """What the transfer function reads at world points."""
         classification = self.transfer.classification(self.volume)
-        coordinates = [self.space.coordinate(point) for point in points]
+        return [classification.at(self.space.coordinate(point)) for point in points]
 
-        def measured(coordinates: list[Vec3]) -> list[Measured]:
-            return [classification.at(coordinate) for coordinate in coordinates]
-
-        def classified(coordinate: Vec3, measured: Measured) -> ClassifiedPoint:
-            x, y, z = (
-                jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
-                for c, n in zip(coordinate, self.volume.shape, strict=True)
-            )
-            inside, (color, extinction) = x * y * z, classification.classify(measured)
-            return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
-
-        # fetches cannot be recorded inside a branch
-        fetch = measured if self.live is None else partial(in_memory, self.live, measured)
-        return list(map(classified, coordinates, fetch(coordinates)))
+    def classified(self, point: Vec3, measured: Measured) -> ClassifiedPoint:
+        """What is at a world point, from what was fetched there."""
+        coordinate = self.space.coordinate(point)
+        x, y, z = (
+            jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
+            for c, n in zip(coordinate, self.volume.shape, strict=True)
+        )
+        inside = x * y * z
+        color, extinction = self.transfer.classification(self.volume).classify(measured)
+        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
 
 
 class Shading(eqx.Module):
@@ -104,10 +107,19 @@ class Shading(eqx.Module):
         """The number of terms."""
         return 0
 
-    def needed(self, transmittance: Scalar, *, derivative: bool = False) -> Int[Array, ""]:
-        """How many terms, from the first one on, may add anything to samples behind this transmittance or
-        less, or, for the `derivative`, to one of its parts. By default all."""
-        return jnp.asarray(self.terms, jnp.int32)
+    def thresholds(self, *, derivative: bool = False) -> Float[Array, " terms"]:
+        """For each term, the transmittance below which neither it nor any after it adds anything to a sample;
+        or, for the `derivative`, to any of its parts. They increase. By default all terms are needed."""
+        return jnp.zeros(self.terms)
+
+    @property
+    def has_dark_samples(self) -> bool:
+        """Whether behind little transmittance a sample may need no term at all. Its colour is then `dark`."""
+        return False
+
+    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
+        """The colour of a sample without any terms."""
+        return sample.color
 
     @abstractmethod
     def about(self, around: Surroundings, sample: Sample) -> PyTree:
@@ -241,7 +253,7 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
     def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
         return jax.tree.map(jnp.add, sums, terms(number))
 
-    needed = shading.needed(jnp.max(samples.transmittance))
+    needed = terms_above(shading.thresholds(), samples.transmittance)
     return jax.lax.fori_loop(0, needed, add, varying(zeros_like_result(terms), samples))
 
 
@@ -251,6 +263,13 @@ def _(primals: Any, tangents: Any) -> Any:
         return jax.vmap(partial(_all_terms, shading, around))(samples, shared)
 
     return eqx.filter_jvp(all_, primals, tangents)
+
+
+def terms_above(
+    thresholds: Float[Array, " terms"], transmittance: Float[Array, " samples"]
+) -> Int[Array, ""]:
+    """How many terms, from the first one on, any of these samples needs. Of NaN, all."""
+    return jnp.sum(~(jnp.max(transmittance) < thresholds), dtype=jnp.int32)
 
 
 def zeros_like_result(of_number: Callable[[Int[Array, ""]], PyTree]) -> PyTree:

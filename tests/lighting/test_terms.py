@@ -17,7 +17,7 @@ from jaxvol.lighting import (
     ScattererTemplate,
     ScattererTemplates,
 )
-from jaxvol.lighting.shading import Sample, Shader, Shading, Surroundings, shade_sample
+from jaxvol.lighting.shading import Sample, Shader, Shading, Surroundings, shade_sample, terms_above
 from jaxvol.space import Affine
 
 from ..scenes import scaled_phantom, soft_transfer
@@ -68,8 +68,8 @@ class Counting(Shading):
     def terms(self):
         return 5
 
-    def needed(self, transmittance):
-        return jnp.where(transmittance < 0.5, 2, 5)
+    def thresholds(self, *, derivative=False):
+        return jnp.asarray([0, 0, 0.5, 0.5, 0.5])
 
     def about(self, around, sample):
         return None
@@ -91,12 +91,16 @@ def test_the_loop_ends_where_none_of_the_samples_needs_more(transmittance, expec
 def test_the_photons_that_are_needed_are_those_above_the_cutoff():
     """The last one is needed that is bright enough in any template, and all before it."""
     cut, all_ = (shader_of(templates(cutoff=cutoff)).shading for cutoff in (0.03, 0.0))
-    for transmittance, expected in ((1, 4), (0.5, 3), (0.1, 2), (0.05, 0), (np.nan, 5)):
-        assert cut.needed(jnp.asarray(transmittance, jnp.float32)) == expected, transmittance
-        assert all_.needed(jnp.asarray(transmittance, jnp.float32)) == 4 or transmittance != transmittance
+    for transmittance, expected in ((1, 4), (0.5, 3), (0.1, 2), (0.05, 0), (np.nan, 4)):
+        several = jnp.asarray([0, transmittance], jnp.float32)
+        assert terms_above(cut.thresholds(), several) == expected, transmittance
+        assert terms_above(all_.thresholds(), several) == 4
+        # as these intensities may be differentiated
+        assert terms_above(all_.thresholds(derivative=True), several) == 5
     blend = shader_of(templates(cutoff=0.03, blend=True)).shading
     # blended, each holds half of its intensity, and is skipped as it would be alone
-    assert [int(blend.needed(jnp.float32(t))) for t in (1, 0.5, 0.1, 0.05)] == [7, 6, 2, 0]
+    needed = [int(terms_above(blend.thresholds(), jnp.asarray([t]))) for t in (1, 0.5, 0.1, 0.05)]
+    assert needed == [7, 6, 2, 0]
 
 
 @pytest.mark.parametrize("occlusion", ["hard", "soft"])
