@@ -7,9 +7,8 @@ Lee, Kwon and Shin: Scattered light representation in accordance with the materi
 volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
 """
 
-import functools
 import math
-from functools import partial
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -142,14 +141,20 @@ class TemplateShading(Shading):
         return _Shared(material_shares, parts, _blend(self.optics, parts, default), template, tuple(lights))
 
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
-        # in stages, each of which is stored: XLA would compute it again for each of its uses
-        photon = around.stored(self._photon, sample, shared, number)
+        # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only a
+        # photon that is the same for all samples costs less to compute than to load.
+        def placed() -> _Photon:
+            return self._photon(sample, shared, number)
+
+        photon = placed if shared.template is None and len(self.materials) == 1 else _known(around, placed)
         if len(self.materials) > 1:
-            read = around.stored(lambda photon: around.fetched([_beside(sample, photon.offset)]), photon)
-            photon = around.stored(partial(self._refracted, around), sample, shared, photon, *read)
-        read = around.stored(lambda photon: around.fetched(self._places(sample, photon)), photon)
-        seen, shows = around.stored(partial(self._weights, around), sample, shared, photon, read)
-        brightness = tuple(seen * self._lit_side(photon.offset, *light[:2]) for light in shared.lights)
+            first = photon()
+            [there] = around.stored(lambda: around.fetched([_beside(sample, first.offset)]))
+            photon = _known(around, lambda: self._refracted(around, sample, shared, first, there))
+        read = around.stored(lambda: around.fetched(self._places(sample, photon())))
+        seen, shows = around.stored(lambda: self._weights(around, sample, shared, photon(), read))
+        offset = photon().offset
+        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
         color, _ = around.transfer.classification(around.volume).classify(read[0])
         return brightness, scaled(color, shows)
 
@@ -229,8 +234,7 @@ class TemplateShading(Shading):
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
         """Visibility of a photon from the sample, from the extinctions at `_places`."""
         if not self._soft:
-            clear = (1 - step(extinction, 0.0) for extinction in extinctions)
-            return functools.reduce(jnp.multiply, clear)
+            return 1 - step(sum(extinctions), 0.0)
         pieces = np.diff([0.0, 1.0, *self.reach])
         depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
         return jnp.exp(-depth * _norm(offset))
@@ -246,6 +250,12 @@ class TemplateShading(Shading):
         if not self._soft:
             return step(near, 0.0)
         return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
+
+
+def _known(around: Surroundings, f: Callable[[], _Photon]) -> Callable[[], _Photon]:
+    """A function that returns what `f` returns, which is computed and stored once."""
+    found = around.stored(f)
+    return lambda: found
 
 
 def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:

@@ -74,9 +74,9 @@ class Surroundings(eqx.Module):
         """The same, with what is `stored` put in memory."""
         return Surroundings(self.volume, self.transfer, self.space, live)
 
-    def stored(self, f: Callable[..., T], *arguments: Any) -> T:
-        """`f(*arguments)`, computed once for all its uses. The arguments are put in memory, too."""
-        return f(*arguments) if self.live is None else in_memory(self.live, f, *arguments)
+    def stored(self, f: Callable[[], T]) -> T:
+        """`f()`, computed once for all its uses."""
+        return f() if self.live is None else in_memory(self.live, f)
 
     def fetched(self, points: list[Vec3]) -> list[Measured]:
         """What the transfer function reads at world points."""

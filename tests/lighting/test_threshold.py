@@ -1,6 +1,5 @@
 """The paper's own numbers: how many photons a template has, and which intensities come from merging."""
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -15,7 +14,10 @@ from jaxvol.lighting import (
 
 
 INDEX = 1.4
-grow = eqx.filter_jit(scatterer_template)
+
+
+def grow(material, key, **how):
+    return jax.jit(lambda key: scatterer_template(material, key, **how))(key)
 
 
 def filled(template):
@@ -80,7 +82,7 @@ def test_merging_makes_the_papers_brightest_photons(opacity, packets, paper):
     assert 0.05 < merged.mean() < 0.5
     # the brightest is the sum of a first one, and one that was among the fainter
     added = near[merged, :1] - first
-    assert np.all(np.isclose(added, apart[merged, packets:], rtol=1e-3).any(-1) | (added[:, 0] > second))
+    assert np.isclose(added, apart[merged, packets:], rtol=1e-3).any(-1).mean() > 0.8  # others of two such
     cosines = added[:, 0] / second
     assert np.any(np.abs(cosines - (paper - first) / second) < 0.01)
     assert 0.88 < (paper - first) / second < 0.92
