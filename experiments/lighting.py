@@ -1,11 +1,16 @@
 """What do photons, templates, occlusion, baking and deferring cost, and what do they gain?
 
 The head phantom under opaque skin, lit from the side: with different numbers of photons per template and of
-blended templates, under hard and soft occlusion, by baked light, and by deferred light, evaluated once per
-ray. Each frame is rendered in turn with the unlit head, and its time is the median of their ratios; beside it
-stands the image's RMSE against one that blends many templates under soft occlusion and lights all samples.
-Lee, Kwon and Shin report 20-24 frames per second lit and 42-56 unlit, which is 2.2 times the time; the goal
-for baked light is 1.2 times.
+blended templates, by one template for each pixel or for each material, under hard and soft occlusion, by
+baked light, and by deferred light, evaluated once per ray. Each frame is rendered in turn with the unlit
+head, and its time is the median of their ratios; beside it stands the image's RMSE against one that blends
+many templates under soft occlusion and lights all samples. Images by one template for each pixel are also
+filtered against their noise (`light_filter`), with the time that this takes.
+
+The published form is hard occlusion, with all photons that templates hold, on all samples. Lee, Kwon and Shin
+report 20-24 frames per second with it and 42-56 without light, which is 2.2 times the time; the goal for
+baked light is 1.2 times. Where there is a lighting by surface normals (`lighting.Phong`), times are also
+relative to a frame with that.
 
 Also measured: the error of deferred light under skin that is more and more translucent; the noise of a flat
 face, seen and lit obliquely, against the number of templates blended; and the energy of a template against
@@ -40,6 +45,7 @@ from jaxvol.metrics import rmse
 
 from . import common, timing
 from .common import plt
+from .light_filter import filtered
 from .scenes import Scene, skin_head
 
 
@@ -49,8 +55,22 @@ FLESH = jv.Material(0.5, 0.05, 1.4)
 LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (50.0, 50.0, 50.0)), ConstantLight((1.3, 1.3, 1.3))
 """Bright, since flesh that absorbs half at each scattering reflects a sixth of white light from all sides."""
 UNLIT = "unlit"
-PHOTONS, BLENDED, BAKED, HARD = "photons", "templates blended", "baked", "hard occlusion"
+PHOTONS, BLENDED, BAKED = "photons", "templates blended", "baked"
+MATERIAL, HARD, HARD_MATERIAL = "one for each material", "hard occlusion", "hard, one for each material"
+PHONG = "Phong"
 ONCE, BLENDED_ONCE, BAKED_ONCE = "photons, deferred", "templates blended, deferred", "baked, deferred"
+STYLES = {
+    PHONG: "kx",
+    PHOTONS: "C0o-",
+    MATERIAL: "C0*",
+    BLENDED: "C1s-",
+    HARD: "C3D",
+    HARD_MATERIAL: "C3*",
+    BAKED: "C2^-",
+    ONCE: "C4o--",
+    BLENDED_ONCE: "C6s--",
+    BAKED_ONCE: "C5^--",
+}
 ENERGIES: dict[str, dict[str, Any]] = {
     "conserving": {"energy": "conserving"},
     "printed": {"energy": "printed"},
@@ -69,10 +89,14 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
     of = partial(ScattererTemplates, FLESH, LIGHTS)
     whole = of().photons
     photons = (*(n for n in photons if n < whole), whole)
+    phong = getattr(jv.lighting, PHONG, None)
     return {
+        **({} if phong is None else {PHONG: [(0, phong())]}),
         PHOTONS: [(n, of(photons=n)) for n in photons],
+        MATERIAL: [(whole, of(choice="material"))],
         BLENDED: [(n, of(templates=n, blend=True)) for n in blended],
         HARD: [(whole, of(occlusion="hard"))],
+        HARD_MATERIAL: [(whole, of(occlusion="hard", choice="material"))],
         BAKED: [(n, of(baked=n)) for n in baked],
         ONCE: [(n, Deferred(of(photons=n))) for n in photons],
         BLENDED_ONCE: [(n, Deferred(of(templates=n, blend=True, photons=FEW))) for n in blended],
@@ -88,25 +112,49 @@ def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
 def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetitions: int, seed: int) -> Any:
     """Time and error of each lighting, one at a time, since a volume keeps the light of one baking only."""
     truth = frame(scene, ScattererTemplates(FLESH, LIGHTS, templates=many, blend=True), seed).rgba
+    beside = {UNLIT: None}
+    if PHONG in lightings:
+        [(_, beside[PHONG])] = lightings[PHONG]
     found: dict[str, list[dict[str, Any]]] = {}
     for kind, each in lightings.items():
         found[kind] = []
         for number, lighting in each:
-            programs = {UNLIT: None, kind: lighting}
+            programs = {**beside, kind: lighting}
             seconds = timing.interleaved(
                 {n: lambda how=how: frame(scene, how, seed).rgba for n, how in programs.items()}, repetitions
             )
-            error = rmse(frame(scene, lighting, seed).rgba, truth)
-            row = {"number": number, **common.row(seconds[kind], seconds[UNLIT], error)}
+            image = frame(scene, lighting, seed).rgba
+            row = {"number": number, **common.row(seconds[kind], seconds[UNLIT], rmse(image, truth))}
+            if PHONG in beside:
+                row["ratio to Phong"] = timing.ratio(seconds[kind], seconds[PHONG])
             if kind == BAKED:
                 row["seconds to bake"] = round(baking(scene, lighting, seed) - row["seconds"], 4)
+            if kind in (PHOTONS, HARD):
+                row["filtered"] = filtering(scene, image, truth, seed)
             found[kind].append(row)
             print(
                 f"{kind:27} {number:4} {row['seconds']:8.3f} s  {row['ratio']['median']:7.2f} x unlit"
-                f"  RMSE {error:.5f}",
+                f"  RMSE {row['rmse']:.5f} {row.get('filtered', '')}",
                 flush=True,
             )
     return found
+
+
+def filtering(scene: Scene, image: Any, truth: Any, seed: int) -> dict[str, float]:
+    """Error of the image after it is filtered, and the time that this takes, without the unlit frame."""
+    how = march(scene, seed)
+    unlit = jv.render(scene.volume, scene.transfer, scene.camera, how)
+    start = time.perf_counter()
+    smooth = filtered(np.asarray(image), unlit, float(scene.volume.spacing[0]))
+    return {"rmse": float(rmse(smooth, truth)), "seconds": round(time.perf_counter() - start, 4)}
+
+
+def held() -> dict[str, Any]:
+    """Number of photons that the templates hold, and that their arrays have room for."""
+    lighting = ScattererTemplates(FLESH, LIGHTS)
+    intensity = np.asarray(jax.jit(lambda: lighting.grown(blend=False))().intensity)
+    each = np.sum(intensity > 0, axis=-1)
+    return {"fewest": int(each.min()), "most": int(each.max()), "room": intensity.shape[-1]}
 
 
 def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
@@ -175,8 +223,8 @@ def pictures(scene: Scene, templates: int, seed: int, path: Path) -> None:
 def draw(result: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(11, 8.5), layout="constrained")
     cost, deferred, spread, energy = axes.flat
-    styles = "C0o-", "C1s-", "C3D", "C2^-", "C4o--", "C6s--", "C5^--"
-    for (kind, rows), style in zip(result["frames"].items(), styles, strict=True):
+    for kind, rows in result["frames"].items():
+        style = STYLES[kind]
         error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
         cost.plot(error, ratio, style, label=kind)
         for row, x, y in zip(rows, error, ratio, strict=True):
@@ -253,6 +301,7 @@ def main(chosen: Namespace) -> common.Answer:
         "resolution": chosen.resolution,
         "repetitions": chosen.repetitions,
         "templates blended in the reference": many,
+        "photons of a template": held(),
         "frames": measure(scene, variants(photons, blended, baked), many, chosen.repetitions, chosen.seed),
         "deferring": deferring(scene, thinned, chosen.seed),
         "noise": noise(blended, trials, chosen.seed),

@@ -55,7 +55,8 @@ class Classification(NamedTuple):
     search: Callable[[Measured], Measured] | None = None
     """Looks up what `classify` needs beside the measured values, once; it is appended to them."""
     light: Callable[[Any], Vec3] | None = None
-    """From a `lighting.shading.Sample` to its shaded colour. None: colours are as classified."""
+    """From a `lighting.shading.Sample`, or many along one axis, to the shaded colours. None: colours are as
+    classified."""
     beside: Callable[[Vec3], Measured] = lambda _: ()
     """What is measured beside the value."""
     integrate: Classify | None = None

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.sharding import varying
 from .._util.trees import PyTree, added, floats, zeros_of
-from ..lighting.shading import Surroundings
+from ..lighting.shading import Shader, Surroundings
 from ..march import EmptySpaceIndex
 from ..reference import Pipeline
 from ..rendering import Rendering
@@ -26,7 +26,6 @@ from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
 from .scene import Scene
-from .shading_gradient import Shader
 from .tiling import Tiling
 from .wavefront import march_rays
 

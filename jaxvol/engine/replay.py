@@ -31,6 +31,7 @@ from .._util.trees import PyTree, added, floats, zeros_of
 from .._util.vec3 import Scalar, Vec3, along
 from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..compositing import Weighting
+from ..lighting.shading import Shader
 from ..reference import Pipeline, Progress, measure, pieces
 from ..rendering import Rendering
 from ..space import Ray
@@ -39,7 +40,7 @@ from ..volume import Volume, with_fetch, with_voxels, without_voxels
 from .packing import with_words
 from .scene import Scene
 from .segment import Samples, SampleVisitor, vmap_cells
-from .shading_gradient import Shader, ShadingTotal, ShadingVjp, shading_vjp
+from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
 from .tiling import Tiling
 from .visible_samples import Weights, weights_of
 

@@ -3,6 +3,7 @@
 Shades each sample again, as `visible_samples.shaded_colors` did in the first march.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,26 +11,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._util.sharding import varying
 from .._util.trees import PyTree, added
 from .._util.vec3 import Scalar, Vec3
-from .._util.voxel_fetch import cubes_of_zeros, scatter_add
-from ..lighting.shading import Shading, Surroundings, shade_sample
+from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
 from ..reference import Pipeline
 from ..space import Ray
+from ..volume import with_fetch
 from .segment import Samples
 from .visible_samples import Weights, samples_of, visible
-
-
-class Shader(NamedTuple):
-    """What shades the samples of an image."""
-
-    shading: Shading
-    around: Surroundings
-
-    @property
-    def leaves(self) -> PyTree:
-        """All that has a gradient, except the transfer function and the voxels."""
-        return self.shading, self.around.space
 
 
 class ShadingTotal(NamedTuple):
@@ -64,37 +55,17 @@ def shading_vjp(
 ) -> tuple[list[ShadingVjp], ShadingTotal]:
     """Pulls back the shading of a segment's samples, and adds to the total. `cotangents`: of each piece's
     shaded colour."""
-    chosen, around = visible(weights, chunk), shader.around
+    chosen = visible(weights, chunk)
     size = sum(weight.size for weight in weights.weight)
-    moving, fixed = eqx.partition((shader.leaves, around.transfer), eqx.is_inexact_array)
 
     def one(
         indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
     ) -> tuple[ShadingVjp, ShadingTotal]:
         found, total = carry
         some = samples_of(chosen, indices, pipeline, ray, samples.cells, samples.measured, weights)
-        moving_sample, fixed_sample = eqx.partition(some, eqx.is_inexact_array)
-
-        def colors(moving: PyTree, moving_sample: PyTree, perturbations: Any) -> tuple[Vec3, Any]:
-            (shading, space), transfer = eqx.combine(moving, fixed)
-            here = Surroundings(around.volume, transfer, space)
-            each = eqx.combine(moving_sample, fixed_sample)
-            return jax.vmap(lambda sample, perturbations: shade_sample(shading, here, sample, perturbations))(
-                each, perturbations
-            )
-
-        perturbations = None
-        if total.voxels is not None:
-            _, bases = jax.eval_shape(lambda: colors(moving, moving_sample, []))
-            perturbations = cubes_of_zeros(bases, weights.weight[0].dtype)
-        color, pull, bases = jax.vjp(colors, moving, moving_sample, perturbations, has_aux=True)
         real = indices < size
-        cotangent = tuple(jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
-        (of_shader, of_transfer), of_sample, of_cubes = pull(cotangent)
-        voxels = total.voxels
-        if voxels is not None:
-            voxels = scatter_add(voxels, around.volume.shape, bases, of_cubes)
-        total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
+        red, green, blue = (jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
+        color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
         part = ShadingVjp(
             color, of_sample.color, of_sample.extinction, of_sample.measured[0], of_sample.point
         )
@@ -105,3 +76,82 @@ def shading_vjp(
     start = ShadingVjp(zeros, zeros, zero, zero, zeros)
     found, total = chosen.fold(one, (start, total))
     return chosen.split(found, len(weights.weight)), total
+
+
+class _Parts(NamedTuple):
+    """What a sample's colour depends on, and has a gradient; or the cotangents of that: of what shades it and
+    of the transfer function, of the samples, and of what all terms of a sample share."""
+
+    leaves: PyTree
+    samples: PyTree
+    shared: PyTree = None
+
+
+def _chunk_vjp(
+    shader: Shader, samples: Sample, cotangent: Vec3, total: ShadingTotal
+) -> tuple[Vec3, PyTree, ShadingTotal]:
+    """The shaded colours of many samples, the cotangents of the samples, and the new total.
+
+    A colour depends on the sum of its terms, so that each term has the cotangent of their sum: the terms are
+    pulled back one by one, in their order, and nothing is kept of them."""
+    (leaves, fixed_leaves), (moving, fixed) = (
+        eqx.partition(tree, eqx.is_inexact_array)
+        for tree in ((shader.leaves, shader.around.transfer), samples)
+    )
+
+    def made(parts: _Parts) -> tuple[Shader, Sample]:
+        (shading, space), transfer = eqx.combine(parts.leaves, fixed_leaves)
+        return Shader(shading, Surroundings(shader.around.volume, transfer, space)), eqx.combine(
+            parts.samples, fixed
+        )
+
+    def about(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
+        (shading, around), each = made(_Parts(leaves, samples))
+        return eqx.partition(jax.vmap(partial(shading.about, around))(each), eqx.is_inexact_array)
+
+    shared, pull_about, fixed_shared = jax.vjp(about, leaves, moving, has_aux=True)
+    parts = _Parts(leaves, moving, shared)
+
+    def color(parts: _Parts, sums: PyTree) -> Vec3:
+        (shading, _), each = made(parts)
+        return jax.vmap(shading.color)(each, eqx.combine(parts.shared, fixed_shared), sums)
+
+    shading, around = shader
+    sums = needed_terms(shading, around, samples, eqx.combine(shared, fixed_shared))
+    colors, pull_color = jax.vjp(color, parts, sums)
+    of_parts, of_sums = pull_color(cotangent)
+
+    def term(
+        parts: _Parts, perturbations: list[Cube] | None, number: Int[Array, ""]
+    ) -> tuple[PyTree, list[Array]]:
+        (shading, around), each = made(parts)
+
+        def one(sample: Sample, shared: PyTree, perturbations: list[Cube] | None) -> tuple[PyTree, Any]:
+            if perturbations is None:
+                return shading.term(around.in_memory_by(number >= 0), sample, shared, number), []
+            record = Recording(perturbations, [])
+            here = Surroundings(with_fetch(around.volume, record), around.transfer, around.space)
+            return shading.term(here, sample, shared, number), record.bases
+
+        return jax.vmap(one)(each, eqx.combine(parts.shared, fixed_shared), perturbations)
+
+    def add(number: Int[Array, ""], carry: tuple[_Parts, PyTree]) -> tuple[_Parts, PyTree]:
+        of_parts, voxels = carry
+        _, pull, bases = jax.vjp(partial(term, number=number), parts, perturbations, has_aux=True)
+        more, of_cubes = pull(of_sums)
+        if voxels is not None:
+            voxels = scatter_add(voxels, shader.around.volume.shape, bases, of_cubes)
+        return added(of_parts, more), voxels
+
+    perturbations, voxels = None, total.voxels
+    if shading.terms > 0:
+        if voxels is not None:
+            _, bases = jax.eval_shape(term, parts, [], jnp.zeros((), jnp.int32))
+            perturbations = cubes_of_zeros(bases, cotangent[0].dtype)
+        needed = terms_above(shading.thresholds(derivative=True), samples.transmittance)
+        start = varying((of_parts, voxels), samples)
+        of_parts, voxels = jax.lax.fori_loop(0, needed, add, start)
+    more_of_leaves, more_of_samples = pull_about(of_parts.shared)
+    of_shader, of_transfer = added(of_parts.leaves, more_of_leaves)
+    total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
+    return colors, added(of_parts.samples, more_of_samples), total

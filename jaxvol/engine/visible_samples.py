@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Int
 from .._util.compaction import Chosen
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing import Composite, Weighting
-from ..lighting.shading import Sample
+from ..lighting.shading import Sample, Shader
 from ..march import Cell
 from ..reference import Pipeline, Progress, stopped
 from ..space import Ray
@@ -83,12 +83,41 @@ def shaded_colors(
 ) -> list[Vec3]:
     """Shaded colours of a segment's samples; 0 for invisible ones."""
     weights, light = weights_of(pipeline, at, alphas), pipeline.classification.light
-    chosen = visible(weights, chunk)
-    assert light is not None
+    assert isinstance(light, Shader)
+    none, shown = jnp.zeros_like(alphas[0]), [weight > 0 for weight in weights.weight]
+    dark = [(none, none, none)] * len(alphas)
+    if light.shading.has_dark_samples:
+        shown, dark = _apart_from_dark(pipeline, light, ray, cells, measured, weights)
+    chosen = Chosen.of(shown, chunk)
 
     def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
         samples = samples_of(chosen, indices, pipeline, ray, cells, measured, weights)
-        return chosen.put(colors, indices, jax.vmap(light)(samples))
+        return chosen.put(colors, indices, light(samples))
 
-    none = jnp.zeros(sum(alpha.size for alpha in alphas), alphas[0].dtype)
-    return chosen.split(chosen.fold(one, (none, none, none)), len(alphas))
+    start = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *dark)
+    return chosen.split(chosen.fold(one, start), len(alphas))
+
+
+def _apart_from_dark(
+    pipeline: Pipeline,
+    light: Shader,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    weights: Weights,
+) -> tuple[list[Bool[Array, "cells rays"]], list[Vec3]]:
+    """Which samples of a segment are visible and need light; and the colours that all would have without.
+    Behind the first few samples most are dark, and these cost much less here than gathered."""
+    least = light.shading.thresholds()[0]
+
+    def one(ray: Ray, cell: Cell, measured: Measured, before: Scalar) -> tuple[Vec3, Bool[Array, ""]]:
+        point = along(ray.entry, ray.direction, pipeline.march.sample(cell))
+        color, extinction = pipeline.classification.of_cells(measured)
+        transmittance = pipeline.compositing.transmittance(Composite(before))
+        sample = Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
+        return light.shading.dark(light.around, sample), transmittance < least
+
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
+    found = [each(ray, *piece) for piece in zip(cells, measured, weights.before, strict=True)]
+    shown = [(weight > 0) & ~dark for weight, (_, dark) in zip(weights.weight, found, strict=True)]
+    return shown, [color for color, _ in found]

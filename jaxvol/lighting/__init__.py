@@ -1,6 +1,7 @@
 """Lighting of samples: light sources, and the materials that scatter their light."""
 
 from .deferred import Deferred as Deferred
+from .growth import scatterer_template as scatterer_template, scatterer_templates as scatterer_templates
 from .lights import (
     ConstantLight as ConstantLight,
     DirectionalLight as DirectionalLight,
@@ -10,9 +11,5 @@ from .lights import (
 from .materials import Material as Material, material as material
 from .scatterers import ScattererTemplates as ScattererTemplates
 from .shading import Lighting as Lighting
-from .template import (
-    ScattererTemplate as ScattererTemplate,
-    scatterer_template as scatterer_template,
-    scatterer_templates as scatterer_templates,
-    template_capacity as template_capacity,
-)
+from .template import ScattererTemplate as ScattererTemplate
+from .threshold import template_capacity as template_capacity

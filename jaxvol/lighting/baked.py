@@ -17,7 +17,7 @@ from .._util.vec3 import Vec3
 from .._util.voxel_fetch import corners
 from .._util.xla import gather
 from ..volume import Volume
-from .shading import Lighting, Sample, Shading, Surroundings, shade_sample
+from .shading import Lighting, Sample, Shader, Shading, Surroundings
 
 
 LEVELS = 2**10 - 1
@@ -118,11 +118,11 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
         point = around.space.point((x, y, z))
         return Sample(point, (zero, zero, zero), measured, color, extinction, one, (column, row))
 
-    def ratio(number: Int[Array, ""]) -> Vec3:
-        sample = node(number)
+    def ratios_of(numbers: Int[Array, " chunk"]) -> Vec3:
+        samples = jax.vmap(node)(numbers)
         r, g, b = (
             lit_color / jnp.maximum(color, DARKEST)
-            for lit_color, color in zip(shade_sample(shading, around, sample)[0], sample.color, strict=True)
+            for lit_color, color in zip(Shader(shading, around)(samples), samples.color, strict=True)
         )
         return r, g, b
 
@@ -132,7 +132,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     zeros = jnp.zeros(count, around.volume.spacing.dtype)
 
     def chunk(indices: Int[Array, " chunk"], channels: Vec3) -> Vec3:
-        return chosen.put(channels, indices, jax.vmap(ratio)(jnp.minimum(indices, count - 1)))
+        return chosen.put(channels, indices, ratios_of(jnp.minimum(indices, count - 1)))
 
     ratios = jnp.stack(chosen.fold(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
     ratios = _dilate(ratios, visible.reshape(nx, ny, nz))

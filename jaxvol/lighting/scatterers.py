@@ -1,60 +1,37 @@
-"""Lighting by scatterer templates: the photons of a template, placed around a sample, light it.
-
-Each photon marks a place from which light is scattered to the sample: photons on the lit side that are not
-hidden make the sample bright, photons inside matter add the colour found there.
+"""Lighting by scatterer templates: which templates, and how are they used? `photons` says what each photon
+adds to a sample.
 
 Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
 volume rendering (2016), sections 3.3 and 3.4.
 """
 
-import functools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._util.checks import integer, is_traced, number
 from .._util.memo import memoized
-from .._util.noise import hashed_uniforms
-from .._util.vec3 import Scalar, Vec3, along
 from ..march import March, Transform
 from ..transfer import Transfer
 from ..volume import Volume, without_voxels
 from .baked import BakedLighting, bake, nodes_for
 from .deferred import Deferred
-from .lights import ConstantLight, Light, LocatedLight, lights_of
-from .materials import Material, Optics, materials_of, shares, smoothstep, step
-from .shading import Lighting, Sample, Shading, Simpler, Surroundings
-from .template import (
-    Energy,
-    ScattererTemplate,
-    photons_above,
-    require_photons,
-    scatterer_templates,
-    settings,
-    template_levels,
-)
+from .growth import scatterer_templates
+from .lights import Light, lights_of
+from .materials import Material, Optics, materials_of
+from .photons import Occlusion, TemplateShading
+from .shading import Lighting, Shading, Simpler, Surroundings
+from .template import ScattererTemplate
+from .threshold import Energy, Threshold, ThresholdOn
 
 
-Occlusion = Literal["soft", "hard"]
-
-EDGE = 0.1
-"""With soft occlusion, a material fades in and out over this fraction of its value range."""
-
-LIT_SIDE_COSINE = 0.25
-"""With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
-
-
-WHITE = 4 / (3 * math.pi)
-"""Factor from irradiance to radiance, by which opaque white matter that absorbs nothing is as bright as the
-light around it. Of the photons around a sample on a flat face, half are outside, where the light comes from,
-and half are inside and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c in light of
-radiance L."""
+Choice = Literal["pixel", "material"]
 
 
 class ScattererTemplates(Lighting):
@@ -74,7 +51,9 @@ class ScattererTemplates(Lighting):
     5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
        times its intensity. Here n is the refractive index, α the opacity, and primes mark the photon's
        material.
-    6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
+    6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`. As they are
+       sorted, the loop over them ends where all that remain are skipped, of all samples that are shaded
+       together.
 
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
     inwards, a sample is lit entirely as that material, and keeps nothing of its own colour.
@@ -101,9 +80,11 @@ class ScattererTemplates(Lighting):
 
     - `materials`: one or several. Where two overlap, the first counts.
     - `lights`: one or several.
-    - `templates`: number per material. `blend`: use all of them for every sample, instead of one per pixel,
-      chosen at random (our choice: the paper does not say which sample uses which template). This has less
-      noise, and its cost grows with the number of templates.
+    - `templates`: number per material. `choice`: which of them a sample uses (the paper does not say):
+      `"pixel"`: one for each pixel, chosen at random. `"material"`: the first one, for all samples of the
+      material. It has no noise, takes less time, and is as lopsided everywhere as that one template is.
+      `blend`: use all of them for every sample, instead. This has less noise than one for each pixel, and
+      takes as much longer as there are templates.
     - `photons`: keep this many of each template's brightest photons, scaled to the energy of all. By default
       all.
     - `occlusion`: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
@@ -116,7 +97,8 @@ class ScattererTemplates(Lighting):
     - `cutoff`: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
       misses the photons that are skipped.
     - `seed`: of the templates, and of their choice for each pixel.
-    - `packets`, `threshold`, `energy`, `critical_angle`: of the templates, see `scatterer_template`.
+    - `packets`, `threshold`, `threshold_on`, `energy`, `critical_angle`: of the templates, see
+      `scatterer_template`.
     - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light is
       computed once and then fetched, as long as volume, transfer function and lighting stay the same. All
       templates are blended there, and no photon is skipped for the ray's transmittance. It carries no
@@ -145,12 +127,14 @@ class ScattererTemplates(Lighting):
     cutoff: Float[Array, ""] | None
     critical_angle: Float[Array, ""] | None
     templates: int = eqx.field(static=True)
+    choice: Choice = eqx.field(static=True)
     blend: bool = eqx.field(static=True)
     photons: int = eqx.field(static=True)
     occlusion: Occlusion = eqx.field(static=True)
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
-    growth: tuple[int, float, Energy, int] = eqx.field(static=True)
+    threshold: Threshold = eqx.field(static=True)
+    levels: int = eqx.field(static=True)
     baked: int = eqx.field(static=True)
 
     def __init__(
@@ -159,6 +143,7 @@ class ScattererTemplates(Lighting):
         lights: Light | tuple[Light, ...] | Any,
         *,
         templates: int = 8,
+        choice: Choice | Any = "pixel",
         blend: bool = False,
         photons: int | None = None,
         occlusion: Occlusion | Any = "soft",
@@ -168,6 +153,7 @@ class ScattererTemplates(Lighting):
         baked: int | bool = False,
         packets: int = 4,
         threshold: float = 0.01,
+        threshold_on: ThresholdOn | Any = "photon",
         energy: Energy | Any = "conserving",
         critical_angle: float | None = None,
         levels: int | None = None,
@@ -175,9 +161,10 @@ class ScattererTemplates(Lighting):
     ):
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), bool(blend)
-        if occlusion not in get_args(Occlusion):
-            raise ValueError(f"occlusion must be one of {', '.join(get_args(Occlusion))}; got {occlusion!r}.")
-        self.occlusion, self.seed = occlusion, integer("seed", seed, 0)
+        for name, given_, allowed in (("occlusion", occlusion, Occlusion), ("choice", choice, Choice)):
+            if given_ not in get_args(allowed):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(allowed))}; got {given_!r}.")
+        self.occlusion, self.choice, self.seed = occlusion, choice, integer("seed", seed, 0)
         try:
             self.reach = tuple(float(r) for r in reach)
             grows = all(b > a for a, b in zip((1.0, *self.reach), (*self.reach, math.inf), strict=True))
@@ -193,7 +180,7 @@ class ScattererTemplates(Lighting):
         self.critical_angle = None
         if critical_angle is not None:
             self.critical_angle = number("critical_angle", critical_angle, above=0, below=90.001)
-        packets, threshold, energy = settings(packets, threshold, energy)
+        self.threshold = Threshold.checked(packets, threshold, threshold_on, energy)
         # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
         self.given = given
@@ -208,39 +195,39 @@ class ScattererTemplates(Lighting):
                 )
             self.templates, levels = given.intensity.shape[1], 0
         else:
-            require_photons(self.materials, packets, threshold)
-            growth: Any = {"packets": packets, "threshold": threshold, "energy": energy}
-            opacities = [each.opacity for each in self.materials]
+            self.threshold.require_photons(self.materials)
             if levels is None:
-                levels = max(template_levels(each, **growth) for each in self.materials)
-            if is_traced(opacities):
-                available = packets * (2**levels - 1)
-            else:
-                available = max(photons_above(each, **growth) for each in self.materials)
-        self.growth = (packets, threshold, energy, levels)
+                levels = max(map(self.threshold.levels, self.materials))
+            opacities = [each.opacity for each in self.materials]
+            available = self.threshold.capacity(levels)
+            if not is_traced(opacities):
+                available = min(available, max(map(self.threshold.photons, self.materials)))
+        self.levels = levels
         self.photons = available if photons is None else min(available, integer("photons", photons, 1))
 
     def grown(self, *, blend: bool) -> ScattererTemplate:
         """The templates that are used, of shape (materials, templates or 1, photons)."""
-        packets, threshold, energy, levels = self.growth
+        ends = self.threshold
+        count = self.templates if blend or self.choice == "pixel" else 1
         if self.given is not None:
-            templates = self.given
+            templates = jax.tree.map(lambda leaf: leaf[:, :count], self.given)
         else:
             templates = scatterer_templates(
                 self.materials,
                 self.seed,
-                count=self.templates,
-                packets=packets,
-                threshold=threshold,
-                energy=energy,
+                count=count,
+                packets=ends.packets,
+                threshold=ends.value,
+                threshold_on=ends.on,
+                energy=ends.energy,
                 critical_angle=self.critical_angle,
-                levels=levels,
+                levels=self.levels,
             )
-            if energy == "conserving":  # restores the energy that the threshold has cut off
+            if ends.energy == "conserving":  # restores the energy that the threshold has cut off
                 templates = templates.normalized()
         if blend:
             templates = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
-        return templates.brightest(self.photons * (self.templates if blend else 1))
+        return templates.brightest(self.photons * (count if blend else 1))
 
     @property
     def smooth(self) -> Lighting:
@@ -260,9 +247,9 @@ class ScattererTemplates(Lighting):
 
     def _with(self, **changes: Any) -> "ScattererTemplates":
         """This lighting with other options."""
-        packets, threshold, energy, levels = self.growth
         own = {
             "templates": self.templates,
+            "choice": self.choice,
             "blend": self.blend,
             "photons": self.photons,
             "occlusion": self.occlusion,
@@ -270,11 +257,12 @@ class ScattererTemplates(Lighting):
             "cutoff": 0.0 if self.cutoff is None else self.cutoff,
             "seed": self.seed,
             "baked": self.baked or False,
-            "packets": packets,
-            "threshold": threshold,
-            "energy": energy,
+            "packets": self.threshold.packets,
+            "threshold": self.threshold.value,
+            "threshold_on": self.threshold.on,
+            "energy": self.threshold.energy,
             "critical_angle": self.critical_angle,
-            "levels": levels,
+            "levels": self.levels or None,
             "given": self.given,
         }
         return ScattererTemplates(self.materials, self.lights, **(own | changes))
@@ -299,15 +287,19 @@ class ScattererTemplates(Lighting):
     def shading(self, around: Surroundings) -> Shading:
         if self.baked:
             return _baked(self, around).shading(around)
-        return TemplateShading(self, self.grown(blend=self.blend), self._optics, self.cutoff)
+        return self._shading(blend=self.blend, cutoff=self.cutoff)
 
-    @property
-    def _optics(self) -> Optics:
-        return jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
+    def _shading(self, *, blend: bool, cutoff: Float[Array, ""] | None) -> TemplateShading:
+        optics: Optics = jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
+        return TemplateShading(
+            *(self.materials, self.lights, self.grown(blend=blend), optics, cutoff),
+            *(self.templates if blend else 1, self.given is not None),
+            *(self.occlusion, self.reach, self.seed),
+        )
 
     def _bake(self, around: Surroundings) -> BakedLighting:
         nodes = nodes_for(around.volume, self.baked)  # checks the memory before templates are grown
-        return bake(TemplateShading(self, self.grown(blend=True), self._optics, None), around, nodes)
+        return bake(self._shading(blend=True, cutoff=None), around, nodes)
 
 
 def _bake_cache(_: Array) -> dict[Any, Any]:
@@ -323,146 +315,3 @@ def _same(a: Any, b: Any) -> bool:
 @eqx.filter_jit
 def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
     return lighting._bake(around)
-
-
-class _Shared(NamedTuple):
-    """What is common to all photons of a sample."""
-
-    shares: tuple[Scalar, ...]
-    parts: tuple[Scalar, ...]
-    """The shares, normalized to sum to 1 if any is above 0."""
-    optics: Optics
-    template: Int[Array, ""]
-    lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
-    """For each light: direction to it, distance and irradiance. Direction None: from all sides."""
-
-
-class TemplateShading(Shading):
-    """Templates prepared for one image."""
-
-    how: ScattererTemplates
-    templates: ScattererTemplate
-    optics: Optics
-    cutoff: Float[Array, ""] | None
-
-    @property
-    def terms(self) -> int:
-        return self.templates.intensity.shape[-1]
-
-    @property
-    def _soft(self) -> bool:
-        return self.how.occlusion == "soft"
-
-    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        edge = EDGE if self._soft else 0.0
-        return shares(self.how.materials, around.volume, coordinate, value, edge=edge)
-
-    def about(self, around: Surroundings, sample: Sample) -> _Shared:
-        material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
-        choice = jnp.zeros((), jnp.int32)
-        if (count := self.templates.intensity.shape[1]) > 1:
-            u, _, _ = hashed_uniforms(*sample.pixel, jnp.uint32(self.how.seed), jnp.float32)
-            choice = (u * count).astype(jnp.int32)
-        lights = []
-        for light in self.how.lights:
-            if isinstance(light, ConstantLight):
-                r, g, b = (jnp.pi * radiance for radiance in light.radiance)
-                lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
-            elif isinstance(light, LocatedLight):
-                lights.append(tuple(light.at(sample.point)))
-        total = sum(material_shares)
-        parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
-        default = Optics(*(jnp.ones_like(total),) * 3)
-        return _Shared(material_shares, parts, _blend(self.optics, parts, default), choice, tuple(lights))
-
-    def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
-        offset, intensity = self._photon(shared, number)
-        if self.cutoff is not None:
-            unblended = intensity * (self.how.templates if self.how.blend else 1)
-            intensity = jnp.where(sample.transmittance * unblended < self.cutoff, 0, intensity)
-        at_photon = around.at(_beside(sample, offset))
-        shares = self._shares(around, at_photon.coordinate, at_photon.value)
-        shares = tuple(at_photon.inside * share for share in shares)
-        optics, scale = _blend(self.optics, shares, shared.optics), intensity
-        if len(self.how.materials) > 1:
-            # refraction into another material stretches the template by the ratio of the speeds of light
-            speed_ratio = shared.optics.refractive_index / optics.refractive_index
-            x, y, z = offset
-            offset = x * speed_ratio, y * speed_ratio, z * speed_ratio
-            at_photon = around.at(_beside(sample, offset))
-            own = shared.optics.opacity
-            scale = intensity * jnp.where(own == 0, 0, optics.opacity / jnp.where(own == 0, 1, own))
-        if self._soft:  # the opacity of one mean free path there
-            matter = -jnp.expm1(-at_photon.extinction * optics.mean_free_path)
-        else:
-            matter = step(at_photon.extinction, 0.0)
-        r, g, b = (scale * sum(shares) * matter * c for c in at_photon.color)
-
-        seen = intensity * self._visible(around, sample, offset, at_photon.extinction)
-        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
-        return brightness, (r, g, b)
-
-    def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
-        brightness, inner = sums
-        # 1 from a material's soft edge inwards: an unlit part of the colour would look like emission
-        matter = jnp.minimum(2 * sum(shared.shares), 1)
-        scale = matter * WHITE * shared.optics.reflectance
-        red, green, blue = (
-            c * (1 - matter)
-            + scale
-            * (c + s)
-            * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, shared.lights, strict=True))
-            for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
-        )
-        return red, green, blue
-
-    def _photon(self, shared: _Shared, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
-        """Offset and intensity of a photon of the sample's material, or of several blended by their parts."""
-        x = y = z = intensity = jnp.zeros_like(shared.parts[0])
-        for m, part in enumerate(shared.parts):
-            offset = self.templates.offset[m, shared.template, number]
-            intensity = intensity + part * self.templates.intensity[m, shared.template, number]
-            x, y, z = x + part * offset[0], y + part * offset[1], z + part * offset[2]
-        return (x, y, z), intensity
-
-    def _visible(self, around: Surroundings, sample: Sample, offset: Vec3, first: Scalar) -> Scalar:
-        """Visibility of a photon from the sample; `first` is the extinction at the photon itself."""
-        further = [around.extinction(_beside(sample, offset, k)) for k in self.how.reach]
-        extinctions = [first, *further]
-        if not self._soft:
-            clear = (1 - step(extinction, 0.0) for extinction in extinctions)
-            return functools.reduce(jnp.multiply, clear)
-        pieces = np.diff([0.0, 1.0, *self.how.reach])
-        depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
-        return jnp.exp(-depth * _norm(offset))
-
-    def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
-        """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
-        if toward is None:
-            return jnp.ones_like(offset[0])
-        length = _norm(offset)
-        closer = sum(p * d for p, d in zip(offset, toward, strict=True))
-        # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
-        near = closer - length**2 / (2 * distance)
-        if not self._soft:
-            return step(near, 0.0)
-        return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
-
-
-def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
-    return along(sample.point, offset, jnp.full_like(offset[0], times))
-
-
-def _norm(offset: Vec3) -> Scalar:
-    x, y, z = offset
-    return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, jnp.finfo(x.dtype).tiny ** 0.5))
-
-
-def _blend(optics: Optics, shares: tuple[Scalar, ...], rest: Optics) -> Optics:
-    """Optics averaged over the materials at a point, weighted by their shares; `rest` fills up to 1."""
-    remaining = 1 - sum(shares)
-    blended = (
-        sum(share * each[m] for m, share in enumerate(shares)) + remaining * other
-        for each, other in zip(optics, rest, strict=True)
-    )
-    return Optics(*blended)

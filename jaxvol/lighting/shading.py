@@ -1,26 +1,30 @@
 """How is a classified sample shaded? The interface of lightings.
 
 Shading comes between the transfer function and compositing. A user passes a `Lighting`; it makes a `Shading`
-for each image; and engines call `shade_sample`, which adds up terms for points around a sample, one by one.
+for each image, which adds up terms for points around a sample, one by one; and engines call the `Shader`.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._util.sharding import varying
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
-from .._util.voxel_fetch import Recording
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
 from ..transfer import Classification, Measured, Transfer, classification_of
-from ..volume import Volume, with_fetch
+from ..volume import Volume
+
+
+T = TypeVar("T")
 
 
 class Sample(NamedTuple):
@@ -66,32 +70,29 @@ class Surroundings(eqx.Module):
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
 
-    def at(self, point: Vec3) -> ClassifiedPoint:
-        """What is at a world point."""
-        inside, coordinate, measured = self._measured(point)
+    def in_memory_by(self, live: Bool[Array, ""]) -> "Surroundings":
+        """The same, with what is `stored` put in memory."""
+        return Surroundings(self.volume, self.transfer, self.space, live)
 
-        def found(measured: Measured) -> tuple[Vec3, Scalar]:
-            return self.transfer.classification(self.volume).classify(measured)
+    def stored(self, f: Callable[[], T]) -> T:
+        """`f()`, computed once for all its uses."""
+        return f() if self.live is None else in_memory(self.live, f)
 
-        color, extinction = self._in_memory(found, measured)
-        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
-
-    def extinction(self, point: Vec3) -> Scalar:
-        """The extinction at a world point."""
-        inside, _, measured = self._measured(point)
-        return inside * self.transfer.classification(self.volume).classify(measured)[1]
-
-    def _measured(self, point: Vec3) -> tuple[Scalar, Vec3, Measured]:
-        coordinate = self.space.coordinate(point)
+    def fetched(self, points: list[Vec3]) -> list[Measured]:
+        """What the transfer function reads at world points."""
         classification = self.transfer.classification(self.volume)
+        return [classification.at(self.space.coordinate(point)) for point in points]
+
+    def classified(self, point: Vec3, measured: Measured) -> ClassifiedPoint:
+        """What is at a world point, from what was fetched there."""
+        coordinate = self.space.coordinate(point)
         x, y, z = (
             jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
-        return x * y * z, coordinate, self._in_memory(classification.at, coordinate)
-
-    def _in_memory(self, f: Callable[[Any], Any], argument: Any) -> Any:
-        return f(argument) if self.live is None else in_memory(self.live, f, argument)
+        inside = x * y * z
+        color, extinction = self.transfer.classification(self.volume).classify(measured)
+        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
 
 
 class Shading(eqx.Module):
@@ -105,6 +106,20 @@ class Shading(eqx.Module):
     def terms(self) -> int:
         """The number of terms."""
         return 0
+
+    def thresholds(self, *, derivative: bool = False) -> Float[Array, " terms"]:
+        """For each term, the transmittance below which neither it nor any after it adds anything to a sample;
+        or, for the `derivative`, to any of its parts. They increase. By default all terms are needed."""
+        return jnp.zeros(self.terms)
+
+    @property
+    def has_dark_samples(self) -> bool:
+        """Whether behind little transmittance a sample may need no term at all. Its colour is then `dark`."""
+        return False
+
+    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
+        """The colour of a sample without any terms."""
+        return sample.color
 
     @abstractmethod
     def about(self, around: Surroundings, sample: Sample) -> PyTree:
@@ -175,35 +190,89 @@ def lit_classification(
     if lighting is None:
         return classification
     around = Surroundings(volume, transfer, space)
-    shading = lighting.shading(around)
-    return classification._replace(light=lambda sample: shade_sample(shading, around, sample)[0])
+    return classification._replace(light=Shader(lighting.shading(around), around))
 
 
-def shade_sample(
-    shading: Shading, around: Surroundings, sample: Sample, perturbations: Any = None
-) -> tuple[Vec3, Any]:
-    """The shaded colour of a sample, and the first voxels of the cubes that its terms fetched.
+class Shader(NamedTuple):
+    """What shades the samples of an image."""
 
-    `perturbations`: None, and then no voxels are returned; or, for a gradient of the voxels, those of
-    `Recording`. Perturbations and voxels are arrays with a leading axis over the terms."""
+    shading: Shading
+    around: Surroundings
+
+    @property
+    def leaves(self) -> PyTree:
+        """All that has a gradient, except the transfer function and the voxels."""
+        return self.shading, self.around.space
+
+    def __call__(self, sample: Sample) -> Vec3:
+        """The shaded colour of a sample, or those of many along one axis."""
+        shade = shade_sample if sample.extinction.ndim == 0 else shade_samples
+        return shade(self.shading, self.around, sample)
+
+
+def shade_sample(shading: Shading, around: Surroundings, sample: Sample) -> Vec3:
+    """The shaded colour of a sample."""
     shared = shading.about(around, sample)
+    return shading.color(sample, shared, _all_terms(shading, around, sample, shared))
+
+
+def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: PyTree) -> PyTree:
+    """The sums of a sample's terms; None where there are none."""
+    if shading.terms == 0:
+        return None
 
     # The backward pass computes each term again, so that memory holds the intermediate values of one term,
     # not of all.
     @jax.checkpoint
-    def one(sums: PyTree, each: tuple[Int[Array, ""], Any]) -> tuple[PyTree, Any]:
-        number, perturbations = each
-        volume, live, bases = around.volume, number >= 0, None
-        if perturbations is not None:
-            bases, live = [], None
-            volume = with_fetch(volume, Recording(perturbations, bases))
-        here = Surroundings(volume, around.transfer, around.space, live)
-        added = shading.term(here, sample, shared, number)
-        return jax.tree.map(jnp.add, sums, added), bases
+    def add(sums: PyTree, number: Int[Array, ""]) -> tuple[PyTree, None]:
+        added = shading.term(around.in_memory_by(number >= 0), sample, shared, number)
+        return jax.tree.map(jnp.add, sums, added), None
 
+    term = partial(shading.term, around, sample, shared)
+    return jax.lax.scan(add, zeros_like_result(term), jnp.arange(shading.terms))[0]
+
+
+def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
+    """The shaded colours of samples along one axis. Terms that none of them needs are left out."""
+    shared = jax.vmap(partial(shading.about, around))(samples)
+    sums = needed_terms(shading, around, samples, shared)
+    return jax.vmap(shading.color)(samples, shared, sums)
+
+
+@eqx.filter_custom_jvp
+def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
+    """The sums of the terms that any of these samples needs; None where there are none. Their derivative is
+    that of all terms: a term of 0 may have one, and JAX cannot differentiate this loop in reverse."""
     if shading.terms == 0:
-        return shading.color(sample, shared, None), None if perturbations is None else []
-    term = jax.eval_shape(lambda: shading.term(around, sample, shared, jnp.zeros((), jnp.int32)))
-    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), term)
-    sums, bases = jax.lax.scan(one, none, (jnp.arange(shading.terms), perturbations))
-    return shading.color(sample, shared, sums), bases
+        return None
+
+    def terms(number: Int[Array, ""]) -> PyTree:
+        here = around.in_memory_by(number >= 0)
+        return jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))(samples, shared, number)
+
+    def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
+        return jax.tree.map(jnp.add, sums, terms(number))
+
+    needed = terms_above(shading.thresholds(), samples.transmittance)
+    return jax.lax.fori_loop(0, needed, add, varying(zeros_like_result(terms), samples))
+
+
+@needed_terms.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    def all_(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
+        return jax.vmap(partial(_all_terms, shading, around))(samples, shared)
+
+    return eqx.filter_jvp(all_, primals, tangents)
+
+
+def terms_above(
+    thresholds: Float[Array, " terms"], transmittance: Float[Array, " samples"]
+) -> Int[Array, ""]:
+    """How many terms, from the first one on, any of these samples needs. Of NaN, all."""
+    return jnp.sum(~(jnp.max(transmittance) < thresholds), dtype=jnp.int32)
+
+
+def zeros_like_result(of_number: Callable[[Int[Array, ""]], PyTree]) -> PyTree:
+    """Zeros of the shapes of what a function of a term's number returns."""
+    shapes = jax.eval_shape(of_number, jnp.zeros((), jnp.int32))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

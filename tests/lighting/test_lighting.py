@@ -72,7 +72,7 @@ def lit_points(lighting, volume, transfer, points, pixels, transmittance):
     shading = lighting.shading(around)
 
     def one(point, pixel):
-        return jnp.stack(shade_sample(shading, around, sample_at(around, point, pixel, transmittance))[0])
+        return jnp.stack(shade_sample(shading, around, sample_at(around, point, pixel, transmittance)))
 
     return jax.vmap(one)(points, pixels)
 
@@ -944,7 +944,7 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
 
         def one(point, color, pixel):
             sample = sample_at(around, point, pixel, 1.0)._replace(color=apart(color))
-            return jnp.stack(shade_sample(shading, around, sample)[0])
+            return jnp.stack(shade_sample(shading, around, sample))
 
         return jax.vmap(one)(points, colors, pixels)
 

@@ -22,7 +22,8 @@ from jaxvol.lighting import (
 )
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import PRESETS, materials_of
-from jaxvol.lighting.template import FADES, _merged, photons_above, template_levels
+from jaxvol.lighting.merging import merged
+from jaxvol.lighting.threshold import FADES, Threshold
 
 from ..scenes import in_float64
 
@@ -67,7 +68,7 @@ def simulated_total(opacity, *, packets, threshold, index, templates=20_000):
 @pytest.fixture(scope="module")
 def grown():
     """Energy-conserving templates: (opacities, templates, photons)."""
-    levels = max(template_levels(Material(a, 1.0)) for a in OPACITIES)
+    levels = max(Threshold().levels(Material(a, 1.0)) for a in OPACITIES)
 
     def one(opacity, key):
         return scatterer_template(Material(opacity, 1.0, INDEX), key, merge=0, levels=levels)
@@ -93,7 +94,7 @@ def test_photons_are_sorted_brightest_first(grown):
 
 def test_no_template_has_more_photons_than_room_is_made_for(grown):
     for opacity, intensity in zip(OPACITIES, grown.intensity, strict=True):
-        most = photons_above(Material(opacity, 1.0))
+        most = Threshold().photons(Material(opacity, 1.0))
         assert np.sum(np.asarray(intensity) > 0, axis=-1).max() <= most
     assert grown.intensity.shape[-1] <= template_capacity(Material(0.05, 1.0))
 
@@ -212,7 +213,7 @@ def photons(*each):
 
 
 def test_photons_that_coincide_add():
-    found = _merged(
+    found = merged(
         photons(
             ((1.0, 0.0, 0.0), 0.4), ((0.0, 2.0, 0.0), 0.3), ((1.0, 0.0, 0.005), 0.2), ((1.0, 0.0, 0.0), 0.05)
         ),
@@ -222,7 +223,7 @@ def test_photons_that_coincide_add():
 
 
 def test_a_photon_that_joins_one_that_joins_another_is_not_lost():
-    found = _merged(photons(((0.0, 0.0, 0.0), 0.4), ((0.008, 0.0, 0.0), 0.3), ((0.016, 0.0, 0.0), 0.2)), 0.01)
+    found = merged(photons(((0.0, 0.0, 0.0), 0.4), ((0.008, 0.0, 0.0), 0.3), ((0.016, 0.0, 0.0), 0.2)), 0.01)
     np.testing.assert_allclose(found.intensity, [0.9, 0, 0], atol=1e-7)
 
 
@@ -312,7 +313,7 @@ def test_the_brightest_photons_keep_the_energy_of_all(grown):
 
 def test_the_threshold_that_is_advised_keeps_something():
     faint, threshold = Material(0.031, 1.0), 0.00775
-    assert template_levels(faint, threshold=threshold) > 1
+    assert Threshold(value=threshold).levels(faint) > 1
     assert totals(grow(faint, KEY, threshold=threshold, levels=1)) > 0.02
 
 

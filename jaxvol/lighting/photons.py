@@ -1,0 +1,283 @@
+"""What does each photon of a template add to the light of a sample?
+
+Each photon marks a place from which light is scattered to the sample: photons on the lit side that are not
+hidden make the sample bright, photons inside matter add the colour found there.
+
+Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
+volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._util.noise import hashed_uniforms
+from .._util.vec3 import Scalar, Vec3, along, scaled
+from .._util.xla import gather
+from ..transfer import Measured
+from .lights import ConstantLight, Light, LocatedLight
+from .materials import Material, Optics, shares, smoothstep, step
+from .shading import Sample, Shading, Surroundings
+from .template import ScattererTemplate
+
+
+Occlusion = Literal["soft", "hard"]
+
+EDGE = 0.1
+"""With soft occlusion, a material fades in and out over this fraction of its value range."""
+
+LIT_SIDE_COSINE = 0.25
+"""With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
+
+WHITE = 4 / (3 * math.pi)
+"""Factor from irradiance to radiance, by which opaque white matter that absorbs nothing is as bright as the
+light around it. Of the photons around a sample on a flat face, half are outside, where the light comes from,
+and half are inside and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c in light of
+radiance L."""
+
+
+class _Shared(NamedTuple):
+    """What is common to all photons of a sample."""
+
+    shares: tuple[Scalar, ...]
+    parts: tuple[Scalar, ...]
+    """The shares, normalized to sum to 1 if any is above 0."""
+    optics: Optics
+    template: Int[Array, ""] | None
+    """None: there is one for each material."""
+    lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
+    """For each light: direction to it, distance and irradiance. Direction None: from all sides."""
+
+
+class _There(NamedTuple):
+    """At a photon's place: how much its colour counts there, and the mean free path."""
+
+    scale: Scalar
+    mean_free_path: Scalar
+
+
+class _Photon(NamedTuple):
+    """A photon, placed around a sample; and what is `there`, if that is known before its place is fetched."""
+
+    offset: Vec3
+    intensity: Scalar
+    there: _There | None
+
+
+class TemplateShading(Shading):
+    """Templates prepared for one image.
+
+    - `templates`: (materials, templates, photons). Where there are several for a material, each pixel uses
+      one, drawn by `seed`. `blended`: how many were blended into each; their photons are skipped as they
+      would be in their own templates.
+    - `optics`: of the materials.
+    - `cutoff`: None: no photon is skipped.
+    - `given`: whether the templates are a user's own, in which an intensity of 0 may have a derivative. Of
+      those that were grown, a photon that has faded out, and its derivative with it, is 0.
+    """
+
+    materials: tuple[Material, ...]
+    lights: tuple[Light, ...]
+    templates: ScattererTemplate
+    optics: Optics
+    cutoff: Float[Array, ""] | None
+    blended: int = eqx.field(static=True)
+    given: bool = eqx.field(static=True)
+    occlusion: Occlusion = eqx.field(static=True)
+    reach: tuple[float, ...] = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+
+    @property
+    def terms(self) -> int:
+        return self.templates.intensity.shape[-1]
+
+    @property
+    def _soft(self) -> bool:
+        return self.occlusion == "soft"
+
+    def thresholds(self, *, derivative: bool = False) -> Float[Array, " photons"]:
+        intensity = jax.lax.stop_gradient(self.templates.intensity)
+        brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
+        least = jnp.zeros_like(brightest)
+        if self.cutoff is not None:
+            # a little less, so that rounding leaves out no photon that `_photon` does not skip
+            least = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
+        return least if derivative and self.given else jnp.where(brightest <= 0, jnp.inf, least)
+
+    @property
+    def has_dark_samples(self) -> bool:
+        return self.cutoff is not None
+
+    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
+        material = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
+        return scaled(sample.color, 1 - _matter(material))
+
+    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
+        edge = EDGE if self._soft else 0.0
+        return shares(self.materials, around.volume, coordinate, value, edge=edge)
+
+    def about(self, around: Surroundings, sample: Sample) -> _Shared:
+        material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
+        template = None
+        if (count := self.templates.intensity.shape[1]) > 1:
+            u, _, _ = hashed_uniforms(*sample.pixel, jnp.uint32(self.seed), jnp.float32)
+            template = (u * count).astype(jnp.int32)
+        lights = []
+        for light in self.lights:
+            if isinstance(light, ConstantLight):
+                r, g, b = (jnp.pi * radiance for radiance in light.radiance)
+                lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
+            elif isinstance(light, LocatedLight):
+                lights.append(tuple(light.at(sample.point)))
+        total = sum(material_shares)
+        parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
+        default = Optics(*(jnp.ones_like(total),) * 3)
+        return _Shared(material_shares, parts, _blend(self.optics, parts, default), template, tuple(lights))
+
+    def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
+        # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only a
+        # photon that is the same for all samples costs less to compute than to load.
+        def placed() -> _Photon:
+            return self._photon(sample, shared, number)
+
+        photon = placed if shared.template is None and len(self.materials) == 1 else _known(around, placed)
+        if len(self.materials) > 1:
+            first = photon()
+            [there] = around.stored(lambda: around.fetched([_beside(sample, first.offset)]))
+            photon = _known(around, lambda: self._refracted(around, sample, shared, first, there))
+        read = around.stored(lambda: around.fetched(self._places(sample, photon())))
+        seen, shows = around.stored(lambda: self._weights(around, sample, shared, photon(), read))
+        offset = photon().offset
+        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
+        color, _ = around.transfer.classification(around.volume).classify(read[0])
+        return brightness, scaled(color, shows)
+
+    def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
+        brightness, inner = sums
+        matter = _matter(shared.shares)
+        scale = matter * WHITE * shared.optics.reflectance
+        red, green, blue = (
+            c * (1 - matter)
+            + scale
+            * (c + s)
+            * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, shared.lights, strict=True))
+            for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
+        )
+        return red, green, blue
+
+    def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
+        """A photon of the sample's material, or of several blended by their parts; of intensity 0 if it is
+        skipped."""
+
+        def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
+            return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
+
+        x = y = z = intensity = jnp.zeros_like(shared.parts[0])
+        for m, part in enumerate(shared.parts):
+            dx, dy, dz = (of_sample(self.templates.offset[m, :, number, i]) for i in range(3))
+            intensity = intensity + part * of_sample(self.templates.intensity[m, :, number])
+            x, y, z = x + part * dx, y + part * dy, z + part * dz
+        if self.cutoff is not None:
+            skipped = sample.transmittance * intensity * self.blended < self.cutoff
+            intensity = jnp.where(skipped, 0, intensity)
+        return _Photon((x, y, z), intensity, None)
+
+    def _refracted(
+        self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon, read: Measured
+    ) -> _Photon:
+        """The photon, moved by refraction into the material at its place. `read`: what was fetched there."""
+        shares, optics = self._shares_at(around, _beside(sample, photon.offset), read, shared)
+        own = shared.optics
+        # the template is stretched by the ratio of the speeds of light
+        offset = scaled(photon.offset, own.refractive_index / optics.refractive_index)
+        ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
+        scale = jnp.where(own.opacity == 0, 0, ratio)
+        return _Photon(offset, photon.intensity, _There(scale * sum(shares), optics.mean_free_path))
+
+    def _places(self, sample: Sample, photon: _Photon) -> list[Vec3]:
+        """Where a photon lies, and where else it is tested for occlusion."""
+        return [_beside(sample, photon.offset, times) for times in (1.0, *self.reach)]
+
+    def _weights(
+        self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon, read: list[Measured]
+    ) -> tuple[Scalar, Scalar]:
+        """How much of a photon is seen, and how much the colour at its place counts. `read`: what was fetched
+        at `_places`."""
+        places = self._places(sample, photon)
+        extinctions = [around.classified(*each).extinction for each in zip(places, read, strict=True)]
+        there = photon.there
+        if there is None:
+            shares, optics = self._shares_at(around, places[0], read[0], shared)
+            there = _There(sum(shares), optics.mean_free_path)
+        if self._soft:  # the opacity of one mean free path there
+            matter = -jnp.expm1(-extinctions[0] * there.mean_free_path)
+        else:
+            matter = step(extinctions[0], 0.0)
+        visible = self._visible(photon.offset, extinctions)
+        return photon.intensity * visible, photon.intensity * there.scale * matter
+
+    def _shares_at(
+        self, around: Surroundings, place: Vec3, read: Measured, shared: _Shared
+    ) -> tuple[tuple[Scalar, ...], Optics]:
+        """Shares of the materials at a place, and their optics; outside of all materials the sample's."""
+        there = around.classified(place, read)
+        found = self._shares(around, there.coordinate, there.value)
+        found = tuple(there.inside * share for share in found)
+        return found, _blend(self.optics, found, shared.optics)
+
+    def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
+        """Visibility of a photon from the sample, from the extinctions at `_places`."""
+        if not self._soft:
+            return 1 - step(sum(extinctions), 0.0)
+        pieces = np.diff([0.0, 1.0, *self.reach])
+        depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
+        return jnp.exp(-depth * _norm(offset))
+
+    def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
+        """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
+        if toward is None:
+            return jnp.ones_like(offset[0])
+        length = _norm(offset)
+        closer = sum(p * d for p, d in zip(offset, toward, strict=True))
+        # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
+        near = closer - length**2 / (2 * distance)
+        if not self._soft:
+            return step(near, 0.0)
+        return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
+
+
+def _known(around: Surroundings, f: Callable[[], _Photon]) -> Callable[[], _Photon]:
+    """A function that returns what `f` returns, which is computed and stored once."""
+    found = around.stored(f)
+    return lambda: found
+
+
+def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
+    return along(sample.point, offset, jnp.full_like(offset[0], times))
+
+
+def _matter(shares: tuple[Scalar, ...]) -> Scalar:
+    """How far a sample is in any material: 1 from a material's soft edge inwards, since an unlit part of its
+    colour would look like emission."""
+    return jnp.minimum(2 * sum(shares), 1)
+
+
+def _norm(offset: Vec3) -> Scalar:
+    x, y, z = offset
+    return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, jnp.finfo(x.dtype).tiny ** 0.5))
+
+
+def _blend(optics: Optics, shares: tuple[Scalar, ...], rest: Optics) -> Optics:
+    """Optics averaged over the materials at a point, weighted by their shares; `rest` fills up to 1."""
+    remaining = 1 - sum(shares)
+    blended = (
+        sum(share * each[m] for m, share in enumerate(shares)) + remaining * other
+        for each, other in zip(optics, rest, strict=True)
+    )
+    return Optics(*blended)
