@@ -185,7 +185,8 @@ class Affine(Space):
         return slab_interval(origin, direction, self.low, self.high)
 
     def coordinate(self, point: Vec3) -> Vec3:
-        x, y, z = ((p - low) / step for p, low, step in zip(point, self.low, self.spacing, strict=True))
+        # times the reciprocal, since XLA stores quotients of which there is more than one use
+        x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
 
     def point(self, coordinate: Vec3) -> Vec3:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
 from .._util.checks import check_answer
+from ..lighting.shading import Lighting
 from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
@@ -16,7 +17,7 @@ from ..transfer import classification_of
 from ..variation import Windows
 from ..volume import Volume
 from .batch import Beams
-from .packing import with_words, words_of
+from .packing import slopes_of, with_words, words_of
 from .rays import OwnRays, RayTiles, lines, vmap_rays
 from .scene import Scene
 from .tiling import Tiling
@@ -24,25 +25,27 @@ from .wavefront import march_rays
 
 
 class VolumeAcceleration(eqx.Module):
-    """What depends on the voxels alone: a packed copy for fetching, the ranges of blocks, and how values vary
-    around them; None where the march has no use for it. Made once for an array of voxels, and anew for
-    another one."""
+    """What depends on the voxels alone: a packed copy for fetching, the slopes of nodes, the ranges of blocks,
+    and how values vary around them; None where the image has no use for it. Made once for an array of voxels,
+    and anew for another one."""
 
     words: UInt32[Array, " voxels"] | None
+    slopes: UInt32[Array, " voxels"] | None
     blocks: Blocks | None
     windows: Windows | None
 
     @classmethod
-    def of(cls, volume: Volume, march: March) -> "VolumeAcceleration":
+    def of(cls, volume: Volume, march: March, lighting: Lighting | None = None) -> "VolumeAcceleration":
         return cls(
             words_of(volume),
+            slopes_of(volume) if lighting is not None and lighting.reads_gradient else None,
             Blocks.of(volume) if march.leaps else None,
             Windows.of(volume) if march.looks_ahead else None,
         )
 
     def packed(self, scene: Scene) -> Scene:
         """The scene, with voxels fetched from their packed copy."""
-        return scene._replace(volume=with_words(scene.volume, self.words))
+        return scene._replace(volume=with_words(scene.volume, self.words, self.slopes))
 
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:

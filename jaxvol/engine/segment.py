@@ -25,6 +25,7 @@ from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..selection import Selection
 from ..space import Ray
 from ..transfer import Classification, Measured
+from .inline_shading import inline_shader, light_term, lit_color
 from .tiling import Tiling
 from .visible_samples import shaded_colors
 
@@ -37,11 +38,12 @@ def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, arrays (cells, rays). Cells
-    that a ray does not take are placed beyond its exit."""
+    that a ray does not take are placed beyond its exit. `light`: the terms of shading that is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
     opacity: list[Scalar]
+    light: list[PyTree] | None = None
 
     @property
     def number(self) -> int:
@@ -100,6 +102,11 @@ def march_segment(
         colors, values = [None] * len(every.cells), every.measured
     elif classification.light is None:
         colors = _colors(pipeline, at, every.measured)
+    elif (shader := inline_shader(pipeline)) is not None:
+        assert every.light is not None
+        lit = vmap_cells(partial(lit_color, shader, pipeline), (False, True, True, True))
+        parts = every.cells, _colors(pipeline, at, every.measured), every.light
+        colors = [lit(ray, *piece) for piece in zip(*parts, strict=True)]
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
@@ -162,7 +169,13 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
     else:
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
-    return Samples(list(cells(at, given)), values, alphas)
+    shader, light = inline_shader(pipeline), None
+    if shader is not None:
+        term = vmap_cells(partial(light_term, shader, pipeline), (False, True))
+        light = in_memory(
+            live, lambda at, given: [term(ray, piece) for piece in cells(at, given)], at, given
+        )
+    return Samples(list(cells(at, given)), values, alphas, light)
 
 
 def always(at: Progress) -> Bool[Array, ""]:
@@ -253,4 +266,4 @@ def _without(samples: Samples, taken: Int[Array, " rays"], ray: Ray) -> Samples:
         for cell in samples.cells
     ]
     opacity = [jnp.where(takes, alpha, 0) for alpha in samples.opacity]
-    return Samples(cells, samples.measured, opacity)
+    return samples._replace(cells=cells, opacity=opacity)

@@ -49,6 +49,10 @@ class Deferred(Lighting):
         self.lighting = lighting
 
     @property
+    def reads_gradient(self) -> bool:
+        return self.lighting.reads_gradient
+
+    @property
     def smooth(self) -> Lighting:
         return self.lighting.smooth
 

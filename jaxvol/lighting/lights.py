@@ -97,6 +97,23 @@ class PointLight(LocatedLight):
         return Arriving((dx / distance, dy / distance, dz / distance), distance, (r, g, b))
 
 
+class HeadLight(Light):
+    """A light at the camera: each ray brings its own parallel light, which travels along it. (VTK's fixed-point
+    ray caster lets it travel along the camera's axis, on all rays.) For `Phong`.
+
+    **Arguments:**
+
+    - `irradiance`: (3,) linear RGB, power per area on a plane that faces the ray, ≥ 0.
+
+    **Raises:** `ValueError` for another shape, NaN or infinity, and negative irradiance.
+    """
+
+    irradiance: Float[Array, "3"]
+
+    def __init__(self, irradiance: Arrayable = (1.0, 1.0, 1.0)):
+        self.irradiance = _power("irradiance", irradiance)
+
+
 class ConstantLight(Light):
     """The same radiance from all directions, as in a white room or under an overcast sky.
 
@@ -113,15 +130,23 @@ class ConstantLight(Light):
         self.radiance = _power("radiance", radiance)
 
 
-def lights_of(lights: Light | tuple[Light, ...] | Any) -> tuple[Light, ...]:
-    """One or several lights as a tuple. **Raises** `ValueError` for no lights and for other objects."""
+def lights_of(
+    lights: Light | tuple[Light, ...] | Any,
+    kinds: tuple[type[Light], ...] = (LocatedLight, ConstantLight),
+) -> tuple[Light, ...]:
+    """One or several lights of some kinds, as a tuple. **Raises** `ValueError` for no lights and for other
+    objects."""
     several = (lights,) if isinstance(lights, Light) else lights
     if not isinstance(several, tuple | list) or not several:
         raise ValueError(f"lights must be a light or a tuple of lights; got {lights!r}.")
     for light in several:
-        if not isinstance(light, LocatedLight | ConstantLight):
-            raise ValueError(f"lights must hold jaxvol lights, such as DirectionalLight; got {light!r}.")
+        if not isinstance(light, kinds):
+            known = ", ".join(each.__name__ for each in CLASSES if issubclass(each, kinds))
+            raise ValueError(f"lights must hold jaxvol lights, here {known}; got {light!r}.")
     return tuple(several)
+
+
+CLASSES = (DirectionalLight, PointLight, HeadLight, ConstantLight)
 
 
 def _power(name: str, value: Arrayable) -> Float[Array, "3"]:

@@ -107,6 +107,14 @@ class Shading(eqx.Module):
         """The number of terms."""
         return 0
 
+    @property
+    def inline(self) -> bool:
+        """Whether all samples are shaded where they are, visible or not, since that takes less time than to
+        gather those that are visible. For shading by one term that is nearly all of its work. `about` and
+        `term` are told where the sample is, `color` also its colour; all else is as for a sample that nothing
+        hides."""
+        return False
+
     def thresholds(self, *, derivative: bool = False) -> Float[Array, " terms"]:
         """For each term, the transmittance below which neither it nor any after it adds anything to a sample;
         or, for the `derivative`, to any of its parts. They increase. By default all terms are needed."""
@@ -141,6 +149,11 @@ class Lighting(eqx.Module):
     def shades_pixels(self) -> bool:
         """Whether rays are marched without light, and `shade_pixel` is called once for each of them."""
         return type(self).shade_pixel is not Lighting.shade_pixel
+
+    @property
+    def reads_gradient(self) -> bool:
+        """Whether samples read the volume's gradient, so that it is worth storing slopes. By default not."""
+        return False
 
     @abstractmethod
     def shading(self, around: Surroundings) -> Shading:
