@@ -104,11 +104,14 @@ def prepare(
     step: float,
     threads: int | None = None,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    shade: jv.lighting.Phong | None = None,
 ) -> Drawn:
     """A scene in VTK, drawn once.
 
     - `step`: world length between samples.
     - `threads`: number of threads that cast rays; by default one for each core.
+    - `shade`: with these coefficients, under a head light. VTK shades nodes, by their own gradients, and
+      interpolates what that gives.
     """
     import vtk
     from vtkmodules.util.numpy_support import numpy_to_vtk
@@ -136,6 +139,13 @@ def prepare(
     look.SetScalarOpacityUnitDistance(step)
     look.SetInterpolationTypeToLinear()
     look.ShadeOff()
+    if shade is not None:
+        look.ShadeOn()
+        look.SetAmbient(float(shade.ambient))
+        look.SetDiffuse(float(shade.diffuse))
+        look.SetSpecular(float(shade.specular))
+        # (n·h)^4p, which is what VTK computes, is nearly (r·v)^p
+        look.SetSpecularPower(4 * float(shade.specular_power))
     look.DisableGradientOpacityOn()
 
     mapper = vtk.vtkFixedPointVolumeRayCastMapper()

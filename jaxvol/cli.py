@@ -20,6 +20,7 @@ from .display import image_file, save_image
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
 from .isosurface import Isosurface
+from .lighting import Lighting, Phong
 from .march import March, Transform
 from .modes import MODES, Mode, compositing_of
 from .phantoms import phantom
@@ -249,6 +250,12 @@ def _view_options() -> argparse.ArgumentParser:
         "--isovalue", type=float, metavar="VALUE", help="with --compositing isosurface: the value on it"
     )
 
+    appearance.add_argument(
+        "--shade",
+        action="store_true",
+        help="shade by the gradient of the values, under a light at the camera",
+    )
+
     camera = view.add_argument_group("camera")
     camera.add_argument(
         "--camera",
@@ -372,10 +379,12 @@ def _render(options: argparse.Namespace) -> None:
     mode = _mode(options)
     volume, transfer, camera = _view(options)
     background = None if options.transparent else options.background
-    volume, march = _march(options, volume, transfer, camera, _clip(options), mode)
+    lighting = _lighting(options)
+    volume, march, lighting = _march(options, volume, transfer, camera, _clip(options), mode, lighting)
     _picture(
         *(volume, transfer, camera, march, options.output),
         compositing=mode,
+        lighting=lighting,
         background=background,
         depth=options.depth,
     )
@@ -384,8 +393,12 @@ def _render(options: argparse.Namespace) -> None:
 def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
-    mode = _mode(options)
-    print(plan(*_view(options), _tolerance(options), transforms=_clip(options), compositing=mode))
+    how = {"transforms": _clip(options), "compositing": _mode(options), "lighting": _lighting(options)}
+    print(plan(*_view(options), _tolerance(options), **how))
+
+
+def _lighting(options: argparse.Namespace) -> Lighting | None:
+    return Phong() if options.shade else None
 
 
 def _mode(options: argparse.Namespace) -> Compositing[Any]:
@@ -430,17 +443,19 @@ def _march(
     camera: Camera,
     clip: tuple[Transform, ...],
     mode: Compositing[Any],
-) -> tuple[Volume, March]:
-    """The volume and its march: of the given step; without one, as planned."""
+    lighting: Lighting | None,
+) -> tuple[Volume, March, Lighting | None]:
+    """The volume, its march and its light: with the given step; without one, as planned."""
     if options.step is None:
         scene = volume, transfer, camera
-        found = plan(*scene, _tolerance(options), transforms=clip, compositing=mode)
+        how = {"transforms": clip, "compositing": mode, "lighting": lighting}
+        found = plan(*scene, _tolerance(options), **how)
         if not found.within:
             print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
-        return found.volume, found.march
+        return found.volume, found.march, found.lighting
     if options.tolerance is not None:
         raise ValueError("--tolerance finds a step; leave out --step.")
-    return volume, March(options.step, (*clip, *FAST), "midpoint")
+    return volume, March(options.step, (*clip, *FAST), "midpoint"), lighting
 
 
 def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:
@@ -507,12 +522,14 @@ def _picture(
     output: Path,
     *,
     compositing: Compositing[Any] | Mode = "over",
+    lighting: Lighting | None = None,
     background: Sequence[float] | None = (1, 1, 1),
     depth: Path | None = None,
 ) -> None:
     """Render to files, with opacity if there is no background; print their paths and the time taken."""
     begun = time.perf_counter()
-    rendering = jax.block_until_ready(render(volume, transfer, camera, march, compositing=compositing))
+    how = {"compositing": compositing, "lighting": lighting}
+    rendering = jax.block_until_ready(render(volume, transfer, camera, march, **how))
     took = time.perf_counter() - begun
     path = save_image(output, rendering.rgba if background is None else rendering.image(background))
     device = jax.devices()[0]

@@ -16,10 +16,12 @@ import pytest
 
 import jaxvol as jv
 from experiments import peer_vtk
+from jaxvol.lighting import DirectionalLight, Phong
 
 
 BACKGROUND = (0.2, 0.4, 0.6)  # 51, 102 and 153 of 255: exact, and different in each channel
 AGREED = 2 / 255
+SHADED_AGREED = 3 / 255
 STEP = 0.5  # voxels
 
 
@@ -86,17 +88,20 @@ SCENES: dict[str, Callable[[Callable], Scene]] = {
 }
 
 
-def drawn_by_vtk(scene: Scene) -> tuple[np.ndarray, Any]:
+def drawn_by_vtk(scene: Scene, shade: Phong | None = None) -> tuple[np.ndarray, Any]:
     """VTK's image over the background, (height, width, 3) in [0, 1], top row first, and its mapper."""
     drawn = peer_vtk.prepare(
-        scene.volume, scene.transfer, scene.camera, STEP * scene.voxel, background=BACKGROUND
+        *(scene.volume, scene.transfer, scene.camera, STEP * scene.voxel),
+        background=BACKGROUND,
+        shade=shade,
     )
     return drawn.image(), drawn.mapper
 
 
-def drawn_by_us(scene: Scene, mapper: Any) -> tuple[np.ndarray, np.ndarray]:
+def drawn_by_us(scene: Scene, mapper: Any, lighting: Phong | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Our image over the background as VTK would display it, and a mask of the pixels inside the object."""
-    rendering = jv.render(scene.volume, scene.transfer, scene.camera, jv.March(STEP * scene.voxel))
+    march = jv.March(STEP * scene.voxel)
+    rendering = jv.render(scene.volume, scene.transfer, scene.camera, march, lighting=lighting)
     image, opacity = rendering.image(BACKGROUND), rendering.rgba[..., 3]
     return peer_vtk.as_displayed(np.asarray(image), mapper), np.asarray(opacity) > 0.01
 
@@ -119,6 +124,37 @@ def test_vtk_draws_the_same_picture_to_the_pixel(real_volume, name):
     wrong |= {"upside down": ours[::-1], "mirrored": ours[:, ::-1], "blue for red": ours[..., ::-1]}
     for what, image in wrong.items():
         assert difference(image, theirs, inside) > 3 * right, what
+
+
+def cthead(real_volume: Callable) -> Scene:
+    volume = jv.load(real_volume("cthead_256x256x113_uint16le.raw.gz"), spacing=(1, 1, 2))
+    points = [(700, (0.8, 0.5, 0.4), 0.0), (1000, (0.8, 0.5, 0.4), 0.04), (1150, (0.9, 0.6, 0.5), 0.02)]
+    bones = [(1300, (1.0, 0.95, 0.85), 0.5), (3200, (1.0, 1.0, 1.0), 0.9)]
+    transfer = jv.TransferFunction.from_points(points + bones)
+    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.2), (0, 0, -1), size=(256, 256))
+    return Scene(volume, transfer, camera)
+
+
+@pytest.mark.parametrize("name", ["engine", "cthead"])
+def test_vtk_shades_alike(real_volume, name):
+    """VTK shades nodes, by gradients rounded to some 10 000 directions, and interpolates what that gives; its
+    head light shines along the camera's axis, as here."""
+    scene, phong = (SCENES | {"cthead": cthead})[name](real_volume), Phong()
+    axis = np.asarray(scene.camera.focal_point - scene.camera.position)
+    theirs, mapper = drawn_by_vtk(scene, phong)
+    ours, inside = drawn_by_us(scene, mapper, phong)
+    assert inside.mean() > 0.1
+    right = difference(ours, theirs, inside)
+    assert right < SHADED_AGREED
+    wrong = {
+        "unlit": None,
+        "ambient": Phong(ambient=0.3),
+        "diffuse": Phong(diffuse=0.5),
+        "specular": Phong(specular=0.0),
+        "from above": Phong(DirectionalLight(axis + np.linalg.norm(axis) * np.array([0, 0, 1]))),
+    }
+    for what, lighting in wrong.items():
+        assert difference(drawn_by_us(scene, mapper, lighting)[0], theirs, inside) > 1.5 * right, what
 
 
 PERSPECTIVE, PARALLEL = {"view_angle": 40.0}, {"parallel_scale": 1.1}

@@ -51,6 +51,7 @@ PINS = {
     "lopsided templates": Pin({2.0: 0.738}, {1.0: 1.32}),
     "long mean free paths": Pin({0.5: 0.152}, {2.0: 0.286}),
     "short mean free paths": Pin({0.2: 0.306}, {0.1: 0.39}),
+    "normals in noise": Pin({0.3: 8.3}, {1.0: 26.0}),
     "fits of what images do not show": Pin({0.0: 0.0}, {1.0: 4.0, 2.0: 8.0}),
     "fits from opaque starts": Pin({1e3: 0.0}, {1e4: 0.00344}),
     "fits under noise": Pin({0.003: 0.0167}, {0.03: 0.116}),

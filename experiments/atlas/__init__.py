@@ -1,6 +1,19 @@
 """Where do the methods of jaxvol fail? The entries of the failure atlas, a file for each family of them."""
 
-from . import adaptive, clips, fits, labels, leaping, light, opacity, precision, probe, sampling, surfaces
+from . import (
+    adaptive,
+    clips,
+    fits,
+    labels,
+    leaping,
+    light,
+    normals,
+    opacity,
+    precision,
+    probe,
+    sampling,
+    surfaces,
+)
 from .entry import Entry
 
 
@@ -15,6 +28,7 @@ FAMILIES = {
     "toroidal maps": probe.ENTRIES,
     "isosurfaces": surfaces.ENTRIES,
     "scatterer templates": light.ENTRIES,
+    "shading": normals.ENTRIES,
     "fits": fits.ENTRIES,
 }
 """All entries, by family. A new method joins by a row."""

@@ -25,9 +25,9 @@ from .wavefront import march_rays
 
 
 class VolumeAcceleration(eqx.Module):
-    """What depends on the voxels alone: a packed copy for fetching, the slopes of nodes, the ranges of blocks,
-    and how values vary around them; None where the image has no use for it. Made once for an array of voxels,
-    and anew for another one."""
+    """What depends on the voxels alone: a packed copy for fetching, the slopes of nodes, the ranges of
+    blocks, and how values vary around them; None where the image has no use for it. Made once for an array of
+    voxels, and anew for another one."""
 
     words: UInt32[Array, " voxels"] | None
     slopes: UInt32[Array, " voxels"] | None

@@ -29,9 +29,7 @@ def light_term(shader: Shader, pipeline: Pipeline, ray: Ray, cell: Cell) -> PyTr
     return shading.term(around, sample, shading.about(around, sample), jnp.zeros((), jnp.int32))
 
 
-def lit_color(
-    shader: Shader, pipeline: Pipeline, ray: Ray, cell: Cell, color: Vec3, term: PyTree
-) -> Vec3:
+def lit_color(shader: Shader, pipeline: Pipeline, ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
     """The shaded colour of a sample, from its colour and its term."""
     shading, around = shader
     sample = _sample(pipeline, ray, cell, color)

@@ -172,9 +172,7 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
     shader, light = inline_shader(pipeline), None
     if shader is not None:
         term = vmap_cells(partial(light_term, shader, pipeline), (False, True))
-        light = in_memory(
-            live, lambda at, given: [term(ray, piece) for piece in cells(at, given)], at, given
-        )
+        light = in_memory(live, lambda at, given: [term(ray, piece) for piece in cells(at, given)], at, given)
     return Samples(list(cells(at, given)), values, alphas, light)
 
 

@@ -98,8 +98,8 @@ class PointLight(LocatedLight):
 
 
 class HeadLight(Light):
-    """A light at the camera: each ray brings its own parallel light, which travels along it. (VTK's fixed-point
-    ray caster lets it travel along the camera's axis, on all rays.) For `Phong`.
+    """A light at the camera: each ray brings its own parallel light, which travels along it. For `Phong`.
+    (VTK's fixed-point ray caster lets the light of all rays travel along the camera's axis.)
 
     **Arguments:**
 

@@ -19,8 +19,8 @@ class Phong(Lighting):
 
         c (ambient + diffuse Σ_lights n·l E) + specular Σ_lights (r·v)^specular_power E
 
-    where r = 2 (n·l) n - l is the direction in which the light is reflected. A light on the far side, n·l ≤ 0,
-    adds nothing.
+    where r = 2 (n·l) n - l is the direction in which the light is reflected. A light on the far side, with
+    n·l ≤ 0, adds nothing.
 
     - The normal is the world gradient of the value (`space.world_gradient` with central differences), of unit
       length. It is turned to the viewer, so that both sides of a surface are lit, as by VTK.
@@ -33,8 +33,8 @@ class Phong(Lighting):
     - VTK's fixed-point ray caster computes its highlight from the vector half-way between l and v. It is as
       wide as Phong's of a quarter of the power. VTK's ray caster on GPUs has Phong's.
 
-    Shading takes place at all samples, so that only the angle matters, not whether there is a surface: a
-    nearly homogeneous region is shaded by its noise.
+    Only the angle matters, not whether there is a surface: a nearly homogeneous region is shaded by its noise
+    (`experiments/stability.py`, "normals in noise").
 
     Gradients of light, material, camera and volume are those of this formula. They grow without bound as the
     volume's gradient falls to 0; where it is 0, and where a normal turns from one side to the other, they
@@ -42,9 +42,8 @@ class Phong(Lighting):
 
     **Arguments:**
 
-    - `lights`: one or several of `HeadLight`, `DirectionalLight` and `PointLight`.
-    - `ambient`, `diffuse`, `specular`: ≥ 0. `specular_power`: > 0. Names and defaults of
-      `vtkVolumeProperty`, but for the default of `specular_power`, with which VTK has 10, too.
+    - `lights`: one or several of `HeadLight`, `DirectionalLight` and `PointLight`; by default a `HeadLight`.
+    - `ambient`, `diffuse`, `specular`: ≥ 0. `specular_power`: > 0. Names and defaults of `vtkVolumeProperty`.
 
     **Raises:** `ValueError` for other lights, and for numbers that are negative, NaN or infinite.
 
