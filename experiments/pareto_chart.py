@@ -27,6 +27,8 @@ COLORS = {
     "templates": "#7f0000",
     "baked": "#00441b",
     "deferred": "#fd8d8d",
+    "shaded": "#6a3d9a",
+    "shaded once": "#b15928",
     VTK: "#555555",
     DRJIT: "#ff7f0e",
 }

@@ -2,7 +2,8 @@
 
 Each method has its own sweep around one base: the midpoint rule at steps of one voxel, cells cut at the exit
 (`AlphaCorrection`), space leaping by the hierarchy, and rays that end at a transmittance of 1e-4. In a lit
-scene the base is lit once per ray, by one template of eight photons.
+scene the base is lit once per ray, by one template of eight photons, and in a shaded one each sample is
+shaded by its gradient.
 """
 
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from .pareto_scenes import Case, Row, copied
 STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 BASE = "midpoint, step 1"
 LIT_BASE = "lit, midpoint, step 1"
+SHADED_BASE = "shaded, midpoint, step 1"
 PHOTONS = 8
 
 
@@ -60,7 +62,7 @@ def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = templates, 
     if "baked" in how:
         march["changed"] = keep
     made = ours(*transforms, lighting=partial(by, **how), **march)
-    return Setting(family, made, lambda row: row.lit)
+    return Setting(family, made, lambda row: row.lit and not row.shaded)
 
 
 def straight(row: Row) -> bool:
@@ -154,6 +156,15 @@ LIT: dict[str, Setting] = {
     },
 }
 
+SHADED: dict[str, Setting] = {
+    f"shaded{once}, {q}, step {step:g}": Setting(
+        f"shaded{once}", ours(step=step, quadrature=q, lighting=by), lambda row: row.shaded
+    )
+    for once, by in (("", templates), (" once", deferred))
+    for q in QUADRATURES
+    for step in STEPS
+}
+
 PEERS: dict[str, Setting] = {
     **{f"{VTK}, step {step:g}": Setting(VTK, partial(by_vtk, step), peer) for step in STEPS[1:]},
     **{
@@ -163,7 +174,7 @@ PEERS: dict[str, Setting] = {
     },
 }
 
-SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **PEERS}
+SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **SHADED, **PEERS}
 
 GRADIENTS = (
     "midpoint, step 0.5",
@@ -191,4 +202,4 @@ def of(row: Row, there: dict[str, str]) -> dict[str, Setting]:
 
 def base_of(row: Row) -> str:
     """Name of the setting that all others of the scene are timed against."""
-    return LIT_BASE if row.lit else BASE
+    return SHADED_BASE if row.shaded else LIT_BASE if row.lit else BASE

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
+from jaxvol.lighting import ConstantLight, DirectionalLight, Lighting, Phong, ScattererTemplates
 from jaxvol.march import Quadrature
 
 from . import peer_vtk, scenes
@@ -26,12 +26,13 @@ from .scenes import PHANTOM, SCENES, Scene
 class Case(NamedTuple):
     """A scene, the transforms without which it cannot be rendered, and its light.
 
-    `lighting` makes templates from the options of `ScattererTemplates`; None where the scene is unlit.
+    `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options `Phong`;
+    None where the scene is unlit.
     """
 
     scene: Scene
     placed: tuple[jv.Transform, ...] = ()
-    lighting: Callable[..., ScattererTemplates] | None = None
+    lighting: Callable[..., Lighting] | None = None
 
 
 class Row(NamedTuple):
@@ -41,6 +42,7 @@ class Row(NamedTuple):
       phantom.
     - `file`: the real volume, None for a phantom.
     - `peers`: None, or why VTK and Dr.Jit are left out.
+    - `lit`: whether there is light; `shaded`: whether it is `Phong`'s.
     - `gradients`: whether gradients are measured, too.
     - `finer`, `quadrature`: of the converged image, into how many parts it divides a step, and its rule.
     - `part`: of the image's side, where frames take longer.
@@ -53,6 +55,7 @@ class Row(NamedTuple):
     peers: str | None = None
     toroidal: bool = False
     lit: bool = False
+    shaded: bool = False
     gradients: bool = False
     finer: int = 16
     quadrature: Quadrature = "midpoint"
@@ -134,6 +137,10 @@ def lit_engine(folder: Path | None, size: int, resolution: int) -> Case:
     return case._replace(lighting=partial(ScattererTemplates, jv.Material(0.5, 4.0, 1.4), lights))
 
 
+def shaded(name: str, folder: Path | None, size: int, resolution: int) -> Case:
+    return real(name, folder, size, resolution)._replace(lighting=Phong)
+
+
 ENGINE, BONSAI, AIRWAY, ANEURISM, SHELLS = (
     "engine_256x256x128_uint8.raw.gz",
     "bonsai_256x256x256_uint8.raw.gz",
@@ -161,6 +168,8 @@ ROWS: dict[str, Row] = {
     "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.25),
     f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=UNLIT, lit=True, finer=4, part=0.5),
     "engine, lit": Row(lit_engine, ENGINE, peers=UNLIT, lit=True, finer=4, part=0.25),
+    "engine, shaded": Row(partial(shaded, "engine"), ENGINE, peers=UNLIT, lit=True, shaded=True),
+    "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, peers=UNLIT, lit=True, shaded=True),
 }
 
 

@@ -74,7 +74,38 @@ VMAP = "engine/test_vmap.py::test_over_one_part[cameras-uint8]"
 PACKED = "transforms/test_space_leaping.py::test_packed_voxels_are_the_same_values"
 RENDERED = "test_agreement.py::test_render_agrees_with_the_independent_marcher"
 
+SLOPES = "lighting/test_phong.py::test_the_gradient_is_interpolated_between_central_differences"
+
 MUTATIONS = [
+    # shading by gradients
+    Mutation(
+        "slopes: of two nodes at the border, over two cells",
+        "_util/voxel_fetch.py",
+        "jnp.where(whole, 1, 0.5)",
+        "jnp.where(whole, 0.5, 0.5)",
+        (f"{SLOPES}[float32]",),
+    ),
+    Mutation(
+        "slopes: a bit of y is read as one of z",
+        "_util/voxel_fetch.py",
+        "slope(lambda word: word << 10)",
+        "slope(lambda word: word << 9)",
+        (f"{SLOPES}[uint8]",),
+    ),
+    Mutation(
+        "Phong: normals are not turned to the viewer",
+        "lighting/phong.py",
+        "jnp.where(toward_viewer < 0, -1, 1)",
+        "jnp.where(toward_viewer < 0, 1, 1)",
+        ("lighting/test_phong.py::test_both_sides_are_lit_alike",),
+    ),
+    Mutation(
+        "inline shading: where cells begin, not where they are sampled",
+        "engine/inline_shading.py",
+        "pipeline.march.sample(cell)",
+        "cell.front",
+        ("lighting/test_phong.py::test_quadratures_shade_where_they_sample[preintegrated]",),
+    ),
     # planning
     Mutation(
         "plan: the opacity of an error left out",
