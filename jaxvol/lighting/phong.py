@@ -122,7 +122,7 @@ class PhongShading(Shading):
     ) -> tuple[Angles, ...]:
         gradient = world_gradient(around.volume, around.space, sample.point)
         squared, toward_viewer = dot(gradient, gradient), -dot(gradient, sample.direction)
-        exists = squared > 0
+        exists = ~(squared <= 0)  # also of NaN, which is to be seen
         # 0 without a normal, so that it has no derivative
         side = jnp.where(exists, jnp.where(toward_viewer < 0, -1, 1), 0).astype(squared.dtype)
         # Of each light there is one use of this, the last one: XLA stores what is expensive and has two, and
@@ -148,7 +148,7 @@ class PhongShading(Shading):
                 facing, mirrored = angles, 2 * angles * angles - 1
             shines = (facing > 0) & (mirrored > 0)
             highlight = jnp.exp(self.how.specular_power * jnp.log(jnp.where(shines, mirrored, 1)))
-            diffuse = plus(diffuse, scaled(lit.irradiance, jnp.where(facing > 0, facing, 0)))
+            diffuse = plus(diffuse, scaled(lit.irradiance, jnp.where(facing <= 0, 0, facing)))
             specular = plus(specular, scaled(lit.irradiance, jnp.where(shines, highlight, 0)))
         factor = plus(scaled(diffuse, self.how.diffuse), (self.how.ambient,) * 3)
         return plus(times(sample.color, factor), scaled(specular, self.how.specular))
