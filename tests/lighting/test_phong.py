@@ -122,7 +122,7 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.rad2deg(2 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2))
 
 
-@pytest.mark.parametrize("spacing", [(0.05, 0.05, 0.05), (0.035, 0.05, 0.07)])
+@pytest.mark.parametrize("spacing", [(0.05, 0.05, 0.05), (0.04, 0.05, 0.06)])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("field", FIELDS)
 def test_normals_are_within_half_a_degree(field, kind, spacing):
