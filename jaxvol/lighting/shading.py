@@ -70,9 +70,9 @@ class Surroundings(eqx.Module):
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
 
-    def in_memory_by(self, live: Bool[Array, ""]) -> "Surroundings":
-        """The same, with what is `stored` put in memory."""
-        return Surroundings(self.volume, self.transfer, self.space, live)
+    def in_memory_by(self, live: Bool[Array, ""], sample: Sample) -> "Surroundings":
+        """The same, with what is `stored` for this sample put in memory."""
+        return Surroundings(self.volume, self.transfer, self.space, varying(live, sample))
 
     def stored(self, f: Callable[[], T]) -> T:
         """`f()`, computed once for all its uses."""
@@ -225,11 +225,11 @@ def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: P
     # not of all.
     @jax.checkpoint
     def add(sums: PyTree, number: Int[Array, ""]) -> tuple[PyTree, None]:
-        added = shading.term(around.in_memory_by(number >= 0), sample, shared, number)
+        added = shading.term(around.in_memory_by(number >= 0, sample), sample, shared, number)
         return jax.tree.map(jnp.add, sums, added), None
 
     term = partial(shading.term, around, sample, shared)
-    return jax.lax.scan(add, zeros_like_result(term), jnp.arange(shading.terms))[0]
+    return jax.lax.scan(add, varying(zeros_like_result(term), sample), jnp.arange(shading.terms))[0]
 
 
 def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
@@ -247,7 +247,7 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
         return None
 
     def terms(number: Int[Array, ""]) -> PyTree:
-        here = around.in_memory_by(number >= 0)
+        here = around.in_memory_by(number >= 0, samples)
         return jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))(samples, shared, number)
 
     def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
