@@ -156,7 +156,7 @@ class TemplateShading(Shading):
         seen, shows = around.stored(lambda: self._weights(around, sample, shared, photon(), read))
         offset = photon().offset
         brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
-        color, _ = around.transfer.classification(around.volume).classify(read[0])
+        color, _ = around.classification.classify(read[0])
         return brightness, scaled(color, shows)
 
     def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
