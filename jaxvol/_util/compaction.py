@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, UInt32
 
 from .sharding import varying
 from .trees import PyTree
@@ -69,17 +69,28 @@ def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, 
     """Indices of the chosen entries, in order, followed by indices past the end, up to a whole number of
     chunks. `chunk`: a multiple of 128.
 
-    Like `jnp.nonzero`, in a quarter of its time for 16 384 entries on CPU, and two thirds for 65 536, where
-    the scatter weighs more. XLA's cumulative sums are slow; here they are a product with a triangle of ones,
-    which is exact for numbers as small as these."""
+    Like `jnp.nonzero`, without its cumulative sum over all entries, which is slow in XLA. An entry's place is
+    counted from bits: those before it in its word of 32, in the words before that in a block of 32, and in
+    the blocks before that."""
     padded = jnp.pad(chosen, (0, -chosen.size % chunk))
-    rows = padded.reshape(-1, 128).astype(jnp.float32)
-    within = jnp.matmul(rows, jnp.triu(jnp.ones((128, 128), rows.dtype), 1), precision="highest")
-    totals = jnp.sum(rows, axis=1)
-    rank = within + (jnp.cumsum(totals) - totals)[:, None]
+    bit = (jnp.uint32(1) << jnp.arange(32, dtype=jnp.uint32))[None]
+    words = jnp.sum(jnp.where(padded.reshape(-1, 32), bit, 0), axis=1, dtype=jnp.uint32)
+    counts = _popcount(words)
+    blocks = jnp.pad(counts, (0, -counts.size % 32)).reshape(-1, 32)
+    before = (_sums_before(blocks) + _sums_before(jnp.sum(blocks, axis=1)[None])[0, :, None]).reshape(-1)
+    rank = before[: words.size, None] + _popcount(words[:, None] & (bit - 1))
     last = padded.size
     return (
         jnp.full(last, chosen.size, jnp.int32)
-        .at[jnp.where(padded, rank.reshape(-1).astype(jnp.int32), last)]
+        .at[jnp.where(padded, rank.reshape(-1), last)]
         .set(jnp.arange(last, dtype=jnp.int32), mode="drop", unique_indices=True)
     )
+
+
+def _popcount(words: UInt32[Array, "*words"]) -> Int[Array, "*words"]:
+    return jax.lax.population_count(words).astype(jnp.int32)
+
+
+def _sums_before(counts: Int[Array, "rows columns"]) -> Int[Array, "rows columns"]:
+    """Of each entry, the sum of those before it in its row. Columns are few."""
+    return jnp.cumsum(counts, axis=1) - counts

@@ -178,6 +178,6 @@ def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> 
             fill = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
             return jnp.full(leaf.shape, fill, leaf.dtype)
 
-        return varying(jax.tree.map(filled, jax.eval_shape(f, *arguments)), arguments)
+        return varying(jax.tree.map(filled, jax.eval_shape(f, *arguments)), live, arguments)
 
     return jax.lax.cond(live, f, never, *arguments)

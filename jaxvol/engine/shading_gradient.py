@@ -128,7 +128,7 @@ def _chunk_vjp(
 
         def one(sample: Sample, shared: PyTree, perturbations: list[Cube] | None) -> tuple[PyTree, Any]:
             if perturbations is None:
-                return shading.term(around.in_memory_by(number >= 0), sample, shared, number), []
+                return shading.term(around.in_memory_by(number >= 0, sample), sample, shared, number), []
             record = Recording(perturbations, [])
             here = Surroundings(with_fetch(around.volume, record), around.transfer, around.space)
             return shading.term(here, sample, shared, number), record.bases

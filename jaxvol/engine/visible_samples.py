@@ -81,7 +81,7 @@ def shaded_colors(
     measured: list[Measured],
     alphas: list[Scalar],
 ) -> list[Vec3]:
-    """Shaded colours of a segment's samples; 0 for invisible ones."""
+    """Shaded colours of a segment's samples; any finite ones for invisible samples."""
     weights, light = weights_of(pipeline, at, alphas), pipeline.classification.light
     assert isinstance(light, Shader)
     none, shown = jnp.zeros_like(alphas[0]), [weight > 0 for weight in weights.weight]

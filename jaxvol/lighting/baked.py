@@ -103,7 +103,7 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
     """Compute the light on a grid of nodes. NaN in any of its inputs makes all of it NaN."""
     shading, around = jax.lax.stop_gradient((shading, around))
     nx, ny, nz = nodes
-    classification = around.transfer.classification(around.volume)
+    classification = around.classification
 
     def node(number: Int[Array, ""]) -> Sample:
         indices = jnp.unravel_index(number, (nx, ny, nz))

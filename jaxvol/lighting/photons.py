@@ -7,8 +7,9 @@ Lee, Kwon and Shin: Scattered light representation in accordance with the materi
 volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
 """
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -155,7 +156,7 @@ class TemplateShading(Shading):
         seen, shows = around.stored(lambda: self._weights(around, sample, shared, photon(), read))
         offset = photon().offset
         brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
-        color, _ = around.transfer.classification(around.volume).classify(read[0])
+        color, _ = around.classification.classify(read[0])
         return brightness, scaled(color, shows)
 
     def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
@@ -214,7 +215,7 @@ class TemplateShading(Shading):
         there = photon.there
         if there is None:
             shares, optics = self._shares_at(around, places[0], read[0], shared)
-            there = _There(sum(shares), optics.mean_free_path)
+            there = _There(_sum(shares), optics.mean_free_path)
         if self._soft:  # the opacity of one mean free path there
             matter = -jnp.expm1(-extinctions[0] * there.mean_free_path)
         else:
@@ -234,7 +235,7 @@ class TemplateShading(Shading):
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
         """Visibility of a photon from the sample, from the extinctions at `_places`."""
         if not self._soft:
-            return 1 - step(sum(extinctions), 0.0)
+            return 1 - step(_sum(extinctions), 0.0)
         pieces = np.diff([0.0, 1.0, *self.reach])
         depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
         return jnp.exp(-depth * _norm(offset))
@@ -256,6 +257,10 @@ def _known(around: Surroundings, f: Callable[[], _Photon]) -> Callable[[], _Phot
     """A function that returns what `f` returns, which is computed and stored once."""
     found = around.stored(f)
     return lambda: found
+
+
+def _sum(parts: Sequence[Scalar]) -> Scalar:
+    return functools.reduce(jnp.add, parts)
 
 
 def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:

@@ -6,6 +6,7 @@ for each image, which adds up terms for points around a sample, one by one; and 
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -69,10 +70,21 @@ class Surroundings(eqx.Module):
     live: Bool[Array, ""] | None = None
     """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
     recorded inside one."""
+    tables: Classification | None = None
+    """The classification, if its tables were computed before."""
 
-    def in_memory_by(self, live: Bool[Array, ""]) -> "Surroundings":
-        """The same, with what is `stored` put in memory."""
-        return Surroundings(self.volume, self.transfer, self.space, live)
+    def before_loop(self) -> "Surroundings":
+        """The same, with the transfer function's tables, which a loop would compute again each time."""
+        return replace(self, tables=self.classification)
+
+    def in_memory_by(self, live: Bool[Array, ""], sample: Sample) -> "Surroundings":
+        """The same, with what is `stored` for this sample put in memory."""
+        return replace(self, live=varying(live, sample))
+
+    @property
+    def classification(self) -> Classification:
+        """The transfer function, applied to the volume."""
+        return self.transfer.classification(self.volume) if self.tables is None else self.tables
 
     def stored(self, f: Callable[[], T]) -> T:
         """`f()`, computed once for all its uses."""
@@ -80,7 +92,7 @@ class Surroundings(eqx.Module):
 
     def fetched(self, points: list[Vec3]) -> list[Measured]:
         """What the transfer function reads at world points."""
-        classification = self.transfer.classification(self.volume)
+        classification = self.classification
         return [classification.at(self.space.coordinate(point)) for point in points]
 
     def classified(self, point: Vec3, measured: Measured) -> ClassifiedPoint:
@@ -91,7 +103,7 @@ class Surroundings(eqx.Module):
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
         inside = x * y * z
-        color, extinction = self.transfer.classification(self.volume).classify(measured)
+        color, extinction = self.classification.classify(measured)
         return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
 
 
@@ -238,11 +250,12 @@ def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: P
     # not of all.
     @jax.checkpoint
     def add(sums: PyTree, number: Int[Array, ""]) -> tuple[PyTree, None]:
-        added = shading.term(around.in_memory_by(number >= 0), sample, shared, number)
+        added = shading.term(looped.in_memory_by(number >= 0, sample), sample, shared, number)
         return jax.tree.map(jnp.add, sums, added), None
 
+    looped = around.before_loop()
     term = partial(shading.term, around, sample, shared)
-    return jax.lax.scan(add, zeros_like_result(term), jnp.arange(shading.terms))[0]
+    return jax.lax.scan(add, varying(zeros_like_result(term), sample), jnp.arange(shading.terms))[0]
 
 
 def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
@@ -259,8 +272,10 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
     if shading.terms == 0:
         return None
 
+    looped = around.before_loop()
+
     def terms(number: Int[Array, ""]) -> PyTree:
-        here = around.in_memory_by(number >= 0)
+        here = looped.in_memory_by(number >= 0, samples)
         return jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))(samples, shared, number)
 
     def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
