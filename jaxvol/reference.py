@@ -398,14 +398,15 @@ def steps_across(volume: Volume, march: March) -> int:
     transforms."""
     with jax.ensure_compile_time_eval():
         diagonal = march.locate(volume).diagonal
-    if is_traced(march.step, diagonal):
+        traced = is_traced(march.step, diagonal)
+        steps = math.nan if traced or not march.step > 0 else float(diagonal) / float(march.step)
+    if traced:
         if march.max_samples is not None:
             return march.max_samples
         raise ValueError(
             "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
             "the length of a scan must be known before the program is compiled."
         )
-    steps = float(diagonal) / float(march.step) if march.step > 0 else math.nan
     if not math.isfinite(steps):  # then nothing is marched, and the image is NaN
         return 1
     # the first cell may begin a step early, one step finds the exit, and a jitter may shorten one more

@@ -208,8 +208,8 @@ MUTATIONS = [
     Mutation(
         "toroidal map: a ray is back as soon as it passes one face",
         "transforms/sector_faces.py",
-        "reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces))",
-        "reduce(jnp.maximum, map(clear, to_faces))",
+        "reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces, near))",
+        "reduce(jnp.maximum, map(clear, to_faces, near))",
         ("transforms/test_toroidal_map.py::test_gaps_are_where_a_ray_is_outside_in_between",),
     ),
     Mutation(
@@ -565,8 +565,8 @@ MUTATIONS = [
     Mutation(
         "selection: depths do not grow with the step",
         "reference.py",
-        "return pixel * valid, ray.t_in + depth * scale",
-        "return pixel * valid, ray.t_in + depth",
+        "depth = jnp.where(seen, ray.t_in + jnp.where(seen, depth, 0) * scale, jnp.inf)",
+        "depth = jnp.where(seen, ray.t_in + jnp.where(seen, depth, 0), jnp.inf)",
         ("test_selections.py::test_gradients_are_central_differences[replay-fog]",),
     ),
     Mutation(

@@ -181,7 +181,7 @@ def test_clips_are_those_of_the_library(volume_file, tmp_path, monkeypatch):
     np.testing.assert_allclose(np.load(output), expected, atol=1e-5)
     assert rmse(expected, images["whole"].image((1, 1, 1))) > 0.05
     planned = []
-    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms: planned.append(transforms))
+    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms, compositing: planned.append(transforms))
     for command in ("plan", "render"):
         monkeypatch.setattr("jaxvol.cli._picture", None)  # not called
         with contextlib.suppress(TypeError, AttributeError):  # there is no plan to print or render

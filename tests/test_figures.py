@@ -28,6 +28,8 @@ FIGURES = sorted(path.stem for path in (ROOT / "paper_figs").glob("*fig*.py") if
 """Figures that need no recorded results."""
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
 """Experiments with stored records."""
+PLANS = "planning", "planning_seed_1"
+"""Records of the experiment `planning`."""
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +195,25 @@ def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     assert table1.table(record.read(record.RESULTS / "overhead.json")) in text
     assert kisti_table.table(record.read(record.RESULTS / "kisti.json")) in text
+
+
+def test_what_the_readme_says_of_plans_and_choices_is_in_the_records():
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    results = [record.read(record.RESULTS / f"{name}.json")["result"] for name in PLANS]
+    rows = [row for result in results for row in result["summary"]["by tolerance"].values()]
+    images, held, within, searched = (
+        sum(row[key] for row in rows) for key in ("scenes", "held", "within 1.5 times", "searched")
+    )
+    assert f"Of {images} images" in text
+    assert f"{held} were within the tolerance" in text
+    assert f"{within} of {searched} images" in text
+    assert held >= 0.95 * images
+    assert max(result["summary"]["planning, in images: largest"] for result in results) <= 16.5
+    choices = record.read(record.RESULTS / "model_choice.json")["result"]["problems"].values()
+    noisy, clean = ([each["summary"][noise]["chosen"] for each in choices] for noise in ("0.02", "0"))
+    assert f"true number of parameters in {sum(found['truth'] for found in noisy)}, and" in text
+    assert min(found["truth"] for found in noisy) >= 9
+    assert all(found == {"truth": 10, "more": 0} for found in clean)
 
 
 @pytest.mark.slow

@@ -94,8 +94,8 @@ def march_segment(
     # otherwise runs begin and end with segments
     partly = at.phase is not None or RUN % number > 0
     if not regular or (at.stride is not None and partly):
-        taken, shifted = in_memory(always(at), partial(_taken, march), at, every.opacity)
-        samples = _without(every, taken, ray)
+        fewer = in_memory(always(at), partial(_taken, march), at, every.opacity)
+        (taken, shifted), samples = fewer, _without(every, fewer[0], ray)
     colors: list[Vec3] | list[None]
     values = [read[:1] for read in every.measured]
     if isinstance(pipeline.compositing, Selection):

@@ -82,7 +82,7 @@ class SectorFaces(eqx.Module):
 
         def next_gap(depth: Scalar, _: None) -> tuple[Scalar, Gap]:
             left, leaves = faces._crossing(start, rate, depth, length - depth, 1, inside=True)
-            back, _ = faces._crossing(start, rate, left, length - left, 1, inside=False)
+            back = faces._crossing(start, rate, left, length - left, 1, inside=False)[0]
             back = jnp.minimum(back, length)  # outside all the way, also where no entry was found
             found = leaves & (back > left)
             gap = tuple(jnp.where(found, depth, jnp.inf) for depth in (left, back))

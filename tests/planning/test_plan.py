@@ -206,6 +206,19 @@ def test_what_cannot_be_reached_is_said(sphere, monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_peak_that_the_midpoint_rule_cannot_resolve_is_planned():
+    """Here no step by the midpoint rule is within the tolerance."""
+    volume = jv.phantom("head", 48)
+    peak = jv.TransferFunction([99.5, 100, 100.5], [[1, 1, 1]] * 3, [0, 50.0, 0])
+    camera = jv.Camera.looking_at(volume, size=(64, 64))
+    found = jv.plan(volume, peak, camera, 0.001)
+    assert found.within
+    assert found.march.quadrature == "preintegrated"
+    assert error_of(found, volume, peak, camera) <= 0.001
+    assert not jv.plan(volume, peak, camera, 0.0001).within
+
+
+@pytest.mark.slow
 def test_light_is_simpler_where_that_looks_the_same(sphere):
     """Light that is nearly the same everywhere may be fetched from a grid, unless it is to be differentiated;
     and the image is as far from that under all templates, blended, as the plan says."""

