@@ -25,7 +25,7 @@ from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..selection import Selection
 from ..space import Ray
 from ..transfer import Classification, Measured
-from .inline_shading import inline_shader, light_term, lit_color
+from .inline_shading import inline_colors, inline_shader
 from .tiling import Tiling
 from .visible_samples import shaded_colors
 
@@ -38,12 +38,11 @@ def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, arrays (cells, rays). Cells
-    that a ray does not take are placed beyond its exit. `light`: the terms of shading that is `inline`."""
+    that a ray does not take are placed beyond its exit."""
 
     cells: list[Cell]
     measured: list[Measured]
     opacity: list[Scalar]
-    light: list[PyTree] | None = None
 
     @property
     def number(self) -> int:
@@ -103,10 +102,8 @@ def march_segment(
     elif classification.light is None:
         colors = _colors(pipeline, at, every.measured)
     elif (shader := inline_shader(pipeline)) is not None:
-        assert every.light is not None
-        lit = vmap_cells(partial(lit_color, shader, pipeline), (False, True, True, True))
-        parts = every.cells, _colors(pipeline, at, every.measured), every.light
-        colors = [lit(ray, *piece) for piece in zip(*parts, strict=True)]
+        plain = _colors(pipeline, at, every.measured)
+        colors = inline_colors(shader, pipeline, ray, at, every.cells, plain, samples.opacity)
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
@@ -169,11 +166,7 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
     else:
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
-    shader, light = inline_shader(pipeline), None
-    if shader is not None:
-        term = vmap_cells(partial(light_term, shader, pipeline), (False, True))
-        light = in_memory(live, lambda at, given: [term(ray, piece) for piece in cells(at, given)], at, given)
-    return Samples(list(cells(at, given)), values, alphas, light)
+    return Samples(list(cells(at, given)), values, alphas)
 
 
 def always(at: Progress) -> Bool[Array, ""]:
