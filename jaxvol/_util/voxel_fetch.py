@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .vec3 import Scalar, Vec3
-from .xla import gather
+from .xla import gather, in_memory
 
 
 Cube: TypeAlias = list[list[list[Scalar]]]
@@ -132,7 +132,9 @@ class Packed(Fetch):
         if self.nodes is None:
             return super().slopes(data, coordinate)
         node, fraction = split(coordinate, data.shape)
-        base, dtype = flat_index(node, data.shape), coordinate[0].dtype
+        dtype = coordinate[0].dtype
+        live = (self.nodes[0] | 1) != 0
+        base = in_memory(live, lambda c: flat_index(split(c, data.shape)[0], data.shape), coordinate)
         _, ny, nz = data.shape
         shift = 32 - SLOPE_BITS
 
