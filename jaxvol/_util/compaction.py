@@ -19,14 +19,12 @@ class Chosen(NamedTuple):
     """Chosen entries of arrays (rows, columns), of which there may be several, stacked along the rows.
 
     - `indices`: flat indices of the chosen entries, padded with indices past the end.
-    - `ranks`: of each entry, how many are chosen before it.
     - `number`: how many are chosen.
     - `columns`: of the arrays.
     - `chunk`: entries processed at a time.
     """
 
-    indices: Int[Array, " padded"]
-    ranks: Int[Array, " entries"]
+    indices: Int[Array, " entries"]
     number: Int[Array, ""]
     columns: int
     chunk: int
@@ -36,9 +34,7 @@ class Chosen(NamedTuple):
         """The entries where these are true."""
         whole = jnp.concatenate(chosen)
         number = jnp.sum(whole, dtype=jnp.int32)
-        flat = whole.reshape(-1)
-        ranks = ranks_of(flat)
-        return cls(_in_order(flat, ranks, chunk), ranks, number, whole.shape[1], chunk)
+        return cls(in_front(whole.reshape(-1), chunk), number, whole.shape[1], chunk)
 
     def fold(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
         """Folds `one(indices, carry)` over the chunks of indices."""
@@ -54,8 +50,7 @@ class Chosen(NamedTuple):
         """The entries at these flat indices."""
 
         def taken(*leaves: Array) -> Array:
-            whole = jnp.concatenate(leaves)
-            return whole.reshape(-1, *whole.shape[2:]).at[indices].get(mode="clip")
+            return jnp.concatenate(leaves).reshape(-1).at[indices].get(mode="clip")
 
         return jax.tree.map(taken, *arrays)
 
@@ -72,35 +67,26 @@ class Chosen(NamedTuple):
 
 def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, " padded"]:
     """Indices of the chosen entries, in order, followed by indices past the end, up to a whole number of
-    chunks."""
-    return _in_order(chosen, ranks_of(chosen), chunk)
+    chunks. `chunk`: a multiple of 128.
 
-
-def _in_order(
-    chosen: Bool[Array, " entries"], ranks: Int[Array, " entries"], chunk: int
-) -> Int[Array, " padded"]:
-    last = chosen.size + -chosen.size % chunk
-    return (
-        jnp.full(last, chosen.size, jnp.int32)
-        .at[jnp.where(chosen, ranks, last)]
-        .set(jnp.arange(chosen.size, dtype=jnp.int32), mode="drop", unique_indices=True)
-    )
-
-
-def ranks_of(chosen: Bool[Array, " entries"]) -> Int[Array, " entries"]:
-    """Of each entry, how many are chosen before it.
-
-    Like a cumulative sum over all entries, which is slow in XLA. It is counted from bits: those before an
-    entry in its word of 32, in the words before that in a block of 32, and in the blocks before that."""
+    Like `jnp.nonzero`, without its cumulative sum over all entries, which is slow in XLA. An entry's place is
+    counted from bits: those before it in its word of 32, in the words before that in a block of 32, and in
+    the blocks before that."""
+    padded = jnp.pad(chosen, (0, -chosen.size % chunk))
     bit = (jnp.uint32(1) << jnp.arange(32, dtype=jnp.uint32))[None]
-    padded = jnp.pad(chosen, (0, -chosen.size % 32)).reshape(-1, 32)
-    words = jnp.sum(jnp.where(padded, bit, 0), axis=1, dtype=jnp.uint32)
+    words = jnp.sum(jnp.where(padded.reshape(-1, 32), bit, 0), axis=1, dtype=jnp.uint32)
     counts = _popcount(words)
     blocks = jnp.pad(counts, (0, -counts.size % 32)).reshape(-1, 32)
-    of_blocks = jnp.sum(blocks, axis=1, dtype=blocks.dtype)
-    before = (_sums_before(blocks) + _sums_before(of_blocks[None])[0, :, None]).reshape(-1)
-    ranks = before[: words.size, None] + _popcount(words[:, None] & (bit - 1))
-    return ranks.reshape(-1)[: chosen.size]
+    before = (
+        _sums_before(blocks) + _sums_before(jnp.sum(blocks, axis=1, dtype=blocks.dtype)[None])[0, :, None]
+    ).reshape(-1)
+    rank = before[: words.size, None] + _popcount(words[:, None] & (bit - 1))
+    last = padded.size
+    return (
+        jnp.full(last, chosen.size, jnp.int32)
+        .at[jnp.where(padded, rank.reshape(-1), last)]
+        .set(jnp.arange(last, dtype=jnp.int32), mode="drop", unique_indices=True)
+    )
 
 
 def _popcount(words: UInt32[Array, "*words"]) -> Int[Array, "*words"]:

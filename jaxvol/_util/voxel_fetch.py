@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .vec3 import Scalar, Vec3
-from .xla import gather, in_memory
+from .xla import gather
 
 
 Cube: TypeAlias = list[list[list[Scalar]]]
@@ -32,6 +32,12 @@ class Fetch(eqx.Module):
     @abstractmethod
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
+
+    def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
+        """The same, where slopes are asked for at one coordinate only and its node, as an index into the
+        flattened array, is known. XLA computes an index that several fetches share on one thread, as a kernel
+        of its own, unless it lies in memory."""
+        return self
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
         """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
@@ -101,10 +107,15 @@ class Packed(Fetch):
     - `nodes`: of 8-bit voxels, where they are stored, the slopes of each node. Doubled they are integers of
       10 bits: that along x in the highest bits of a word, that along y from bit 12 on, that along z in the
       lowest.
+    - `begin`: see `of_slopes_at`.
     """
 
     words: UInt32[Array, " voxels"]
     nodes: UInt32[Array, " voxels"] | None = None
+    begin: Int[Array, ""] | None = None
+
+    def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
+        return Packed(self.words, self.nodes, begin)
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         dtype = coordinate[0].dtype
@@ -132,9 +143,8 @@ class Packed(Fetch):
         if self.nodes is None:
             return super().slopes(data, coordinate)
         node, fraction = split(coordinate, data.shape)
+        base = flat_index(node, data.shape) if self.begin is None else self.begin
         dtype = coordinate[0].dtype
-        live = (self.nodes[0] | 1) != 0
-        base = in_memory(live, lambda c: flat_index(split(c, data.shape)[0], data.shape), coordinate)
         _, ny, nz = data.shape
         shift = 32 - SLOPE_BITS
 

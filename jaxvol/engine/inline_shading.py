@@ -1,33 +1,27 @@
 """Shades samples where they are, for shading that costs less than to gather the visible ones.
 
-Colours are elementwise. The one term that they depend on is computed for rows of neighbouring rays in which
-any sample is visible: a fifth of all samples in the bonsai, two fifths in the engine. A row fills a vector
-register, so that it is gathered in one piece, and no sample is moved.
+Its one term is computed for all samples of a segment in a branch of its own, from where they are; its colours
+are then elementwise.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
-from .._util.compaction import Chosen
 from .._util.trees import PyTree
-from .._util.vec3 import Scalar, Vec3, along
-from .._util.xla import gather, in_memory
+from .._util.vec3 import Vec3, along
+from .._util.voxel_fetch import flat_index, split
+from .._util.xla import in_memory
 from ..lighting.shading import Sample, Shader
 from ..march import Cell
-from ..reference import Pipeline, Progress
+from ..reference import Pipeline
 from ..selection import Selection
 from ..space import Ray
-
-
-Place: TypeAlias = tuple[Vec3, Vec3, tuple[Int[Array, ""], Int[Array, ""]]]
-"""Of a ray, where it enters, its direction and its pixel."""
-
-ROW, CHUNK = 16, 64
-"""Rays of a row, and rows whose terms are computed at a time."""
+from ..volume import with_fetch
 
 
 def inline_shader(pipeline: Pipeline) -> Shader | None:
@@ -37,81 +31,39 @@ def inline_shader(pipeline: Pipeline) -> Shader | None:
     return light if inline and not isinstance(pipeline.compositing, Selection) else None
 
 
-def inline_colors(
-    shader: Shader,
-    pipeline: Pipeline,
-    ray: Ray,
-    at: Progress,
-    cells: list[Cell],
-    colors: list[Vec3],
-    alphas: list[Scalar],
-) -> list[Vec3]:
-    """Shaded colours of a segment's samples; any finite ones for invisible samples."""
-    shading, around = shader
-    depths = [pipeline.march.sample(cell) for cell in cells]
-    terms = _terms(shader, ray, at, depths, alphas)
-
-    def one(place: Place, depth: Scalar, color: Vec3, term: PyTree) -> Vec3:
-        sample = _sample(place, depth, color)
-        return shading.color(sample, shading.about(around, sample), term)
-
-    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
-    return [each(_place(ray), *piece) for piece in zip(depths, colors, terms, strict=True)]
-
-
-def _terms(
-    shader: Shader, ray: Ray, at: Progress, depths: list[Scalar], alphas: list[Scalar]
+def light_terms(
+    shader: Shader, pipeline: Pipeline, live: Bool[Array, ""], ray: Ray, cells: Callable[[], tuple[Cell, ...]]
 ) -> list[PyTree]:
-    """The terms of visible samples, arrays (cells, rays); zeros or those of other samples for others."""
+    """The terms of all samples of cells, arrays (cells, rays), in memory. `live`: see `in_memory`."""
     shading, around = shader
-    size = ROW if ray.length.size % ROW == 0 else 1
+    volume = around.volume
 
-    def rows(leaf: Array) -> Array:
-        return leaf.reshape(*leaf.shape[:-1], -1, size)
+    def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
+        coordinate = around.space.coordinate(_sample(pipeline, ray, cell).point)
+        return flat_index(split(coordinate, volume.shape)[0], volume.shape)
 
-    def one(place: Place, depth: Scalar) -> PyTree:
-        sample = _sample(place, depth, (jnp.zeros_like(depth),) * 3)
-        return shading.term(around, sample, shading.about(around, sample), jnp.zeros((), jnp.int32))
+    def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
+        sample = _sample(pipeline, ray, cell)
+        here = replace(around, volume=with_fetch(volume, volume.fetch.of_slopes_at(begin)))
+        return shading.term(here, sample, shading.about(here, sample), jnp.zeros((), jnp.int32))
 
-    every = jnp.concatenate(depths)
-    firsts = jnp.arange(every.shape[0]) * every.shape[1]
-    visible = jnp.concatenate(alphas) > 0
-    chosen = Chosen.of(
-        [(jnp.any(rows(visible), axis=(0, 2)) & ~jnp.all(rows(at.finished), axis=1))[None]], CHUNK
-    )
+    def all_(f: Callable[..., PyTree], *more: list[PyTree]) -> list[PyTree]:
+        over_rays = jax.vmap(f, in_axes=(0,) * (2 + len(more)))
+        mapped = jax.vmap(over_rays, in_axes=(None, *(0,) * (1 + len(more))))
+        return [mapped(ray, *piece) for piece in zip(cells(), *more, strict=True)]
 
-    def add(indices: Int[Array, " chunk"], state: tuple[Int[Array, ""], PyTree]) -> PyTree:
-        begin, found = state
-
-        lanes = (jnp.minimum(indices, chosen.columns - 1)[:, None] * size + jnp.arange(size)).reshape(-1)
-
-        def taken(place: Place, depth: Scalar) -> Any:
-            of_rays = jax.tree.map(lambda leaf: gather(leaf, lanes), place)
-            return of_rays, gather(depth.reshape(-1), firsts[:, None] + lanes[None])
-
-        here = in_memory(begin >= 0, taken, _place(ray), every)
-        # a kernel of its own: one that writes into part of an array runs on one thread
-        term = in_memory(begin >= 0, jax.vmap(jax.vmap(one), in_axes=(None, 0)), *here)
-        put = partial(jax.lax.dynamic_update_slice_in_dim, start_index=begin * size, axis=1)
-        return begin + indices.size, jax.tree.map(put, found, term)
-
-    shapes = jax.eval_shape(one, *jax.tree.map(lambda leaf: leaf[0], (_place(ray), depths[0][0])))
-    none = jax.tree.map(
-        lambda leaf: jnp.zeros((every.shape[0], chosen.indices.size * size), leaf.dtype), shapes
-    )
-    _, found = chosen.fold(add, (jnp.zeros((), jnp.int32), none))
-    whose = (chosen.ranks[:, None] * size + jnp.arange(size)).reshape(-1)
-    begins = jnp.arange(every.shape[0])[:, None] * chosen.indices.size * size
-    terms = jax.tree.map(lambda leaf: gather(leaf.reshape(-1), begins + whose[None]), found)
-    split = [slice(i * len(depth), (i + 1) * len(depth)) for i, depth in enumerate(depths)]
-    return [jax.tree.map(lambda leaf, part=part: leaf[part], terms) for part in split]
+    begins = in_memory(live, partial(all_, begin))
+    return in_memory(live, partial(all_, term), begins)
 
 
-def _place(ray: Ray) -> Place:
-    return ray.entry, ray.direction, ray.pixel
+def lit_color(shader: Shader, pipeline: Pipeline, ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
+    """The shaded colour of a sample, from its colour and its term."""
+    shading, around = shader
+    sample = _sample(pipeline, ray, cell)._replace(color=color)
+    return shading.color(sample, shading.about(around, sample), term)
 
 
-def _sample(place: Place, depth: Scalar, color: Vec3) -> Sample:
-    entry, direction, pixel = place
-    zero = jnp.zeros_like(depth)
-    return Sample(along(entry, direction, depth), direction, (), color, zero, zero + 1, pixel)
+def _sample(pipeline: Pipeline, ray: Ray, cell: Cell) -> Sample:
+    zero, depth = jnp.zeros_like(cell.front), pipeline.march.sample(cell)
+    point = along(ray.entry, ray.direction, depth)
+    return Sample(point, ray.direction, (), (zero, zero, zero), zero, zero + 1, ray.pixel)

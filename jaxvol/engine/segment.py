@@ -25,7 +25,7 @@ from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..selection import Selection
 from ..space import Ray
 from ..transfer import Classification, Measured
-from .inline_shading import inline_colors, inline_shader
+from .inline_shading import inline_shader, light_terms, lit_color
 from .tiling import Tiling
 from .visible_samples import shaded_colors
 
@@ -38,11 +38,12 @@ def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, arrays (cells, rays). Cells
-    that a ray does not take are placed beyond its exit."""
+    that a ray does not take are placed beyond its exit. `light`: the terms of shading that is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
     opacity: list[Scalar]
+    light: list[PyTree] | None = None
 
     @property
     def number(self) -> int:
@@ -102,8 +103,10 @@ def march_segment(
     elif classification.light is None:
         colors = _colors(pipeline, at, every.measured)
     elif (shader := inline_shader(pipeline)) is not None:
-        plain = _colors(pipeline, at, every.measured)
-        colors = inline_colors(shader, pipeline, ray, at, every.cells, plain, samples.opacity)
+        assert every.light is not None
+        lit = vmap_cells(partial(lit_color, shader, pipeline), (False, True, True, True))
+        parts = every.cells, _colors(pipeline, at, every.measured), every.light
+        colors = [lit(ray, *piece) for piece in zip(*parts, strict=True)]
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
@@ -166,7 +169,9 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
     else:
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
-    return Samples(list(cells(at, given)), values, alphas)
+    shader = inline_shader(pipeline)
+    light = None if shader is None else light_terms(shader, pipeline, live, ray, partial(cells, at, given))
+    return Samples(list(cells(at, given)), values, alphas, light)
 
 
 def always(at: Progress) -> Bool[Array, ""]:
