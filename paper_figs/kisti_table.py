@@ -1,6 +1,6 @@
 """The KISTI report's table (2005): what early ray termination (ERT) and empty-space skipping (ESS) save.
-Writes the record of `experiments/kisti.py` in Markdown, beside the report's table, with the quotient of both
-speed-ups.
+Writes the record of `experiments/kisti.py` in Markdown, with shading on as in the report and without, beside
+the report's table, with the quotient of both speed-ups.
 """
 
 from argparse import Namespace
@@ -8,15 +8,16 @@ from typing import Any
 
 from experiments import record
 from experiments.command import command
-from experiments.kisti import BOTH, ERT, ESS, NEITHER, REPORT
+from experiments.kisti import BOTH, BOTH_SKIPPED, ERT, ESS, NEITHER, REPORT, SKIPPED
 
 from .common import OUTPUT, RECORDS, write_table
 
 
-def table(measured: dict[str, Any]) -> str:
-    """The record of `experiments/kisti.py` and the report's table, as one Markdown table."""
+def table(measured: dict[str, Any], shading: str) -> str:
+    """One half of the record of `experiments/kisti.py`, "scenes" (unshaded) or "shaded", and the report's
+    table, as one Markdown table."""
     result = measured["result"]
-    sizes, scenes = [str(size) for size in result["sizes"]], result["scenes"]
+    sizes, scenes = [str(size) for size in result["sizes"]], result[shading]
     lines = ["| | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
 
     def line(name: str, cells: list[list[str]]) -> None:
@@ -28,27 +29,50 @@ def table(measured: dict[str, Any]) -> str:
             rows = [[row[key] for row in pair] for pair in rows]
         return [[format(value, form) for value in pair] for pair in rows]
 
-    for method in (ERT, ESS, BOTH):
-        line(method, of(method, ".2f", "speed-up", "median"))
+    ours = {ERT: [ERT], ESS: [SKIPPED, ESS], BOTH: [BOTH_SKIPPED, BOTH]}
+    for method, forms in ours.items():
         line(f"*report: {method}*", [[f"{gain:.2f}" for gain in REPORT[scene][method]] for scene in REPORT])
-        quotients = [
-            [
-                f"{scenes[scene][size][method]['speed-up']['median'] / gain:.2f}"
-                for size, gain in zip(sizes, REPORT[scene][method], strict=True)
+        for form in forms:
+            if form not in scenes[next(iter(REPORT))][sizes[0]]:
+                continue
+            line(form, of(form, ".2f", "speed-up", "median"))
+            quotients = [
+                [
+                    f"{scenes[scene][size][form]['speed-up']['median'] / gain:.2f}"
+                    for size, gain in zip(sizes, REPORT[scene][method], strict=True)
+                ]
+                for scene in REPORT
             ]
-            for scene in REPORT
-        ]
-        line(f"{method}, ours / report's", quotients)
+            line(f"{form}, ours / report's", quotients)
     line(f"seconds, {NEITHER}", of(NEITHER, ".3f", "seconds"))
     line(f"RMSE, {NEITHER}", of(NEITHER, ".4f", "rmse"))
     line(f"RMSE, {BOTH}", of(BOTH, ".4f", "rmse"))
     return "\n".join(lines) + "\n"
 
 
+def tested_every(measured: dict[str, Any]) -> str:
+    """What early termination gains where ended rays are looked for every so many samples."""
+    rows = measured["result"]["ended rays are looked for every so many samples"]
+    counts = list(rows[next(iter(REPORT))])
+    lines = ["| samples | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
+    for count in counts:
+        cells = [
+            f"{rows[scene][count]['speed-up']['median']:.2f} ({rows[scene][count]['seconds'][ERT]:.3f} s)"
+            for scene in REPORT
+        ]
+        lines.append(f"| {count} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def tables(measured: dict[str, Any]) -> str:
+    """All three."""
+    return "\n".join((table(measured, "shaded"), table(measured, "scenes"), tested_every(measured)))
+
+
 @command(__doc__, OUTPUT, results=RECORDS)
 def main(chosen: Namespace) -> None:
     measured = record.read(chosen.results / "kisti.json")
-    write_table(table(measured), chosen.output / "kisti_table.md")
+    write_table(tables(measured), chosen.output / "kisti_table.md")
 
 
 if __name__ == "__main__":

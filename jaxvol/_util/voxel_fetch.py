@@ -140,7 +140,8 @@ class Packed(Fetch):
         return [row(base), row(base + ny * nz)], fraction
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
-        if self.nodes is None:
+        nodes = self.nodes
+        if nodes is None:
             return super().slopes(data, coordinate)
         node, fraction = split(coordinate, data.shape)
         base = flat_index(node, data.shape) if self.begin is None else self.begin
@@ -154,7 +155,7 @@ class Packed(Fetch):
         length = data.size - last
 
         def word(offset: int) -> Int[Array, ""]:
-            return gather(jax.lax.slice(self.nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
+            return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
 
         words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
 

@@ -27,8 +27,9 @@ from ..volume import with_fetch
 def inline_shader(pipeline: Pipeline) -> Shader | None:
     """What shades all samples of a march where they are, if anything does."""
     light = pipeline.classification.light
-    inline = isinstance(light, Shader) and light.shading.inline
-    return light if inline and not isinstance(pipeline.compositing, Selection) else None
+    if not isinstance(light, Shader) or isinstance(pipeline.compositing, Selection):
+        return None
+    return light if light.shading.inline else None
 
 
 def light_terms(

@@ -150,7 +150,8 @@ class PhongShading(Shading):
             highlight = jnp.exp(self.how.specular_power * jnp.log(jnp.where(shines, mirrored, 1)))
             diffuse = plus(diffuse, scaled(lit.irradiance, jnp.where(facing <= 0, 0, facing)))
             specular = plus(specular, scaled(lit.irradiance, jnp.where(shines, highlight, 0)))
-        factor = plus(scaled(diffuse, self.how.diffuse), (self.how.ambient,) * 3)
+        ambient = self.how.ambient
+        factor = plus(scaled(diffuse, self.how.diffuse), (ambient, ambient, ambient))
         return plus(times(sample.color, factor), scaled(specular, self.how.specular))
 
 

@@ -167,8 +167,8 @@ def lit(
     around = Surroundings(volume, jv.colormap("gray", (0.0, 1.0)), Affine(volume))
     one, direction = jnp.ones(()), np.asarray(direction, float) / np.linalg.norm(direction)
     zero = jnp.zeros((), jnp.int32)
-    place = (apart(jnp.asarray(p, jnp.float32)) for p in (point, direction))
-    sample = Sample(*place, (), apart(jnp.asarray(COLOR, jnp.float32)), one, one, (zero, zero))
+    place, along = (apart(jnp.asarray(p, jnp.float32)) for p in (point, direction))
+    sample = Sample(place, along, (), apart(jnp.asarray(COLOR, jnp.float32)), one, one, (zero, zero))
     return np.asarray(jnp.stack(shade_sample(lighting.shading(around), around, sample)))
 
 
