@@ -52,9 +52,9 @@ class TransferFunction2D(Transfer):
     - `extinction`: (n, m), in 1/length, ≥ 0.
 
     The magnitude is that of `volume.gradient`: of central differences at the nodes, interpolated, and divided
-    by the volume's spacing. Under a `ToroidalMap`, which bends the grid, it is still that of the straight grid:
-    choose a spacing for which that has a meaning. The image depends on the spacing through the magnitude,
-    too, and so does its gradient.
+    by the volume's spacing. The image depends on the spacing through the magnitude, too, and so does its
+    gradient. Under a `ToroidalMap`, which bends the grid, it is still that of the straight grid: choose a
+    spacing for which that has a meaning.
 
     Look-up, `majorant` and leaping are exact. The extinction along a ray has a kink where the ray passes from
     voxel to voxel or from cell to cell of the table, and where the gradient is 0, at which the derivative of
