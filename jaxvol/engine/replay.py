@@ -188,9 +188,9 @@ class Replay(SampleVisitor):
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
-        of_point = [None] * len(depths) if shaded is None else [part.of_point for part in shaded]
+        of_place = [None] * len(depths) if shaded is None else [part.of_place for part in shaded]
         (of_march, of_volume, of_rays), bases, of_cubes = self._geometric_vjp(
-            ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_point, strict=True))
+            ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         )
         voxels = total.voxels
         if voxels is not None:
@@ -226,9 +226,10 @@ class Replay(SampleVisitor):
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
             for piece in pieces(pipeline, ray, at, number):
                 depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
-                point = None if self.shader is None else along(ray.entry, ray.direction, depth)
+                point = along(ray.entry, ray.direction, depth)
+                place = None if self.shader is None else (point, ray.direction)
                 at_depth = depth if self.given.depth is not None else None
-                found.append((floats(measured), piece.width, at_depth, point))
+                found.append((floats(measured), piece.width, at_depth, place))
             return found, record.bases
 
         rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))

@@ -34,13 +34,13 @@ class ShadingTotal(NamedTuple):
 
 class ShadingVjp(NamedTuple):
     """Shaded colours of samples, arrays (cells, rays); and the cotangents of their unshaded colour,
-    extinction, value and world points. 0 for invisible samples."""
+    extinction and value, and of their world points and directions. 0 for invisible samples."""
 
     color: Vec3
     of_color: Vec3
     of_extinction: Scalar
     of_value: Scalar
-    of_point: Vec3
+    of_place: tuple[Vec3, Vec3]
 
 
 def shading_vjp(
@@ -66,14 +66,13 @@ def shading_vjp(
         real = indices < size
         red, green, blue = (jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
         color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
-        part = ShadingVjp(
-            color, of_sample.color, of_sample.extinction, of_sample.measured[0], of_sample.point
-        )
+        place = of_sample.point, of_sample.direction
+        part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured[0], place)
         return chosen.put(found, indices, part), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     zeros = zero, zero, zero
-    start = ShadingVjp(zeros, zeros, zero, zero, zeros)
+    start = ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros))
     found, total = chosen.fold(one, (start, total))
     return chosen.split(found, len(weights.weight)), total
 

@@ -126,14 +126,15 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("field", FIELDS)
 def test_normals_are_within_half_a_degree(field, kind, spacing):
-    """Of the bell in 8 bits, whose slopes are a few units of its values, on average."""
+    """In 8 bits on average: where a field rises by 40 from node to node, rounding turns a normal by up to 0.7
+    degrees, more where it rises less."""
     volume = sampled(field, kind, spacing)
     outward = np.random.default_rng(2).normal(size=(500, 3))
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
     radius = {"ball": 1.0, "bell": 0.5}[field]
     off = angles(normals(accelerated(volume), Affine(volume), radius * outward), -outward)
     assert np.mean(off) < 0.5
-    if (field, kind) != ("bell", "uint8"):
+    if kind != "uint8":
         assert np.max(off) < 0.5
 
 
@@ -217,7 +218,7 @@ def test_a_plane_that_faces_the_head_light_has_vtks_colour():
 
 def test_both_sides_are_lit_alike():
     for light in LIGHTS.values():
-        front, back = (lit(Phong(light), side * VIEWS[1], -VIEWS[2]) for side in (1, -1))
+        front, back = (lit(Phong(light), side * VIEWS[1], -VIEWS[0]) for side in (1, -1))
         np.testing.assert_allclose(front, back, atol=1e-6)
         assert np.all(front > 0.15 * COLOR)
 
@@ -241,6 +242,7 @@ def test_without_a_gradient_there_is_ambient_light_and_no_derivative(light):
         return jnp.sum(image), image
 
     slope, image = jax.grad(loss, has_aux=True)(jnp.full((4, 4, 4), 0.5))
+    image = np.asarray(image)
     np.testing.assert_allclose(image[..., :3], image[..., 3:] * (0.1 * COLOR), atol=1e-6)
     np.testing.assert_array_equal(slope, 0)
 
@@ -365,6 +367,11 @@ def test_leaping_and_tiles_show_neither_in_the_image_nor_in_its_gradient():
     )
     assert np.mean(np.asarray(leapt[..., 3]) == 0) > 0.1
     np.testing.assert_allclose(leapt, other, atol=1e-6)
+    # of an extinction of 0 only what is not leapt over has a gradient
+    slope, other_slope = (
+        eqx.tree_at(lambda parts: parts[0].extinction, each, each[0].extinction[2:])
+        for each in (slope, other_slope)
+    )
     for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(other_slope), strict=True):
         assert np.linalg.norm(a - b) <= 1e-5 * max(np.linalg.norm(a), 1e-3)
 
