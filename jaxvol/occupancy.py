@@ -57,9 +57,10 @@ class Blocks(eqx.Module):
     def unordered(self) -> Bool[Array, "bx by bz"]:
         """Blocks that hold NaN, also as a slope: nothing is known about them."""
         unordered = ~(self.low <= self.high)
-        if self.slopes is None:
-            return unordered
-        return unordered | ~jnp.all(self.slopes.low <= self.slopes.high, axis=0)
+        if self.slopes is not None:
+            for low, high in zip(self.slopes.low, self.slopes.high, strict=True):
+                unordered |= ~(low <= high)
+        return unordered
 
     @property
     def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
@@ -99,12 +100,13 @@ class SlopeRanges(eqx.Module):
     def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
         """Least and greatest magnitude of the gradient, in value units per world length."""
         spacing = self.spacing.astype(self.low.dtype)
-        low, high = (slope / spacing[:, None, None, None] for slope in (self.low, self.high))
-        nearest = jnp.maximum(jnp.maximum(low, -high), 0)  # 0 where slopes change sign
-        farthest = jnp.maximum(jnp.abs(low), jnp.abs(high))
-        least, most = (jnp.sqrt(jnp.sum(each**2, axis=0)) for each in (nearest, farthest))
-        most = jnp.minimum(most, self.steepest / jnp.min(spacing))
-        return least * (1 - ROUNDING), most * (1 + ROUNDING)
+        least = most = jnp.zeros_like(self.steepest)
+        for axis in range(3):  # one by one: XLA's sum over a leading axis is slow on CPU
+            low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]
+            least += jnp.maximum(jnp.maximum(low, -high), 0) ** 2  # 0 where slopes change sign
+            most += jnp.maximum(-low, high) ** 2
+        most = jnp.minimum(jnp.sqrt(most), self.steepest / jnp.min(spacing))
+        return jnp.sqrt(least) * (1 - ROUNDING), most * (1 + ROUNDING)
 
 
 class Sums(eqx.Module):

@@ -69,10 +69,12 @@ def any_between(marked: Bool[Array, "n m"], rows: Lines, columns: Lines) -> Bool
     """Whether any crossing of these lines is marked: a summed-area table."""
     table = jnp.pad(marked.astype(jnp.int32), ((1, 0), (1, 0)))
     table = jnp.cumsum(jnp.cumsum(table, axis=0, dtype=jnp.int32), axis=1, dtype=jnp.int32)
+    flat = table.reshape(-1)
 
     def below(row: Int[Array, "*blocks"]) -> Int[Array, "*blocks"]:
         """Number of marked crossings of these columns and the rows before this one."""
-        return table[row, columns[1] + 1] - table[row, columns[0]]
+        start = row * table.shape[1]
+        return gather(flat, start + columns[1] + 1) - gather(flat, start + columns[0])
 
     return below(rows[1] + 1) > below(rows[0])
 
