@@ -166,7 +166,7 @@ class TransferFunction2D(Transfer):
         mean = jnp.einsum("pnm,pc->nmc", each, rgb) / jnp.where(extinction > 0, extinction, 1)[..., None]
         # where nothing is seen, the colour of the nearest point, so that it reaches to its sides
         nearest = rgb[np.argmin(np.maximum(*away), axis=0)]
-        return cls(*lines, jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
+        return cls(lines[0], lines[1], jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
 
     def __call__(self, value: Scalar, magnitude: Scalar) -> tuple[Vec3, Scalar]:
         """Colour (r, g, b) and extinction of a value and a magnitude of the gradient."""
