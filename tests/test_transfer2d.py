@@ -210,14 +210,15 @@ def test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block(kind):
     for seed in range(6):
         transfer = random_table(12, 9, seed)
         magnitude, extinction, block = measured_in_blocks(volume, transfer)
-        known = ~unordered[block]
-        assert np.all(np.isfinite(extinction[known]))
+        # a node on a face is interpolated with those above it, also in the block below: 0 · NaN is NaN
+        lost, above = np.isnan(extinction), np.s_[: -volume.data.size]
+        assert np.all(unordered[block][above][lost[above]])
+        known = ~unordered[block] & ~lost
         assert np.all((least[block] <= magnitude)[known])
         assert np.all((magnitude <= most[block])[known])
         bound, visible = (np.asarray(each) for each in bounds(transfer, blocks))
         assert np.all((extinction <= bound[block])[known])
         np.testing.assert_array_equal((bound > 0)[~unordered], visible[~unordered])
-        assert np.all(unordered[block][np.isnan(extinction)])
 
 
 def test_bounds_are_close_and_homogeneous_blocks_are_empty():
@@ -298,25 +299,28 @@ def test_the_fast_engine_is_the_reference(transforms, kind, lit):
 
 @pytest.mark.parametrize("method", slow("hierarchy", "distance", "beam"))
 def test_leaping_shows_neither_in_the_image_nor_in_its_gradient(method):
-    volume, _, camera, _ = scene_of((), size=(40, 36), kind="float32")
+    with in_float64():
+        volume, _, camera, _ = to_float64(scene_of((), size=(40, 36), kind="float32"))
 
-    def loss(parts, transforms):
-        rgba = jv.render(*parts, march=jv.March(0.11, transforms)).rgba
-        return jnp.sum(rgba**2), rgba
+        def loss(parts, transforms):
+            rgba = jv.render(*parts, march=jv.March(0.11, transforms)).rgba
+            return jnp.sum(rgba**2), rgba
 
-    always = jv.EmptySpaceJitter(4), jv.AlphaCorrection()
-    (slope, whole), (other_slope, other) = (
-        eqx.filter_grad(loss, has_aux=True)((volume, emphasised(), camera), transforms)
-        for transforms in (always, (*always, jv.SpaceLeaping(method)))
-    )
-    blocks = Blocks.of(volume, slopes=True)
-    assert np.mean(emphasised().visible(blocks)) < 0.8
-    np.testing.assert_allclose(whole, other, atol=1e-6)
-    for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(other_slope), strict=True):
-        visible = np.ones(a.shape, bool)
-        if a.shape == emphasised().extinction.shape:  # an extinction of 0 has a gradient that leaps miss
-            visible = np.asarray(emphasised().extinction) > 0
-        assert np.linalg.norm((a - b)[visible]) <= 1e-5 * max(np.linalg.norm(a), 1e-3)
+        always, parts = (jv.EmptySpaceJitter(4), jv.AlphaCorrection()), (volume, emphasised(), camera)
+        (slope, whole), (other_slope, other) = (
+            eqx.filter_grad(loss, has_aux=True)(parts, transforms)
+            for transforms in (always, (*always, jv.SpaceLeaping(method)))
+        )
+        assert np.mean(emphasised().visible(Blocks.of(volume, slopes=True))) < 0.8
+        np.testing.assert_allclose(whole, other, atol=1e-9)
+        # leaps miss the derivative by an extinction of 0
+        seen = emphasised().extinction > 0
+        slopes = [
+            eqx.tree_at(lambda s: s[1].extinction, each, jnp.where(seen, each[1].extinction, 0))
+            for each in (slope, other_slope)
+        ]
+        for a, b in zip(*map(jax.tree.leaves, slopes), strict=True):
+            assert np.linalg.norm(a - b) <= 1e-6 * max(np.linalg.norm(a), 1e-3)
 
 
 def test_slopes_are_stored_for_a_transfer_function_that_reads_them():
