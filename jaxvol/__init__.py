@@ -56,6 +56,7 @@ from .render import render as render, render_rays as render_rays
 from .rendering import Rendering as Rendering
 from .selection import FirstVisible as FirstVisible, Selection as Selection
 from .transfer import TransferFunction as TransferFunction
+from .transfer2d import TransferFunction2D as TransferFunction2D
 from .transforms import (
     AdaptiveSampling as AdaptiveSampling,
     AlphaCorrection as AlphaCorrection,

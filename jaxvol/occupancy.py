@@ -39,26 +39,74 @@ class Blocks(eqx.Module):
     high: Float[Array, "bx by bz"]
     labels: UInt32[Array, "bx by bz"] | None
     """Bit `label % 32` is set for each label of the block's nodes."""
+    slopes: "SlopeRanges | None" = None
+    """None: nothing is known about them."""
 
     @classmethod
-    def of(cls, volume: Volume) -> "Blocks":
-        """The blocks of a volume, computed once for each array of voxels and of labels."""
+    def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
+        """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: with the
+        ranges of slopes, for those who read the gradient."""
         labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
         low, high = memoized(volume.data, _ranges)
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
-        return cls(low, high, labels)
+        known = slopes and volume.field is None
+        return cls(low, high, labels, SlopeRanges.of(volume) if known else None)
 
     @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
-        """Blocks that hold NaN: nothing is known about them."""
-        return ~(self.low <= self.high)
+        """Blocks that hold NaN, also as a slope: nothing is known about them."""
+        unordered = ~(self.low <= self.high)
+        if self.slopes is not None:
+            for low, high in zip(self.slopes.low, self.slopes.high, strict=True):
+                unordered |= ~(low <= high)
+        return unordered
+
+    @property
+    def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+        """Least and greatest magnitude of the gradient (`Volume.gradient`)."""
+        if self.slopes is None:
+            return jnp.zeros_like(self.low), jnp.full_like(self.high, jnp.inf)
+        return self.slopes.magnitudes
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
         """Which blocks may hold this label."""
         if self.labels is None:
             return jnp.ones(self.low.shape, bool)
         return (self.labels >> (label % 32)) & 1 == 1
+
+
+class SlopeRanges(eqx.Module):
+    """Ranges of slopes along x, y, z in each block, including the nodes on its faces. Slopes between nodes
+    are interpolated, and so within these ranges.
+
+    - `low`, `high`: least and greatest slope along each axis, in value units per node.
+    - `steepest`: greatest length of a node's three slopes, per node. Interpolation never exceeds it.
+    - `spacing`: of the volume. Ranges do not depend on it, so that they are kept where it changes.
+    """
+
+    low: Float[Array, "3 bx by bz"]
+    high: Float[Array, "3 bx by bz"]
+    steepest: Float[Array, "bx by bz"]
+    spacing: Float[Array, "3"]
+
+    @classmethod
+    def of(cls, volume: Volume) -> "SlopeRanges":
+        """Those of a volume's voxels, computed once for each array of them."""
+        low, high, steepest = memoized(volume.data, _slope_ranges)
+        return cls(low, high, steepest, jax.lax.stop_gradient(volume.spacing))
+
+    @property
+    def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+        """Least and greatest magnitude of the gradient, in value units per world length."""
+        spacing = self.spacing.astype(self.low.dtype)
+        least = most = jnp.zeros_like(self.steepest)
+        for axis in range(3):  # one by one: XLA's sum over a leading axis is slow on CPU
+            low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]
+            least += jnp.maximum(jnp.maximum(low, -high), 0) ** 2  # 0 where slopes change sign
+            most += jnp.maximum(-low, high) ** 2
+        most = jnp.minimum(jnp.sqrt(most), self.steepest / jnp.min(spacing))
+        return jnp.sqrt(least) * (1 - ROUNDING), most * (1 + ROUNDING)
 
 
 class Sums(eqx.Module):
@@ -145,6 +193,50 @@ def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], 
     low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     slack = ROUNDING * jnp.maximum(abs(low), abs(high))
     return low - slack, high + slack
+
+
+@jax.jit
+def _slope_ranges(
+    data: Shaped[Array, "nx ny nz"],
+) -> tuple[Float[Array, "3 bx by bz"], Float[Array, "3 bx by bz"], Float[Array, "bx by bz"]]:
+    """What `SlopeRanges` holds of the voxels, one layer of blocks after the other: the slopes of a volume
+    would take several times its memory."""
+    last = data.shape[0] - 1
+
+    def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
+        node = jnp.clip(BLOCK * block + jnp.arange(BLOCK + 1), 0, last)
+        before, here, after = (
+            data[jnp.clip(node + side, 0, last)].astype(jnp.float32) for side in (-1, 0, 1)
+        )
+        border = ((node == 0) | (node == last))[:, None, None]
+        along_x = (after - before) * jnp.where(border, 1, 0.5).astype(jnp.float32)
+        slopes = jnp.stack([along_x, _central(here, 1), _central(here, 2)])
+        square = jnp.max(jnp.sum(slopes**2, axis=0), axis=0)
+        low, high, square = (
+            jax.vmap(lambda part, of=of: over_blocks(part, of))(part)
+            for part, of in (
+                (jnp.min(slopes, axis=1), jnp.minimum),
+                (jnp.max(slopes, axis=1), jnp.maximum),
+                (square[None], jnp.maximum),
+            )
+        )
+        # inside loops on CPU, XLA's minima and maxima lose NaN
+        lost = over_blocks(jnp.any(jnp.isnan(slopes), axis=(0, 1)), jnp.logical_or)
+        slack = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
+        steepest = jnp.sqrt(square[0]) * (1 + ROUNDING)
+        return jnp.where(lost, jnp.nan, low - slack), jnp.where(lost, jnp.nan, high + slack), steepest
+
+    low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
+    return jnp.moveaxis(low, 0, 1), jnp.moveaxis(high, 0, 1), steepest
+
+
+def _central(values: Float[Array, "nx ny nz"], axis: int) -> Float[Array, "nx ny nz"]:
+    """Slopes of nodes along an axis, as `voxel_fetch.Fetch.slopes` has them."""
+    rise = jnp.diff(values, axis=axis)
+    n = values.shape[axis] - 1
+    first, last = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 1, n)))
+    before, after = (jax.lax.slice_in_dim(values, *part, axis=axis) for part in ((0, n - 1), (2, n + 1)))
+    return jnp.concatenate([first, (after - before) / 2, last], axis)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.checks import Arrayable, finite_array, number, require, unit_interval
+from ._util.checks import Arrayable, finite_array, increasing, number, require, unit_interval
 from ._util.piecewise_linear import (
     FEW,
     clip_below,
@@ -93,6 +93,12 @@ class Transfer(eqx.Module):
     def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
         """What is read beside the value; by default nothing."""
         return ()
+
+    @property
+    def reads_gradient(self) -> bool:
+        """Whether `beside` reads the volume's gradient, so that it is worth storing slopes, and the ranges of
+        them in blocks (`Blocks.slopes`). By default not."""
+        return False
 
     @abstractmethod
     def classifier(self) -> Classify:
@@ -214,16 +220,8 @@ class TransferFunction(Transfer):
     extinction: Float[Array, " n"]
 
     def __init__(self, values: Arrayable, colors: Arrayable, extinction: Arrayable):
-        values = finite_array("values", values, (None,))
-        n = values.shape[0]
-        if n < 2:
-            raise ValueError(f"values must hold at least 2 control points; got {n}.")
-        self.values = require(
-            values,
-            lambda v: (v[1:] >= v[:-1]).all() & (v[2:] > v[:-2]).all(),
-            "values must increase from point to point, but for two equal ones that make a step; got {got}. "
-            "Sort them, and let no three be equal.",
-        )
+        self.values = increasing("values", values)
+        n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
         extinction = finite_array("extinction", extinction, (n,))
         self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")

@@ -63,7 +63,9 @@ def why_unseen(
         return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     shown = _shown(transfer)
     if shown is None:
-        return f"{where}, and the transfer function shows none of them, or only under another label."
+        return (
+            f"{where}, and the transfer function shows none of them, or only under another label or gradient."
+        )
     if not shown:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
     ranges = " or ".join(_range_text(*ends) for ends in shown)

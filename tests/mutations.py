@@ -76,6 +76,9 @@ RENDERED = "test_agreement.py::test_render_agrees_with_the_independent_marcher"
 
 SLOPES = "lighting/test_phong.py::test_the_gradient_is_interpolated_between_central_differences"
 
+TABLE = "test_transfer2d.py::test_the_table_is_bilinear_and_constant_beyond_its_lines"
+RANGES = "test_transfer2d.py::test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block"
+
 MUTATIONS = [
     # shading by gradients
     Mutation(
@@ -105,6 +108,49 @@ MUTATIONS = [
         "pipeline.march.sample(cell)",
         "cell.front",
         ("lighting/test_phong.py::test_quadratures_shade_where_they_sample[preintegrated]",),
+    ),
+    # transfer functions of value and gradient magnitude
+    Mutation(
+        "2-D transfer function: rows as long as the number of lines",
+        "transfer2d.py",
+        "return i * (self.magnitudes.shape[0] - 1) + j",
+        "return i * self.magnitudes.shape[0] + j",
+        (f"{TABLE}[5-3]",),
+    ),
+    Mutation(
+        "2-D transfer function: the derivative by the magnitude is that by the value",
+        "transfer2d.py",
+        "of_across * slope_between_lines(self.magnitudes",
+        "of_along * slope_between_lines(self.magnitudes",
+        ("test_transfer2d.py::test_the_pull_of_many_samples_is_jaxs_derivative",),
+    ),
+    Mutation(
+        "slopes of blocks: without the nodes on their far faces",
+        "occupancy.py",
+        "jnp.clip(BLOCK * block + jnp.arange(BLOCK + 1), 0, last)",
+        "jnp.clip(BLOCK * block + jnp.arange(BLOCK), 0, last)",
+        (f"{RANGES}[float32]",),
+    ),
+    Mutation(
+        "slopes of blocks: per node, not per world length",
+        "occupancy.py",
+        "low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]",
+        "low, high = self.low[axis], self.high[axis]",
+        (f"{RANGES}[float32]",),
+    ),
+    Mutation(
+        "slopes of blocks: one that is NaN is like any other",
+        "occupancy.py",
+        "unordered |= ~(low <= high)",
+        "unordered |= low > high",
+        (f"{RANGES}[NaN]",),
+    ),
+    Mutation(
+        "2-D transfer function: a range ends at the line below its end",
+        "_util/bilinear.py",
+        "last = jnp.maximum(points_below(lines, high, strictly=True), points_below(lines, high) - 1)",
+        "last = jnp.maximum(points_below(lines, high) - 1, 0)",
+        (f"{RANGES}[float32]",),
     ),
     # planning
     Mutation(

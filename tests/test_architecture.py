@@ -24,6 +24,7 @@ ORDER = [
     "space",
     "transfer",
     "labels",
+    "transfer2d",
     "display",
     "presets",
     "camera",

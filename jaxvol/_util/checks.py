@@ -135,6 +135,19 @@ def number(
     )
 
 
+def increasing(name: str, value: Arrayable) -> Array:
+    """`value` as an array of at least two numbers that increase, but for two equal ones that make a step."""
+    array = finite_array(name, value, (None,))
+    if array.shape[0] < 2:
+        raise ValueError(f"{name} must hold at least 2 control points; got {array.shape[0]}.")
+    return require(
+        array,
+        lambda v: (v[1:] >= v[:-1]).all() & (v[2:] > v[:-2]).all(),
+        f"{name} must increase from point to point, but for two equal ones that make a step; got {{got}}. "
+        "Sort them, and let no three be equal.",
+    )
+
+
 def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> Array:
     """`value` as an array of numbers in [0, 1]."""
     array = finite_array(name, value, shape)

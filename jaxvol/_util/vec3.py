@@ -54,6 +54,12 @@ def dot(a: Vec3, b: Vec3) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def length(a: Vec3) -> Scalar:
+    """Length of a vector. Of that of length 0, the derivative is 0."""
+    square = dot(a, a)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), square)
+
+
 def greatest(a: Vec3) -> Scalar:
     """The greatest component."""
     return jnp.maximum(jnp.maximum(a[0], a[1]), a[2])

@@ -13,7 +13,7 @@ from ..march import EmptySpaceIndex, March, View
 from ..occupancy import Blocks
 from ..reference import Pipeline, end
 from ..selection import FirstVisible
-from ..transfer import classification_of
+from ..transfer import Transfer, classification_of
 from ..variation import Windows
 from ..volume import Volume
 from .batch import Beams
@@ -35,11 +35,14 @@ class VolumeAcceleration(eqx.Module):
     windows: Windows | None
 
     @classmethod
-    def of(cls, volume: Volume, march: March, lighting: Lighting | None = None) -> "VolumeAcceleration":
+    def of(
+        cls, volume: Volume, transfer: Transfer, march: March, lighting: Lighting | None = None
+    ) -> "VolumeAcceleration":
+        lit_by_gradient = lighting is not None and lighting.reads_gradient
         return cls(
             words_of(volume),
-            slopes_of(volume) if lighting is not None and lighting.reads_gradient else None,
-            Blocks.of(volume) if march.leaps else None,
+            slopes_of(volume) if transfer.reads_gradient or lit_by_gradient else None,
+            Blocks.of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
             Windows.of(volume) if march.looks_ahead else None,
         )
 

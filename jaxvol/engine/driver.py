@@ -36,7 +36,7 @@ def render_scene(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None
     if lighting is not None:
         lighting = lighting.prepared(volume, transfer, march)
     options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
-    acceleration = VolumeAcceleration.of(volume, march, lighting)
+    acceleration = VolumeAcceleration.of(volume, transfer, march, lighting)
     scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
     if resolves(scene.compositing, lighting):
         return _resolved(scene, options, how, acceleration)

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Int
 
 from .._util.sharding import varying
 from .._util.trees import PyTree, added, floats, zeros_of
+from .._util.voxel_fetch import Fetch
 from ..lighting.shading import Shader, Surroundings
 from ..march import EmptySpaceIndex
 from ..reference import Pipeline
@@ -73,7 +74,7 @@ class _Image(NamedTuple):
 
     scene: Scene
     pipeline: Pipeline
-    words: UInt32[Array, " voxels"] | None
+    fetch: Fetch
     empty_space: EmptySpaceIndex | None
     shader: Shader | None
     fault: Bool[Array, ""]
@@ -98,7 +99,7 @@ class _Image(NamedTuple):
 
         rays, pull = eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
         replay = Replay(
-            *(self.pipeline, self.scene, self.words, rays, Cotangents.of(rays, rendering, cotangent)),
+            *(self.pipeline, self.scene, self.fetch, rays, Cotangents.of(rays, rendering, cotangent)),
             *(sums.total, self.shader, self.tiling),
         )
         beams = Beams(rays, self.tiles.beam_count, self.tiles.box(source, rays, number), range_)
@@ -137,7 +138,7 @@ def _vjp_by_tiles(
     shader, pull_shader = None, None
     if lighting is not None:
         shader, pull_shader = _shader_of(scene, packed.volume, voxels=of_voxels)
-    image = _Image(*(scene, pipeline, acceleration.words, index, shader, fault_of(scene), tiles, tiling))
+    image = _Image(*(scene, pipeline, packed.volume.fetch, index, shader, fault_of(scene), tiles, tiling))
     of_transfer = any(jax.tree.leaves(perturbed.transfer))
     sums = _Sums(
         Total.zeros(scene, shader, transfer=of_transfer, geometric=geometric, voxels=of_voxels),

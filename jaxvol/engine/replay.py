@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float, Int
 
 from .._util.trees import PyTree, added, floats, zeros_of
 from .._util.vec3 import Scalar, Vec3, along
-from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from .._util.voxel_fetch import Cube, Fetch, Recording, cubes_of_zeros, scatter_add
 from ..compositing import Weighting
 from ..lighting.shading import Shader
 from ..reference import Pipeline, Progress, measure, pieces
@@ -37,7 +37,6 @@ from ..rendering import Rendering
 from ..space import Ray
 from ..transfer import Transfer, classification_of
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
-from .packing import with_words
 from .scene import Scene
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
@@ -109,7 +108,7 @@ class Replay(SampleVisitor):
     **Arguments:**
 
     - `pipeline`: of the rays; without lighting. `scene`: what the gradient is taken by.
-    - `words`: the packed copy of the scene's voxels.
+    - `fetch`: of the scene's voxels, from their packed copy where there is one.
     - `rays`: those that are marched.
     - `given`: cotangents of the rays.
     - `total`: the gradients so far, to which those of these rays are added.
@@ -117,7 +116,7 @@ class Replay(SampleVisitor):
     """
 
     volume: Volume
-    words: UInt32[Array, " voxels"] | None
+    fetch: Fetch
     transfer: Transfer
     pipeline: Pipeline
     shader: Shader | None
@@ -131,14 +130,14 @@ class Replay(SampleVisitor):
         self,
         pipeline: Pipeline,
         scene: Scene,
-        words: UInt32[Array, " voxels"] | None,
+        fetch: Fetch,
         rays: Ray,
         given: Cotangents,
         total: Total,
         shader: Shader | None,
         tiling: Tiling,
     ):
-        self.volume, self.words, self.transfer = scene.volume, words, scene.transfer
+        self.volume, self.fetch, self.transfer = scene.volume, fetch, scene.transfer
         self.pipeline, self.shader = pipeline, shader
         self.given, self.total, self.tiling = given, total, tiling
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
@@ -221,7 +220,7 @@ class Replay(SampleVisitor):
         ) -> tuple[list[Any], list[Array]]:
             march, volume, ray = eqx.combine((march, volume, ray), (*fixed[:2], ray_fixed))
             whole, record = with_voxels(volume, self.volume.data), Recording(perturbations or [], [])
-            here = with_fetch(whole, record) if voxels else with_words(whole, self.words)
+            here = with_fetch(whole, record if voxels else self.fetch)
             found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
             pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)

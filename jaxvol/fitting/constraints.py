@@ -15,6 +15,7 @@ from ..labels import LabelTransferFunction
 from ..lighting import Material
 from ..march import March
 from ..transfer import TransferFunction
+from ..transfer2d import TransferFunction2D
 from ..volume import Volume
 from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInterval
 
@@ -116,10 +117,10 @@ def _default(node: Any) -> PyTree:
     return Unconstrained() if eqx.is_inexact_array(node) else Fixed()
 
 
-def _of_transfer(transfer: TransferFunction) -> PyTree:
+def _of_transfer(transfer: TransferFunction | TransferFunction2D) -> PyTree:
     top = float(jnp.max(transfer.extinction))
-    bounds = Fixed(), UnitInterval(), Positive(top if top > 0 else 1.0)
-    return eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), transfer, bounds)
+    bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
+    return eqx.tree_at(lambda t: (t.colors, t.extinction), _fixed(transfer), bounds)
 
 
 def _of_labels(transfer: LabelTransferFunction) -> PyTree:
@@ -142,6 +143,7 @@ def _fixed(node: Any) -> PyTree:
 
 _DEFAULTS: dict[type, Callable[[Any], PyTree]] = {
     TransferFunction: _of_transfer,
+    TransferFunction2D: _of_transfer,
     LabelTransferFunction: _of_labels,
     Camera: Pose,
     Volume: _of_volume,

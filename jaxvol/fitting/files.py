@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._util.checks import described
 from ..camera import Camera
 from ..display import from_srgb
 from ..transfer import TransferFunction
@@ -60,8 +61,12 @@ def read_transfer(path: File) -> TransferFunction:
         raise ValueError(f"{path}: {fault}") from fault
 
 
-def write_transfer(path: File, transfer: TransferFunction) -> Path:
-    """Write a transfer function in the format that `read_transfer` reads."""
+def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
+    """Write a transfer function in the format that `read_transfer` reads.
+
+    **Raises:** `ValueError` for other kinds of them, which that format does not hold."""
+    if not isinstance(transfer, TransferFunction):
+        raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     fields = {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}

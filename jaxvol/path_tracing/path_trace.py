@@ -145,7 +145,7 @@ def path_trace(
     inputs = _Inputs(
         volume,
         words_of(volume),
-        Blocks.of(volume),
+        Blocks.of(volume, slopes=transfer.reads_gradient),
         transfer,
         materials,
         lights,

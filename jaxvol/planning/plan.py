@@ -262,7 +262,7 @@ def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx
     volume, transfer, mode = setting
     if mode.resolves:
         transfer, _ = mode.marched(transfer, March(1.0, given), volume)
-    return mode.occupied(transfer, Blocks.of(volume))
+    return mode.occupied(transfer, Blocks.of(volume, slopes=transfer.reads_gradient))
 
 
 def _proven(

@@ -398,9 +398,9 @@ def test_slopes_are_stored_for_those_who_read_them():
 
     volume, march = shells(), jv.March(0.1)
     for lighting, stored in ((None, False), (Phong(), True), (Deferred(Phong()), True)):
-        found = VolumeAcceleration.of(volume, march, lighting)
+        found = VolumeAcceleration.of(volume, soft(), march, lighting)
         assert (found.slopes is not None) == stored
-    assert VolumeAcceleration.of(shells("float32"), march, Phong()).slopes is None
+    assert VolumeAcceleration.of(shells("float32"), soft(), march, Phong()).slopes is None
 
 
 def test_a_ray_can_be_shaded_once():

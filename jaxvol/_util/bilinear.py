@@ -1,0 +1,110 @@
+"""Piecewise bilinear functions of two variables, constant beyond a grid of lines: look-ups, and bounds over
+rectangles.
+
+Lines increase along each axis, but for two equal ones, between which the function has a step.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .piecewise_linear import points_below
+from .vec3 import Scalar
+from .xla import gather
+
+
+Lines = tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]
+"""The first and the last of some lines, inclusive."""
+
+
+def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, "..."], Scalar]:
+    """The interval in which a value lies, and which part of it lies below the value: 0 below the first line,
+    1 from the last one on. NaN stays NaN."""
+    lines = jax.lax.stop_gradient(lines)
+    index = jnp.clip(points_below(lines, value) - 1, 0, lines.shape[0] - 2)
+    start, end = gather(lines, index), gather(lines, index + 1)
+    gap = end - start
+    # a quotient of a smaller and a larger number never exceeds 1, unlike a product with 1 / gap
+    part = (value - start) / jnp.where(gap > 0, gap, 1)
+    return index, jnp.where(value < lines[0], 0, jnp.where(value >= lines[-1], 1, part))
+
+
+def slope_between_lines(lines: Float[Array, " n"], value: Scalar, index: Int[Array, "..."]) -> Scalar:
+    """The derivative of the part that `between_lines` finds, by the value."""
+    gap = gather(lines, index + 1) - gather(lines, index)
+    inside = (value >= lines[0]) & (value < lines[-1]) & (gap > 0)
+    return jnp.where(inside, 1 / jnp.where(gap > 0, gap, 1), 0)
+
+
+def corner_rows(table: Float[Array, "n m columns"]) -> Float[Array, "cells corners"]:
+    """One row for each cell of the grid, in row-major order: the entries of its four corners."""
+    corners = [table[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1)]
+    return jnp.concatenate(corners, axis=-1).reshape(-1, 4 * table.shape[2])
+
+
+def interpolate_corners(row: tuple[Scalar, ...], along: Scalar, across: Scalar) -> tuple[Scalar, ...]:
+    """The entries at these parts of a cell. Means of what is at its corners, also when rounded: 0 between
+    zeros, and nowhere negative between positive numbers."""
+
+    def mix(part: Scalar, a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+        return tuple(p * (1 - part) + q * part for p, q in zip(a, b, strict=True))
+
+    n = len(row) // 4
+    first, second = (mix(across, row[at : at + n], row[at + n : at + 2 * n]) for at in (0, 2 * n))
+    return mix(along, first, second)
+
+
+def lines_between(
+    lines: Float[Array, " n"], low: Float[Array, "*blocks"], high: Float[Array, "*blocks"]
+) -> Lines:
+    """The lines on which a function depends from `low` to `high`: those within, and the next ones around."""
+    low, high = low.astype(lines.dtype), high.astype(lines.dtype)
+    first = jnp.maximum(points_below(lines, low) - 1, 0)
+    # the first line at or above `high`; the second of two lines at `high`
+    last = jnp.maximum(points_below(lines, high, strictly=True), points_below(lines, high) - 1)
+    return first, jnp.minimum(last, lines.shape[0] - 1)
+
+
+def any_between(marked: Bool[Array, "n m"], rows: Lines, columns: Lines) -> Bool[Array, "*blocks"]:
+    """Whether any crossing of these lines is marked: a summed-area table."""
+    table = jnp.pad(marked.astype(jnp.int32), ((1, 0), (1, 0)))
+    table = jnp.cumsum(jnp.cumsum(table, axis=0, dtype=jnp.int32), axis=1, dtype=jnp.int32)
+    flat = table.reshape(-1)
+
+    def below(row: Int[Array, "*blocks"]) -> Int[Array, "*blocks"]:
+        """Number of marked crossings of these columns and the rows before this one."""
+        start = row * table.shape[1]
+        return gather(flat, start + columns[1] + 1) - gather(flat, start + columns[0])
+
+    return below(rows[1] + 1) > below(rows[0])
+
+
+def greatest_between(table: Float[Array, "n m"], rows: Lines, columns: Lines) -> Float[Array, "*blocks"]:
+    """The greatest entry where these lines cross: four look-ups in tables of the maxima of all rectangles
+    whose sides are powers of two."""
+    maxima = jnp.stack([jnp.stack(_runs(wide, 1)) for wide in _runs(table, 0)])
+
+    def starts(lines: Lines, levels: int) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], ...]]:
+        """Two runs that cover some lines: the level of their length, and where they begin."""
+        first, last = lines
+        level = sum(
+            ((last - first + 1 >= 2**k).astype(jnp.int32) for k in range(1, levels)), jnp.zeros_like(first)
+        )
+        return level, (first, last + 1 - 2**level)
+
+    (wide, begins), (long, others) = (
+        starts(lines, maxima.shape[axis]) for axis, lines in enumerate((rows, columns))
+    )
+    return jnp.max(jnp.stack([maxima[wide, long, i, j] for i in begins for j in others]), axis=0)
+
+
+def _runs(table: Float[Array, "n m"], axis: int) -> list[Float[Array, "n m"]]:
+    """The maxima of 1, 2, 4, … entries from each one on along an axis."""
+    runs, length = [table], 1
+    while 2 * length <= table.shape[axis]:
+        later = jax.lax.slice_in_dim(runs[-1], length, None, axis=axis)
+        # the last ones are never asked for
+        rest = jax.lax.slice_in_dim(runs[-1], table.shape[axis] - length, None, axis=axis)
+        runs.append(jnp.maximum(runs[-1], jnp.concatenate([later, rest], axis)))
+        length *= 2
+    return runs
