@@ -15,7 +15,7 @@ import numpy as np
 
 from ._util.checks import output_file
 from .camera import Camera
-from .compositing import Compositing
+from .compositing import Compositing, Over
 from .display import image_file, save_image
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
@@ -25,7 +25,7 @@ from .march import March, Transform
 from .modes import MODES, Mode, compositing_of
 from .phantoms import phantom
 from .planning import plan
-from .presets import PRESETS, colormap, preset
+from .presets import PRESETS, SHADED, colormap, preset
 from .render import PLANNED, render
 from .transfer import TransferFunction
 from .transforms.alpha_correction import AlphaCorrection
@@ -252,8 +252,9 @@ def _view_options() -> argparse.ArgumentParser:
 
     appearance.add_argument(
         "--shade",
-        action="store_true",
-        help="shade by the gradient of the values, under a light at the camera",
+        action=argparse.BooleanOptionalAction,
+        help="shade by the gradient of the values, under a light at the camera; by default isosurfaces, and "
+        f"with the presets {', '.join(sorted(SHADED))}",
     )
 
     camera = view.add_argument_group("camera")
@@ -360,7 +361,8 @@ def _demo(options: argparse.Namespace) -> None:
     head = phantom("head", options.resolution)
     camera = Camera.looking_at(head, (0.65, -1, 0.15), size=size).zoom(1.45)
     march = March(float(head.spacing[0]) / 2, FAST, "midpoint")
-    _picture(head, preset("head", unit_distance=0.01), camera, march, options.output / "head.png")
+    look, path = preset("head", unit_distance=0.01), options.output / "head.png"
+    _picture(head, look, camera, march, path, lighting=Phong())
 
     # A translucent cube at a far too long step: each ray's last cell reaches past the cube by a different
     # fraction of a step, which shows as terraces unless the cell is cut at the exit.
@@ -379,7 +381,7 @@ def _render(options: argparse.Namespace) -> None:
     mode = _mode(options)
     volume, transfer, camera = _view(options)
     background = None if options.transparent else options.background
-    lighting = _lighting(options)
+    lighting = _lighting(options, mode)
     volume, march, lighting = _march(options, volume, transfer, camera, _clip(options), mode, lighting)
     _picture(
         *(volume, transfer, camera, march, options.output),
@@ -393,12 +395,18 @@ def _render(options: argparse.Namespace) -> None:
 def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
-    how = {"transforms": _clip(options), "compositing": _mode(options), "lighting": _lighting(options)}
+    mode = _mode(options)
+    how = {"transforms": _clip(options), "compositing": mode, "lighting": _lighting(options, mode)}
     print(plan(*_view(options), _tolerance(options), **how))
 
 
-def _lighting(options: argparse.Namespace) -> Lighting | None:
-    return Phong() if options.shade else None
+def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
+    """The light that the options ask for, or that is usual for what they show."""
+    shade = options.shade
+    if shade is None:
+        of_preset = options.preset in SHADED and isinstance(mode, Over)
+        shade = of_preset or isinstance(mode, Isosurface)
+    return Phong() if shade else None
 
 
 def _mode(options: argparse.Namespace) -> Compositing[Any]:

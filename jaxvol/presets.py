@@ -126,6 +126,11 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
 }
 
 
+SHADED = frozenset({"ct_bone", "ct_skin_bone", "ct_airway", "ct_chest", "engine", "bonsai", "head"})
+"""Presets that show surfaces, which the command line shades. Gradients of magnetic resonance images are
+mostly noise."""
+
+
 def preset(
     name: str | Any, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0
 ) -> TransferFunction:

@@ -12,7 +12,7 @@ from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -53,7 +53,8 @@ def frog(folder: Path, size: int) -> Subject:
 
     functions = [None, *(function(tuple(colors[3 * n % len(colors)]), 0.8) for n in range(1, 16))]
     camera = jv.Camera.looking_at(volume, (0.2, 0.3, -1), (0, -1, 0), size=(size, size)).zoom(1.3)
-    scene = Scene(volume, jv.LabelTransferFunction(functions), camera, voxel / 2)
+    transfer = cast(Any, jv.LabelTransferFunction(functions))  # Scene: for VTK and Dr.Jit, not used here
+    scene = Scene(volume, transfer, camera, voxel / 2)
     return matter(scene, 0.3, 3, (0.7, 0.6, 0.7))
 
 
