@@ -29,6 +29,9 @@ COLORS = {
     "deferred": "#fd8d8d",
     "shaded": "#6a3d9a",
     "shaded once": "#b15928",
+    "isosurface": "#1b9e77",
+    "isosurface, no leaping": "#d95f02",
+    "isosurface, leaping by distance": "#7570b3",
     VTK: "#555555",
     DRJIT: "#ff7f0e",
 }

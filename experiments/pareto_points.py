@@ -2,8 +2,8 @@
 
 Each method has its own sweep around one base: the midpoint rule at steps of one voxel, cells cut at the exit
 (`AlphaCorrection`), space leaping by the hierarchy, and rays that end at a transmittance of 1e-4. In a lit
-scene the base is lit once per ray, by one template of eight photons, and in a shaded one each sample is
-shaded by its gradient.
+scene the base is lit once per ray, by one template of eight photons; in a shaded one each sample is
+shaded by its gradient, and an isosurface where it is hit.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,7 @@ STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 BASE = "midpoint, step 1"
 LIT_BASE = "lit, midpoint, step 1"
 SHADED_BASE = "shaded, midpoint, step 1"
+SURFACE_BASE = "isosurface, step 1"
 PHOTONS = 8
 
 
@@ -62,7 +63,7 @@ def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = templates, 
     if "baked" in how:
         march["changed"] = keep
     made = ours(*transforms, lighting=partial(by, **how), **march)
-    return Setting(family, made, lambda row: row.lit and not row.shaded)
+    return Setting(family, made, lambda row: row.noisy)
 
 
 def straight(row: Row) -> bool:
@@ -72,6 +73,10 @@ def straight(row: Row) -> bool:
 
 def peer(row: Row) -> bool:
     return row.peers is None
+
+
+def unlit_peer(row: Row) -> bool:
+    return peer(row) and not row.shaded
 
 
 JITTERS: dict[str, tuple[jv.Transform, ...]] = {
@@ -165,16 +170,30 @@ SHADED: dict[str, Setting] = {
     for step in STEPS
 }
 
+SURFACE: dict[str, Setting] = {
+    f"isosurface{how}, step {step:g}": Setting(
+        f"isosurface{how}",
+        ours(*leaps, step=step, without=without, lighting=templates),
+        lambda row: row.surface,
+    )
+    for how, leaps, without in (
+        ("", (), ()),
+        (", no leaping", (), (jv.SpaceLeaping,)),
+        (", leaping by distance", (jv.SpaceLeaping("distance"),), ()),
+    )
+    for step in STEPS
+}
+
 PEERS: dict[str, Setting] = {
     **{f"{VTK}, step {step:g}": Setting(VTK, partial(by_vtk, step), peer) for step in STEPS[1:]},
     **{
-        f"{DRJIT}, {q}, step {step:g}": Setting(DRJIT, partial(by_drjit, q, step), peer)
+        f"{DRJIT}, {q}, step {step:g}": Setting(DRJIT, partial(by_drjit, q, step), unlit_peer)
         for q in ("left", "midpoint")
         for step in STEPS[1:]
     },
 }
 
-SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **SHADED, **PEERS}
+SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **SHADED, **SURFACE, **PEERS}
 
 GRADIENTS = (
     "midpoint, step 0.5",
@@ -202,4 +221,6 @@ def of(row: Row, there: dict[str, str]) -> dict[str, Setting]:
 
 def base_of(row: Row) -> str:
     """Name of the setting that all others of the scene are timed against."""
+    if row.surface:
+        return SURFACE_BASE
     return SHADED_BASE if row.shaded else LIT_BASE if row.lit else BASE

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxvol as jv
-from jaxvol.lighting import Deferred, Lighting
+from jaxvol.lighting import Deferred, Lighting, Phong
 from jaxvol.march import Quadrature
 
 from . import accuracy, peer_vtk
@@ -41,7 +41,8 @@ def program(case: Case, march: jv.March, lighting: Lighting | None = None) -> Pr
     volume, transfer, camera, _ = case.scene
 
     def render(transfer: jv.TransferFunction) -> jv.Rendering:
-        return jv.render(volume, transfer, camera, march, lighting=lighting, outputs="rgba")
+        how = {"compositing": case.compositing, "lighting": lighting, "outputs": "rgba"}
+        return jv.render(volume, transfer, camera, march, **how)
 
     def image() -> np.ndarray:
         rendering = render(transfer)
@@ -96,7 +97,9 @@ def stored(kind: str, case: Case) -> Case:
 
 def by_vtk(step: float, case: Case) -> Program:
     volume, transfer, camera, voxel = case.scene
-    drawn = peer_vtk.prepare(volume, transfer, camera, step * voxel, THREADS)
+    shade = None if case.lighting is None else case.lighting()
+    assert isinstance(shade, Phong | None)
+    drawn = peer_vtk.prepare(volume, transfer, camera, step * voxel, THREADS, shade=shade)
     return Program(drawn.draw, drawn.image, lambda truth: peer_vtk.as_displayed(truth, drawn.mapper))
 
 

@@ -39,16 +39,17 @@ def march(case: Case, finer: float, quadrature: Quadrature = "midpoint") -> jv.M
 
 def converged(case: Case, row: Row, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
     """The reference, over white. `row`: how fine it is; `count`: of templates."""
-    lighting = None if case.lighting is None else templates(case, templates=count, blend=True, seed=seed)
+    how = {"templates": count, "blend": True, "seed": seed} if row.noisy else {}
+    lighting = None if case.lighting is None else templates(case, **how)
     return program(case, march(case, row.finer, row.quadrature), lighting).image()
 
 
 def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
     """What is estimated of the reference's own error: `rmse` in total, and its parts."""
-    few: Lighting | None = None
+    few: Lighting | None = None if case.lighting is None or row.noisy else templates(case)
     image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
     fine, coarse = (march(case, n, row.quadrature) for n in (row.finer, row.finer / 2))
-    if case.lighting is not None:
+    if row.noisy:
         # grown once: in float64, random numbers are others
         grown = templates(case, templates=1, photons=8, seed=SEEDS[0]).grown(blend=False)
         few = templates(case, given=grown)
@@ -65,7 +66,7 @@ def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dic
         "difference to float64": float(np.sqrt(np.mean((there - exact) ** 2))),
         "largest difference to float64": float(np.abs(there - exact).max()),
     }
-    if case.lighting is not None:
+    if row.noisy:
         found["templates"] = count
         coarse = row._replace(finer=1)
         one, other = (
@@ -98,9 +99,8 @@ def in_float64(case: Case, march: jv.March, lighting: Lighting | None, pixels: n
 
         def one(pixel: jax.Array) -> jax.Array:
             origin, direction = (jnp.stack(part) for part in camera.ray(pixel[0], pixel[1]))
-            return jv.render_ray_reference(
-                volume, transfer, origin, direction, march, pixel=(pixel[0], pixel[1]), lighting=lighting
-            ).image()
+            how = {"pixel": (pixel[0], pixel[1]), "lighting": lighting, "compositing": case.compositing}
+            return jv.render_ray_reference(volume, transfer, origin, direction, march, **how).image()
 
         return np.asarray(jax.vmap(one)(jnp.asarray(pixels, jnp.int32)))
 

@@ -24,7 +24,7 @@ from .scenes import PHANTOM, SCENES, Scene
 
 
 class Case(NamedTuple):
-    """A scene, the transforms without which it cannot be rendered, and its light.
+    """A scene, the transforms without which it cannot be rendered, its light, and its compositing mode.
 
     `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options
     `Phong`; None where the scene is unlit.
@@ -33,6 +33,7 @@ class Case(NamedTuple):
     scene: Scene
     placed: tuple[jv.Transform, ...] = ()
     lighting: Callable[..., Lighting] | None = None
+    compositing: Any = "over"
 
 
 class Row(NamedTuple):
@@ -42,7 +43,8 @@ class Row(NamedTuple):
       phantom.
     - `file`: the real volume, None for a phantom.
     - `peers`: None, or why VTK and Dr.Jit are left out.
-    - `lit`: whether there is light; `shaded`: whether it is `Phong`'s.
+    - `lit`: whether there is light; `shaded`: whether it is `Phong`'s; `surface`: whether an isosurface is
+      shown.
     - `gradients`: whether gradients are measured, too.
     - `finer`, `quadrature`: of the converged image, into how many parts it divides a step, and its rule.
     - `part`: of the image's side, where frames take longer.
@@ -56,14 +58,21 @@ class Row(NamedTuple):
     toroidal: bool = False
     lit: bool = False
     shaded: bool = False
+    surface: bool = False
     gradients: bool = False
     finer: int = 16
     quadrature: Quadrature = "midpoint"
     part: float = 1.0
 
+    @property
+    def noisy(self) -> bool:
+        """Whether its light is made of templates, which are random."""
+        return self.lit and not self.shaded and not self.surface
+
 
 UNBENT = "the ray casters of VTK and Dr.Jit that are compared here have no toroidal grids"
 UNLIT = "VTK and Dr.Jit are compared without light"
+WHOLE = "VTK and Dr.Jit are compared on whole volumes"
 
 
 def real(name: str, folder: Path | None, size: int, resolution: int) -> Case:
@@ -141,6 +150,18 @@ def shaded(name: str, folder: Path | None, size: int, resolution: int) -> Case:
     return real(name, folder, size, resolution)._replace(lighting=Phong)
 
 
+def cut(folder: Path | None, size: int, resolution: int) -> Case:
+    """The engine, cut obliquely through its middle."""
+    scene = real("engine", folder, size, resolution).scene
+    plane = jv.Clip(planes=((scene.volume.center, (0.6, -0.9, -0.5)),))
+    return Case(scene, (plane,))
+
+
+def surface(folder: Path | None, size: int, resolution: int) -> Case:
+    """An isosurface of the engine."""
+    return shaded("engine", folder, size, resolution)._replace(compositing=jv.Isosurface(100))
+
+
 ENGINE, BONSAI, AIRWAY, ANEURISM, SHELLS = (
     "engine_256x256x128_uint8.raw.gz",
     "bonsai_256x256x256_uint8.raw.gz",
@@ -168,8 +189,10 @@ ROWS: dict[str, Row] = {
     "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.25),
     f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=UNLIT, lit=True, finer=4, part=0.5),
     "engine, lit": Row(lit_engine, ENGINE, peers=UNLIT, lit=True, finer=4, part=0.25),
-    "engine, shaded": Row(partial(shaded, "engine"), ENGINE, peers=UNLIT, lit=True, shaded=True),
-    "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, peers=UNLIT, lit=True, shaded=True),
+    "engine, shaded": Row(partial(shaded, "engine"), ENGINE, lit=True, shaded=True),
+    "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, lit=True, shaded=True),
+    "engine, cut": Row(cut, ENGINE, peers=WHOLE),
+    "engine, isosurface": Row(surface, ENGINE, peers=UNLIT, lit=True, surface=True),
 }
 
 
