@@ -26,8 +26,8 @@ from .scenes import PHANTOM, SCENES, Scene
 class Case(NamedTuple):
     """A scene, the transforms without which it cannot be rendered, and its light.
 
-    `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options `Phong`;
-    None where the scene is unlit.
+    `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options
+    `Phong`; None where the scene is unlit.
     """
 
     scene: Scene
