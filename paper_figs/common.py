@@ -76,15 +76,17 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
     return jv.Volume(part, volume.spacing, origin)
 
 
-def figure(about: str | None, resolution: int = 160) -> Callable[[Callable[[Namespace], None]], Main]:
+def figure(
+    about: str | None, resolution: int = 160, size: int = 184
+) -> Callable[[Callable[[Namespace], None]], Main]:
     """Decorator that makes the `main` of a script that draws scenes of a function of its options.
 
     - `about`: the module's docstring.
-    - `resolution`: voxels along an axis of a phantom, by default.
+    - `resolution`: voxels along an axis of a phantom, by default. `size`: pixels along a side of an image.
     """
 
     def made(draw: Callable[[Namespace], None]) -> Main:
-        @command(about, OUTPUT, data=DATA, size=184, resolution=resolution, quick=QUICK)
+        @command(about, OUTPUT, data=DATA, size=size, resolution=resolution, quick=QUICK)
         def main(chosen: Namespace) -> None:
             if chosen.quick:
                 chosen.size, chosen.resolution = 48, 40

@@ -61,7 +61,6 @@ class ClassifiedPoint(NamedTuple):
     inside: Scalar
     coordinate: Vec3
     value: Scalar
-    color: Vec3
     extinction: Scalar
 
 
@@ -107,8 +106,8 @@ class Surroundings(eqx.Module):
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
         inside = x * y * z
-        color, extinction = self.classification.classify(measured)
-        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
+        _, extinction = self.classification.classify(measured)
+        return ClassifiedPoint(inside, coordinate, measured[0], inside * extinction)
 
 
 class Shading(eqx.Module):
