@@ -82,7 +82,7 @@ def figure(
     """Decorator that makes the `main` of a script that draws scenes of a function of its options.
 
     - `about`: the module's docstring.
-    - `resolution`: voxels along an axis of a phantom, by default. `size`: pixels along the side of an image.
+    - `resolution`: voxels along an axis of a phantom, by default. `size`: pixels along a side of an image.
     """
 
     def made(draw: Callable[[Namespace], None]) -> Main:

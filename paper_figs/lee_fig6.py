@@ -94,11 +94,11 @@ def draw(page: Page, row: int, name: str, subject: Subject) -> None:
             lights = DirectionalLight(direction, IRRADIANCE), AROUND
             lighting = ScattererTemplates(materials, lights, **how)
         rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
-        caption = name if lighting is None else f"{lighting.photons} photon slots a template"
+        caption = name if lighting is None else f"{lighting.photons} photons a template at most"
         page.draw(row, column, rendering.image(BLACK), caption, title if row == 0 else "")
 
 
-@figure(__doc__, resolution=128)
+@figure(__doc__, resolution=128, size=512)
 def main(chosen: Namespace) -> None:
     subjects = {
         "the head phantom": head(chosen.resolution, chosen.size),

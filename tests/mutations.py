@@ -820,8 +820,8 @@ MUTATIONS = [
     Mutation(
         "light: photons not occluded by what lies behind them",
         "lighting/photons.py",
-        "seen = intensity * self._visible(offset, [each.extinction for each in (at_photon, *further)])",
-        "seen = intensity",
+        "visible = self._visible(photon.offset, extinctions)",
+        "visible = self._visible(photon.offset, [0 * each for each in extinctions])",
         ("lighting/test_lighting.py::test_step_2_a_wall_behind_a_photon_hides_it_within_reach[soft]",),
     ),
     Mutation(
@@ -851,6 +851,13 @@ MUTATIONS = [
         "least = (1 - 1e-5) * jax",
         "least = 2 * jax",
         ("lighting/test_terms.py::test_samples_shaded_together_are_shaded_as_each_alone[hard]",),
+    ),
+    Mutation(
+        "light: the last group of terms is filled up with terms that there are not",
+        "lighting/shading.py",
+        "jnp.where(numbers[i] < shading.terms, leaf[i], 0)",
+        "leaf[i]",
+        ("lighting/test_terms.py::test_the_loop_ends_where_none_of_the_samples_needs_more",),
     ),
     Mutation(
         "templates: photons fade out where the threshold is on whole levels",

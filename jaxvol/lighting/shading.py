@@ -7,7 +7,7 @@ for each image, which adds up terms for points around a sample, one by one; and 
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -26,6 +26,10 @@ from ..volume import Volume
 
 
 T = TypeVar("T")
+
+TOGETHER = 4
+"""Terms of many samples that are computed at a time. To launch a kernel on several threads takes longer than
+2048 samples of one term take in it."""
 
 
 class Sample(NamedTuple):
@@ -57,7 +61,6 @@ class ClassifiedPoint(NamedTuple):
     inside: Scalar
     coordinate: Vec3
     value: Scalar
-    color: Vec3
     extinction: Scalar
 
 
@@ -103,8 +106,8 @@ class Surroundings(eqx.Module):
             for c, n in zip(coordinate, self.volume.shape, strict=True)
         )
         inside = x * y * z
-        color, extinction = self.classification.classify(measured)
-        return ClassifiedPoint(inside, coordinate, measured[0], color, inside * extinction)
+        _, extinction = self.classification.classify(measured)
+        return ClassifiedPoint(inside, coordinate, measured[0], inside * extinction)
 
 
 class Shading(eqx.Module):
@@ -272,17 +275,27 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
     if shading.terms == 0:
         return None
 
-    looped = around.before_loop()
+    looped, together = around.before_loop(), min(TOGETHER, shading.terms)
 
-    def terms(number: Int[Array, ""]) -> PyTree:
-        here = looped.in_memory_by(number >= 0, samples)
-        return jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))(samples, shared, number)
+    def terms(first: Int[Array, ""]) -> PyTree:
+        here = looped.in_memory_by(first >= 0, samples)
+        of_samples = jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))
+        numbers = first + jnp.arange(together, dtype=jnp.int32)
+        each = jax.vmap(of_samples, in_axes=(None, None, 0))(samples, shared, numbers)
 
-    def add(number: Int[Array, ""], sums: PyTree) -> PyTree:
-        return jax.tree.map(jnp.add, sums, terms(number))
+        def total(leaf: Array) -> Array:  # `jnp.sum` over the terms would not be vectorized over the samples
+            return reduce(
+                jnp.add, (jnp.where(numbers[i] < shading.terms, leaf[i], 0) for i in range(together))
+            )
+
+        return jax.tree.map(total, each)
+
+    def add(group: Int[Array, ""], sums: PyTree) -> PyTree:
+        return jax.tree.map(jnp.add, sums, terms(group * together))
 
     needed = terms_above(shading.thresholds(), samples.transmittance)
-    return jax.lax.fori_loop(0, needed, add, varying(zeros_like_result(terms), samples))
+    groups = -(-needed // together)
+    return jax.lax.fori_loop(0, groups, add, varying(zeros_like_result(terms), samples))
 
 
 @needed_terms.def_jvp

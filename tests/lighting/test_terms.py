@@ -17,7 +17,15 @@ from jaxvol.lighting import (
     ScattererTemplate,
     ScattererTemplates,
 )
-from jaxvol.lighting.shading import Sample, Shader, Shading, Surroundings, shade_sample, terms_above
+from jaxvol.lighting.shading import (
+    TOGETHER,
+    Sample,
+    Shader,
+    Shading,
+    Surroundings,
+    shade_sample,
+    terms_above,
+)
 from jaxvol.space import Affine
 
 from ..scenes import scaled_phantom, soft_transfer
@@ -67,14 +75,15 @@ def samples_in(around, transmittance):
 
 
 class Counting(Shading):
-    """Five terms of 1 each, of which samples behind less than half of the light need two."""
+    """Terms of 1 each, one more than are computed together, of which samples behind less than half of the
+    light need two."""
 
     @property
     def terms(self):
-        return 5
+        return TOGETHER + 1
 
     def thresholds(self, *, derivative=False):
-        return jnp.asarray([0, 0, 0.5, 0.5, 0.5])
+        return jnp.where(jnp.arange(self.terms) < 2, 0, 0.5)
 
     def about(self, around, sample):
         return None
@@ -86,8 +95,9 @@ class Counting(Shading):
         return sums, sums, sums
 
 
-@pytest.mark.parametrize(("transmittance", "expected"), [((0.1, 0.4), 2), ((0.1, 0.6), 5)])
+@pytest.mark.parametrize(("transmittance", "expected"), [((0.1, 0.4), TOGETHER), ((0.1, 0.6), TOGETHER + 1)])
 def test_the_loop_ends_where_none_of_the_samples_needs_more(transmittance, expected):
+    """After a whole group of terms; the last group is not filled up with terms that there are not."""
     around = surroundings()
     found = jax.jit(lambda samples: Shader(Counting(), around)(samples))(samples_in(around, transmittance))
     np.testing.assert_array_equal(found[0], [expected] * 2)
