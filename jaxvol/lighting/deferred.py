@@ -28,7 +28,7 @@ class Deferred(Lighting):
     at all, and then the pixel stays unlit. Baked light shows its grid as faint rings, which are not averaged
     over the samples of a ray. `experiments/lighting.py` measures the error on an opaque and on a translucent
     head. There two templates blended, of eight photons each, come as near to many of them as one does with
-    all its photons on all samples, in an eleventh of the time:
+    all its photons on all samples, in a sixth of the time:
     `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))`.
 
     Gradients are those of the image that it makes. The gradient of voxels takes an array of their size for
