@@ -160,7 +160,13 @@ def tested_every(scene: Scene, samples: int, repetitions: int) -> dict[str, Any]
 def draw(result: dict[str, Any], path: Path) -> None:
     """Measured speed-ups as bars, the report's as crosses: without shading above, with it below."""
     figure, axes = plt.subplots(
-        2, len(result["sizes"]), figsize=(11, 6.4), sharex=True, sharey="row", layout="constrained"
+        2,
+        len(result["sizes"]),
+        figsize=(11, 6.4),
+        sharex=True,
+        sharey="row",
+        squeeze=False,
+        layout="constrained",
     )
     bars = {ERT: "C3", SKIPPED: "C9", ESS: "C0", BOTH_SKIPPED: "C8", BOTH: "C2"}
     reported = {SKIPPED: ESS, BOTH_SKIPPED: BOTH}

@@ -9,8 +9,7 @@ filtered against their noise (`light_filter`), with the time that this takes.
 
 The published form is hard occlusion, with all photons that templates hold, on all samples. Lee, Kwon and Shin
 report 20-24 frames per second with it and 42-56 without light, which is 2.2 times the time; the goal for
-baked light is 1.2 times. Where there is a lighting by surface normals (`lighting.Phong`), times are also
-relative to a frame with that.
+baked light is 1.2 times. Times are also relative to a frame that `lighting.Phong` shades.
 
 Also measured: the error of deferred light under skin that is more and more translucent; the noise of a flat
 face, seen and lit obliquely, against the number of templates blended; and the energy of a template against
@@ -37,6 +36,7 @@ from jaxvol.lighting import (
     Deferred,
     DirectionalLight,
     Lighting,
+    Phong,
     ScattererTemplate,
     ScattererTemplates,
     scatterer_templates,
@@ -89,9 +89,8 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
     of = partial(ScattererTemplates, FLESH, LIGHTS)
     whole = of().photons
     photons = (*(n for n in photons if n < whole), whole)
-    phong = getattr(jv.lighting, PHONG, None)
     return {
-        **({} if phong is None else {PHONG: [(0, phong())]}),
+        PHONG: [(0, Phong())],
         PHOTONS: [(n, of(photons=n)) for n in photons],
         MATERIAL: [(whole, of(choice="material"))],
         BLENDED: [(n, of(templates=n, blend=True)) for n in blended],

@@ -11,6 +11,9 @@ unless commit, sources or options differ; Ctrl-C loses one method of one scene. 
 one scene again, times it and saves its picture beside its error. The record is `pareto.json`, the chart
 `pareto.png`, the page `pareto.html` (see `pareto_page`).
 
+Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
+distance to our image, up to 3 / 255, is that and not an error.
+
 Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
 JAXVOL_DATA names; scenes whose volume is not there are left out, too.
 """

@@ -71,7 +71,8 @@ class Row(NamedTuple):
 
 
 UNBENT = "the ray casters of VTK and Dr.Jit that are compared here have no toroidal grids"
-UNLIT = "VTK and Dr.Jit are compared without light"
+TEMPLATES = "VTK and Dr.Jit have no templates of light"
+SURFACES = "VTK and Dr.Jit are compared where samples are composited"
 WHOLE = "VTK and Dr.Jit are compared on whole volumes"
 
 
@@ -187,12 +188,12 @@ ROWS: dict[str, Row] = {
     "aneurism": Row(partial(real, "aneurism"), ANEURISM),
     "fetus phantom": Row(fetus, peers=UNBENT, toroidal=True, finer=8, part=0.25),
     "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.25),
-    f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=UNLIT, lit=True, finer=4, part=0.5),
-    "engine, lit": Row(lit_engine, ENGINE, peers=UNLIT, lit=True, finer=4, part=0.25),
+    f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=TEMPLATES, lit=True, finer=4, part=0.5),
+    "engine, lit": Row(lit_engine, ENGINE, peers=TEMPLATES, lit=True, finer=4, part=0.25),
     "engine, shaded": Row(partial(shaded, "engine"), ENGINE, lit=True, shaded=True),
     "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, lit=True, shaded=True),
     "engine, cut": Row(cut, ENGINE, peers=WHOLE),
-    "engine, isosurface": Row(surface, ENGINE, peers=UNLIT, lit=True, surface=True),
+    "engine, isosurface": Row(surface, ENGINE, peers=SURFACES, lit=True, surface=True),
 }
 
 

@@ -166,6 +166,10 @@ def prepare(
 
     renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
     renderer.AddVolume(prop)
+    light = vtk.vtkLight()
+    light.SetLightTypeToHeadlight()
+    light.SetAmbientColor(1, 1, 1)  # by default a light has none
+    renderer.AddLight(light)
     renderer.SetBackground(*background)
     window.SetOffScreenRendering(1)
     window.SetMultiSamples(0)

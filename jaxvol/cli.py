@@ -254,7 +254,7 @@ def _view_options() -> argparse.ArgumentParser:
         "--shade",
         action=argparse.BooleanOptionalAction,
         help="shade by the gradient of the values, under a light at the camera; by default isosurfaces, and "
-        f"with the presets {', '.join(sorted(SHADED))}",
+        f"what is composited with the presets {', '.join(sorted(SHADED))}",
     )
 
     camera = view.add_argument_group("camera")

@@ -205,12 +205,12 @@ def _slope_ranges(
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
         node = jnp.clip(BLOCK * block + jnp.arange(BLOCK + 1), 0, last)
-        before, here, after = (
-            data[jnp.clip(node + side, 0, last)].astype(jnp.float32) for side in (-1, 0, 1)
-        )
+        # subtracted in their own type: doubles that differ little are the same in single precision
+        dtype = jnp.promote_types(data.dtype, jnp.float32)
+        before, here, after = (data[jnp.clip(node + side, 0, last)].astype(dtype) for side in (-1, 0, 1))
         border = ((node == 0) | (node == last))[:, None, None]
-        along_x = (after - before) * jnp.where(border, 1, 0.5).astype(jnp.float32)
-        slopes = jnp.stack([along_x, _central(here, 1), _central(here, 2)])
+        along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)
+        slopes = jnp.stack([along_x, _central(here, 1), _central(here, 2)]).astype(jnp.float32)
         square = jnp.max(jnp.sum(slopes**2, axis=0), axis=0)
         low, high, square = (
             jax.vmap(lambda part, of=of: over_blocks(part, of))(part)

@@ -153,13 +153,16 @@ class TransferFunction2D(Transfer):
         positive = "reaches must be positive; got {got}."
         places = _numbers("values", values, (count,)), _numbers("magnitudes", magnitudes, (count,))
         reach = require(_numbers("reaches", reaches, (count, 2)), lambda reach: reach > 0, positive)
-        lines, away = [], []  # away: how far lines are from each point, in reaches
+        lines, away, falls = [], [], []  # away: how far lines are from each point, in reaches
         for place, far in zip(places, reach.T, strict=True):
+            low, high = (side[:, None] for side in (place - far, place + far))
             lines.append(np.unique([place - far, place, place + far]))
             away.append(np.abs(lines[-1] - place[:, None]) / far[:, None])
+            # exactly 0 on the sides, where the quotient may round to less than 1
+            falls.append(np.where((low < lines[-1]) & (lines[-1] < high), np.maximum(1 - away[-1], 0), 0))
         # (points, values, magnitudes)
-        away = [away[0][:, :, None], away[1][:, None]]
-        tents = np.maximum(1 - away[0], 0) * np.maximum(1 - away[1], 0)
+        away, (along, across) = [away[0][:, :, None], away[1][:, None]], falls
+        tents = along[:, :, None] * across[:, None]
         each = extinction_of(opacities, unit_distance)[:, None, None] * tents
         extinction = jnp.sum(each, axis=0)
         rgb = finite_array("colors", colors, (count, 3))

@@ -55,7 +55,18 @@ def test_figure_is_drawn(name, tmp_path):
 def test_every_figure_in_the_readme_exists():
     text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     lee = ["lee_fig1", "lee_fig4", "lee_fig5", "lee_fig6", "lee_fig_steps"]
-    assert ["chae_fig6", "fig01", "fig09", "fig10", "fig11", "fig12", "fig13", *lee] == FIGURES
+    assert [
+        "chae_fig6",
+        "fig01",
+        "fig09",
+        "fig10",
+        "fig11",
+        "fig12",
+        "fig13",
+        "gallery",
+        "kisti_fig",
+        *lee,
+    ] == FIGURES
     for name in FIGURES:
         assert f"output/{name}.png" in text
         large = name in ("lee_fig5", "lee_fig6")  # images of 512 x 512

@@ -131,14 +131,14 @@ def cthead(real_volume: Callable) -> Scene:
     points = [(700, (0.8, 0.5, 0.4), 0.0), (1000, (0.8, 0.5, 0.4), 0.04), (1150, (0.9, 0.6, 0.5), 0.02)]
     bones = [(1300, (1.0, 0.95, 0.85), 0.5), (3200, (1.0, 1.0, 1.0), 0.9)]
     transfer = jv.TransferFunction.from_points(points + bones)
-    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.2), (0, 0, -1), size=(256, 256))
+    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.2), (0, 0, -1), size=(256, 256), parallel=True)
     return Scene(volume, transfer, camera)
 
 
 @pytest.mark.parametrize("name", ["engine", "cthead"])
 def test_vtk_shades_alike(real_volume, name):
     """VTK shades nodes, by gradients rounded to some 10 000 directions, and interpolates what that gives; its
-    head light shines along the camera's axis, as here."""
+    head light shines along the camera's axis, ours along each ray."""
     scene, phong = (SCENES | {"cthead": cthead})[name](real_volume), Phong()
     axis = np.asarray(scene.camera.focal_point - scene.camera.position)
     theirs, mapper = drawn_by_vtk(scene, phong)

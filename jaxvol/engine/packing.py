@@ -3,7 +3,7 @@
 A fetch costs the same for one byte as for four. A copy in which each 32-bit word holds a voxel and its
 neighbour along z, and for 8-bit voxels the two beside these along y, saves three fetches in four for 8-bit,
 and one in two for 16-bit voxels. It takes four or two times the memory of the voxels, and is made once for
-each array of them.
+each array of them. The slopes of 8-bit voxels take as much again.
 """
 
 from typing import cast
@@ -20,7 +20,7 @@ from ..volume import Volume, with_fetch
 
 
 LIMIT = 2**30
-"""Bytes that a copy may take at most."""
+"""Bytes that a copy of the voxels may take at most, and one of their slopes."""
 
 
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:

@@ -99,10 +99,7 @@ def _chunk_vjp(
     )
 
     def made(parts: _Parts) -> tuple[Shader, Sample]:
-        (shading, space), transfer = eqx.combine(parts.leaves, fixed_leaves)
-        return Shader(shading, Surroundings(shader.around.volume, transfer, space)), eqx.combine(
-            parts.samples, fixed
-        )
+        return shader.with_leaves(*eqx.combine(parts.leaves, fixed_leaves)), eqx.combine(parts.samples, fixed)
 
     def about(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
         (shading, around), each = made(_Parts(leaves, samples))

@@ -8,6 +8,7 @@ from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -63,7 +64,9 @@ class DirectionalLight(LocatedLight):
         self.irradiance = _power("irradiance", irradiance)
 
     def at(self, point: Vec3) -> Arriving:
-        x, y, z = apart(-self.direction / jnp.linalg.norm(self.direction))
+        # its largest component first, so that no square overflows or underflows
+        direction = self.direction / jax.lax.stop_gradient(jnp.max(jnp.abs(self.direction)))
+        x, y, z = apart(-direction / jnp.linalg.norm(direction))
         zero = jnp.zeros_like(point[0])
         r, g, b = apart(self.irradiance)
         return Arriving((x + zero, y + zero, z + zero), zero + jnp.inf, (r + zero, g + zero, b + zero))

@@ -18,11 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.sharding import varying
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
+from .._util.voxel_fetch import OneByOne
 from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
 from ..transfer import Classification, Measured, Transfer, classification_of
-from ..volume import Volume
+from ..volume import Volume, with_fetch, with_voxels, without_voxels
 
 
 T = TypeVar("T")
@@ -230,7 +231,13 @@ class Shader(NamedTuple):
     @property
     def leaves(self) -> PyTree:
         """All that has a gradient, except the transfer function and the voxels."""
-        return self.shading, self.around.space
+        return self.shading, self.around.space, without_voxels(with_fetch(self.around.volume, OneByOne()))
+
+    def with_leaves(self, leaves: PyTree, transfer: Transfer) -> "Shader":
+        """The same with these leaves, a transfer function, and the same voxels."""
+        (shading, space, rest), volume = leaves, self.around.volume
+        whole = with_fetch(with_voxels(rest, volume.data), volume.fetch)
+        return Shader(shading, Surroundings(whole, transfer, space))
 
     def __call__(self, sample: Sample) -> Vec3:
         """The shaded colour of a sample, or those of many along one axis."""
