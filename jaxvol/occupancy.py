@@ -206,7 +206,7 @@ def _slope_ranges(
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
         node = jnp.clip(BLOCK * block + jnp.arange(BLOCK + 1), 0, last)
         # subtracted in their own type: doubles that differ little are the same in single precision
-        dtype = jnp.promote_types(data.dtype, jnp.float32)
+        dtype = data.dtype if data.dtype == jnp.float64 else jnp.float32
         before, here, after = (data[jnp.clip(node + side, 0, last)].astype(dtype) for side in (-1, 0, 1))
         border = ((node == 0) | (node == last))[:, None, None]
         along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)

@@ -106,6 +106,18 @@ POINTS = [
 ]
 
 
+def test_nothing_is_left_of_a_point_at_its_sides_and_beyond():
+    """Where quotients that would be 1 are rounded, as of these numbers."""
+    for seed in range(50):
+        value, magnitude, reach, other = np.random.default_rng(seed).uniform(0.01, 1, 4).round(2)
+        point = (value, magnitude, (1.0, 0.5, 0.2), 0.9, (reach, other))
+        transfer = jv.TransferFunction2D.from_points([point])
+        extinction = np.asarray(transfer.extinction)
+        np.testing.assert_array_equal(extinction[[0, -1]], 0)
+        np.testing.assert_array_equal(extinction[:, [0, -1]], 0)
+        assert extinction.max() > 2
+
+
 def test_points_are_tents_and_add_up():
     transfer = jv.TransferFunction2D.from_points(POINTS, unit_distance=2.0)
     random = np.random.default_rng(3)
@@ -219,6 +231,19 @@ def test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block(kind):
         bound, visible = (np.asarray(each) for each in bounds(transfer, blocks))
         assert np.all((extinction <= bound[block])[known])
         np.testing.assert_array_equal((bound > 0)[~unordered], visible[~unordered])
+
+
+def test_slopes_of_large_doubles_are_not_lost():
+    with in_float64():
+        x = np.arange(9.0)
+        volume = jv.Volume(np.broadcast_to((1e5 + 0.002 * np.sin(2 * x))[:, None, None], (9, 9, 9)))
+        least, most = (np.asarray(each) for each in Blocks.of(volume, slopes=True).magnitudes)
+        slopes = np.abs(np.gradient(np.asarray(volume.data), axis=0))
+        for block in (0, 1):
+            here = slopes[4 * block : 4 * block + 5]
+            assert np.all(most[block] >= here.max())
+            assert np.all(most[block] <= 1.01 * here.max())
+            assert np.all(least[block] <= here.min())
 
 
 def test_bounds_are_close_and_homogeneous_blocks_are_empty():
