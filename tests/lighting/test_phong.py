@@ -224,7 +224,7 @@ def test_both_sides_are_lit_alike():
 
 
 def test_the_length_of_the_gradient_does_not_matter():
-    for scale in (1e-30, 1e-6, 1e6, 1e30):
+    for scale in (1e-15, 1e-6, 1e6, 1e15):
         found = lit(Phong(SUN), VIEWS[1], -VIEWS[0], scale=scale)
         np.testing.assert_allclose(found, lit(Phong(SUN), VIEWS[1], -VIEWS[0]), atol=2e-5)
 
