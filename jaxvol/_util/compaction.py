@@ -77,7 +77,9 @@ def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, 
     words = jnp.sum(jnp.where(padded.reshape(-1, 32), bit, 0), axis=1, dtype=jnp.uint32)
     counts = _popcount(words)
     blocks = jnp.pad(counts, (0, -counts.size % 32)).reshape(-1, 32)
-    before = (_sums_before(blocks) + _sums_before(jnp.sum(blocks, axis=1)[None])[0, :, None]).reshape(-1)
+    before = (
+        _sums_before(blocks) + _sums_before(jnp.sum(blocks, axis=1, dtype=blocks.dtype)[None])[0, :, None]
+    ).reshape(-1)
     rank = before[: words.size, None] + _popcount(words[:, None] & (bit - 1))
     last = padded.size
     return (
@@ -93,4 +95,4 @@ def _popcount(words: UInt32[Array, "*words"]) -> Int[Array, "*words"]:
 
 def _sums_before(counts: Int[Array, "rows columns"]) -> Int[Array, "rows columns"]:
     """Of each entry, the sum of those before it in its row. Columns are few."""
-    return jnp.cumsum(counts, axis=1) - counts
+    return jnp.cumsum(counts, axis=1, dtype=counts.dtype) - counts
