@@ -4,6 +4,7 @@ Shading comes between the transfer function and compositing. A user passes a `Li
 for each image, which adds up terms for points around a sample, one by one; and engines call the `Shader`.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,9 +29,9 @@ from ..volume import Volume, with_fetch, with_voxels, without_voxels
 
 T = TypeVar("T")
 
-TOGETHER = 4
-"""Terms of many samples that are computed at a time. To launch a kernel on several threads takes longer than
-2048 samples of one term take in it."""
+TOGETHER = 8
+"""Most terms of many samples that are computed at a time. To launch a kernel on several threads takes longer
+than 2048 samples of one term take in it."""
 
 
 class Sample(NamedTuple):
@@ -282,7 +283,8 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
     if shading.terms == 0:
         return None
 
-    looped, together = around.before_loop(), min(TOGETHER, shading.terms)
+    looped = around.before_loop()
+    together = math.ceil(shading.terms / math.ceil(shading.terms / TOGETHER))
 
     def terms(first: Int[Array, ""]) -> PyTree:
         here = looped.in_memory_by(first >= 0, samples)

@@ -78,8 +78,8 @@ def test_the_gradient_of_an_image_by_templates_is_that_of_the_reference():
     )
     np.testing.assert_allclose(image, expected_image, atol=2e-5)
     visible = jnp.asarray([False, True, True])
-    found, known = (
+    found, expected = (
         eqx.tree_at(lambda g: g[1].extinction, g, replace_fn=lambda e: jnp.where(visible, e, 0))
         for g in (gradient, expected)
     )
-    same(found, known, 1e-3)
+    same(found, expected, 1e-3)

@@ -95,9 +95,11 @@ class Counting(Shading):
         return sums, sums, sums
 
 
-@pytest.mark.parametrize(("transmittance", "expected"), [((0.1, 0.4), TOGETHER), ((0.1, 0.6), TOGETHER + 1)])
+@pytest.mark.parametrize(("transmittance", "expected"), [((0.1, 0.4), 5), ((0.1, 0.6), 9)])
 def test_the_loop_ends_where_none_of_the_samples_needs_more(transmittance, expected):
-    """After a whole group of terms; the last group is not filled up with terms that there are not."""
+    """After a whole group of terms, the first 5; the other group has 4, and is not filled up with a term that
+    there is not."""
+    assert Counting().terms == 9
     around = surroundings()
     found = jax.jit(lambda samples: Shader(Counting(), around)(samples))(samples_in(around, transmittance))
     np.testing.assert_array_equal(found[0], [expected] * 2)
