@@ -27,7 +27,7 @@ from .common import BLACK, Page, figure
 from .lee_fig6 import Subject
 
 
-PATHS = 64
+PATHS = 48
 TEMPLATES = {"templates": 8, "blend": True, "reach": (2, 4, 8)}
 
 
