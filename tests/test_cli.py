@@ -17,6 +17,7 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.cli import main
+from jaxvol.lighting import Phong
 from jaxvol.metrics import rmse
 
 from .scenes import slow
@@ -67,10 +68,11 @@ def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
         "1.5",
     ]
     look = ["--preset", "engine", "--size", "16", "16", "--step", "0.4", "--background", "0", "0", "0"]
-    assert main(["render", str(volume_file), *camera, *look, "-o", str(output)]) == 0
-    assert "million samples" in capsys.readouterr().out
-    linear = jv.render(*scene_of(volume_file)).image((0, 0, 0))
-    assert np.abs(imread(output) - np.asarray(jv.to_srgb(linear)) * 255).max() <= 1
+    for words, lighting in ((["--no-shade"], None), ([], Phong())):  # the preset shows surfaces
+        assert main(["render", str(volume_file), *camera, *look, *words, "-o", str(output)]) == 0
+        assert "million samples" in capsys.readouterr().out
+        linear = jv.render(*scene_of(volume_file), lighting=lighting).image((0, 0, 0))
+        assert np.abs(imread(output) - np.asarray(jv.to_srgb(linear)) * 255).max() <= 1
 
 
 def test_render_needs_nothing_but_a_file_and_plan_says_how(volume_file, tmp_path, capsys):
@@ -115,16 +117,17 @@ def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path,
 def test_render_composites_as_asked_for(name, volume_file, tmp_path):
     output = tmp_path / "x.npy"
     own = ["--isovalue", "120"] if name == "isosurface" else []
-    look = ["--cmap", "gray", "--clim", "0", "255", "--unit-distance", "20"]
+    look = ["--cmap", "gray", "--clim", "-100", "255", "--unit-distance", "20"]  # shows 0, too
     assert render_file(volume_file, *look, "--compositing", name, *own, "-o", output, "--transparent") == 0
     volume = jv.load(volume_file)
     transfer, camera = (
-        jv.colormap("gray", (0, 255), unit_distance=20),
+        jv.colormap("gray", (-100, 255), unit_distance=20),
         jv.Camera.looking_at(volume, size=(16, 16)),
     )
     mode = jv.Isosurface(120.0) if own else name
     march = jv.March(0.4, (jv.AlphaCorrection(),), "midpoint")
-    expected = jv.render(volume, transfer, camera, march, compositing=mode)
+    lighting = Phong() if own else None
+    expected = jv.render(volume, transfer, camera, march, compositing=mode, lighting=lighting)
     assert np.std(expected.rgba[..., 3]) > 1e-3
     np.testing.assert_allclose(np.load(output), expected.rgba, atol=2e-5)
 
@@ -140,7 +143,7 @@ def test_an_isosurface_that_no_ray_meets_says_why(volume_file, tmp_path, capsys)
 def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_path):
     transfer = jv.write_transfer(tmp_path / "t.json", jv.preset("engine"))
     images = []
-    for number, look in enumerate((["--transfer", transfer], ["--preset", "engine"])):
+    for number, look in enumerate((["--transfer", transfer], ["--preset", "engine", "--no-shade"])):
         output = tmp_path / f"{number}.npy"
         assert render_file(volume_file, *look, "-o", output) == 0
         images.append(np.load(output))
@@ -168,7 +171,7 @@ def test_clips_are_those_of_the_library(volume_file, tmp_path, monkeypatch):
     words = ["--clip-box", 5, 30, -1, 20, -1, 30, "--clip-inside-out"]
     for origin, normal in planes:
         words += ["--clip-plane", *origin, *normal]
-    view = ["--preset", "engine", "--camera", 40, -30, 20, *[11.5] * 3, "--zoom", 1.5]
+    view = ["--preset", "engine", "--no-shade", "--camera", 40, -30, 20, *[11.5] * 3, "--zoom", 1.5]
     output = tmp_path / "x.npy"
     clip = jv.Clip((5, 30, -1, 20, -1, 30), planes, inside_out=True)
     camera = scene_of(volume_file)[2]
@@ -181,7 +184,7 @@ def test_clips_are_those_of_the_library(volume_file, tmp_path, monkeypatch):
     np.testing.assert_allclose(np.load(output), expected, atol=1e-5)
     assert rmse(expected, images["whole"].image((1, 1, 1))) > 0.05
     planned = []
-    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms, compositing: planned.append(transforms))
+    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms, **how: planned.append(transforms))
     for command in ("plan", "render"):
         monkeypatch.setattr("jaxvol.cli._picture", None)  # not called
         with contextlib.suppress(TypeError, AttributeError):  # there is no plan to print or render
