@@ -14,7 +14,7 @@ import jaxvol as jv
 from jaxvol.lighting import Lighting
 
 from .accuracy import DRJIT, FINEST_OF, LONGEST, QUADRATURES, VTK
-from .pareto_programs import Program, by_drjit, by_vtk, deferred, ours, stored, tabulated, templates
+from .pareto_programs import Program, by_drjit, by_vtk, deferred, lighting_of, ours, stored, tabulated
 from .pareto_scenes import Case, Row, copied
 
 
@@ -53,7 +53,7 @@ def stepped(
     return {f"{name}, step {s:g}": Setting(family, ours(*transforms, step=s, **how), where) for s in steps}
 
 
-def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = templates, **how: Any) -> Setting:
+def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = lighting_of, **how: Any) -> Setting:
     """A setting of light; `step` and `quadrature` are the march's, all else the templates'."""
     march: dict[str, Any] = {name: how.pop(name) for name in ("step", "quadrature") if name in how}
 
@@ -165,7 +165,7 @@ SHADED: dict[str, Setting] = {
     f"shaded{once}, {q}, step {step:g}": Setting(
         f"shaded{once}", ours(step=step, quadrature=q, lighting=by), lambda row: row.shaded
     )
-    for once, by in (("", templates), (" once", deferred))
+    for once, by in (("", lighting_of), (" once", deferred))
     for q in QUADRATURES
     for step in STEPS
 }
@@ -173,7 +173,7 @@ SHADED: dict[str, Setting] = {
 SURFACE: dict[str, Setting] = {
     f"isosurface{how}, step {step:g}": Setting(
         f"isosurface{how}",
-        ours(*leaps, step=step, without=without, lighting=templates),
+        ours(*leaps, step=step, without=without, lighting=lighting_of),
         lambda row: row.surface,
     )
     for how, leaps, without in (

@@ -113,10 +113,10 @@ def by_drjit(quadrature: Literal["left", "midpoint"], step: float, case: Case) -
     return Program(marcher.draw, image)
 
 
-def templates(case: Case, **how: Any) -> Any:
+def lighting_of(case: Case, **how: Any) -> Any:
     assert case.lighting is not None
     return case.lighting(**how)
 
 
 def deferred(case: Case, **how: Any) -> Lighting:
-    return Deferred(templates(case, **how))
+    return Deferred(lighting_of(case, **how))

@@ -20,7 +20,7 @@ from jaxvol.lighting import Lighting
 from jaxvol.march import Quadrature
 from jaxvol.metrics import rmse
 
-from .pareto_programs import Image, program, templates
+from .pareto_programs import Image, lighting_of, program
 from .pareto_scenes import Case, Row
 
 
@@ -40,19 +40,19 @@ def march(case: Case, finer: float, quadrature: Quadrature = "midpoint") -> jv.M
 def converged(case: Case, row: Row, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
     """The reference, over white. `row`: how fine it is; `count`: of templates."""
     how = {"templates": count, "blend": True, "seed": seed} if row.noisy else {}
-    lighting = None if case.lighting is None else templates(case, **how)
+    lighting = None if case.lighting is None else lighting_of(case, **how)
     return program(case, march(case, row.finer, row.quadrature), lighting).image()
 
 
 def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
     """What is estimated of the reference's own error: `rmse` in total, and its parts."""
-    few: Lighting | None = None if case.lighting is None or row.noisy else templates(case)
+    few: Lighting | None = None if case.lighting is None or row.noisy else lighting_of(case)
     image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
     fine, coarse = (march(case, n, row.quadrature) for n in (row.finer, row.finer / 2))
     if row.noisy:
         # grown once: in float64, random numbers are others
-        grown = templates(case, templates=1, photons=8, seed=SEEDS[0]).grown(blend=False)
-        few = templates(case, given=grown)
+        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).grown(blend=False)
+        few = lighting_of(case, given=grown)
         image = program(case, fine, few).image()
     pixels = visible_pixels(image)
     exact = in_float64(case, march(case, exactly), few, pixels)

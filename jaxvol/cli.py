@@ -26,6 +26,7 @@ from .modes import MODES, Mode, compositing_of
 from .phantoms import phantom
 from .planning import plan
 from .presets import PRESETS, SHADED, colormap, preset
+from .projections import Average
 from .render import PLANNED, render
 from .transfer import TransferFunction
 from .transforms.alpha_correction import AlphaCorrection
@@ -403,6 +404,8 @@ def _plan(options: argparse.Namespace) -> None:
 def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
     """The light that the options ask for, or that is usual for what they show."""
     shade = options.shade
+    if shade and isinstance(mode, Average):
+        raise ValueError("--shade needs a place that is shaded; leave it out with --compositing average.")
     if shade is None:
         of_preset = options.preset in SHADED and isinstance(mode, Over)
         shade = of_preset or isinstance(mode, Isosurface)

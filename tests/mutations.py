@@ -152,6 +152,34 @@ MUTATIONS = [
         "last = jnp.maximum(points_below(lines, high) - 1, 0)",
         (f"{RANGES}[float32]",),
     ),
+    Mutation(
+        "shading: directions of samples have no cotangent under replay",
+        "engine/shading_gradient.py",
+        "place = of_sample.point, of_sample.direction",
+        "place = of_sample.point, jax.tree.map(jnp.zeros_like, of_sample.direction)",
+        ("lighting/test_phong.py::test_gradients_match_central_differences[replay]",),
+    ),
+    Mutation(
+        "shading: parameters of a field have no cotangent under replay",
+        "lighting/shading.py",
+        "whole = with_fetch(with_voxels(rest, volume.data), volume.fetch)",
+        "whole = volume",
+        ("lighting/test_phong.py::test_fields_are_shaded_and_have_gradients",),
+    ),
+    Mutation(
+        "2-D transfer function: points reach to their sides",
+        "transfer2d.py",
+        "(low < lines[-1]) & (lines[-1] < high)",
+        "(low <= lines[-1]) & (lines[-1] <= high)",
+        ("test_transfer2d.py::test_nothing_is_left_of_a_point_at_its_sides_and_beyond",),
+    ),
+    Mutation(
+        "occupancy: slopes of doubles subtracted in single precision",
+        "occupancy.py",
+        "dtype = data.dtype if data.dtype == jnp.float64 else jnp.float32",
+        "dtype = jnp.float32",
+        ("test_transfer2d.py::test_slopes_of_large_doubles_are_not_lost",),
+    ),
     # planning
     Mutation(
         "plan: the opacity of an error left out",

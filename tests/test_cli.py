@@ -319,6 +319,10 @@ BAD = {
     "shape": (["FILE", "--shape", "24", "24", "25"], "cut short"),
     "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
     "clim": (["FILE", "--preset", "engine", "--clim", "5", "4"], "clim must be"),
+    "shaded average": (
+        ["FILE", "--shade", "--compositing", "average"],
+        "--shade needs a place that is shaded",
+    ),
     "no isovalue": (["FILE", "--compositing", "isosurface"], "--compositing isosurface needs the value"),
     "isovalue": (["FILE", "--isovalue", "9"], "--isovalue goes with --compositing isosurface; got --comp"),
     "infinite isovalue": (

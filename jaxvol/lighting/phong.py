@@ -25,7 +25,7 @@ class Phong(Lighting):
     - The normal is the world gradient of the value (`space.world_gradient` with central differences), of unit
       length. It is turned to the viewer, so that both sides of a surface are lit, as by VTK.
     - Where the gradient is 0 there is no normal, and only ambient light, as in VTK; the same where the square
-      of its length is not a number: in float32, below 1e-19 and above 1e19 value units per world length.
+      of its length leaves the range of floats: in float32, below 1e-19 and above 1e19 value units per length.
       (To scale each gradient first would take 3 % of a frame.)
     - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: a white surface
       that scatters the irradiance E diffusely has the radiance E / π, and here, with `diffuse=1`, the
