@@ -11,6 +11,25 @@ from ._util.checks import finite, is_traced
 from ._util.trees import PyTree
 
 
+class BrickReport(NamedTuple):
+    """What an image by `render_bricks` took.
+
+    - `counts`: bricks along each axis. `needed`: how many of them may hold anything visible.
+    - `loads`: how often a brick was read. `reloads`: how many of these were not the first of their brick.
+    - `bytes_read`: of voxels, with what is read around each brick.
+    - `stored`: voxels along each axis that are read at a time. `bytes_held`: memory that these take, with what
+      is made of them and with the next ones.
+    """
+
+    counts: tuple[int, int, int]
+    needed: int
+    loads: int
+    reloads: int
+    bytes_read: int
+    stored: tuple[int, int, int]
+    bytes_held: int
+
+
 class Details(NamedTuple):
     """Outputs that cost time, each None where it was not asked for. See `Rendering`.
 
@@ -24,6 +43,7 @@ class Details(NamedTuple):
     aligned: Bool[Array, "*rays"] | None = None
     normal: Float[Array, "*rays 3"] | None = None
     selected: PyTree = None
+    bricks: "BrickReport | None" = None
 
 
 class Rendering(eqx.Module):
@@ -75,6 +95,10 @@ class Rendering(eqx.Module):
     @property
     def normal(self) -> Float[Array, "*rays 3"]:
         return self._detail("normal", self.details.normal, "composite by an Isosurface, and ")
+
+    @property
+    def bricks(self) -> BrickReport:
+        return self._detail("bricks", self.details.bricks, "render it by render_bricks, and ")
 
     def _detail(self, name: str, value: Array | None, more: str = "") -> Array:
         if value is None:

@@ -67,8 +67,9 @@ class Space(eqx.Module):
         """World point of a grid coordinate."""
 
     @abstractmethod
-    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
-        """World-space cells that may hold anything visible, from the visible blocks of the grid."""
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
+        """World-space cells that may hold anything visible, from the visible blocks of the grid; or of a box
+        of it that begins at the node `first`, where the volume is only a part of the grid."""
 
     def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
         """For each face at which rays may enter or leave, whether anything visible may lie there, from the
@@ -193,9 +194,9 @@ class Affine(Space):
         x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
         return x, y, z
 
-    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         x, y, z = (BLOCK * step for step in self.spacing)
-        return Occupancy(visible, self.low, (x, y, z))
+        return Occupancy(visible, self.low if first is None else self.point(first), (x, y, z))
 
     def path(self, entry: Vec3, direction: Vec3) -> Straight:
         dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
@@ -212,9 +213,14 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
     return near, far
 
 
-def node_distance(space: Space, shape: tuple[int, ...]) -> Float[Array, "bx by bz"]:
-    """By block, the least world distance between neighbouring nodes, in its middle."""
-    middle = [BLOCK * (jnp.arange(n, dtype=space.middle[0].dtype) + 0.5) for n in shape]
+def node_distance(
+    space: Space, shape: tuple[int, ...], first: Int[Array, "3"] | None = None
+) -> Float[Array, "bx by bz"]:
+    """By block, the least world distance between neighbouring nodes, in its middle. `first`: of the blocks,
+    the index of the first one."""
+    first = jnp.zeros(3, jnp.int32) if first is None else first
+    dtype = space.middle[0].dtype
+    middle = [BLOCK * ((jnp.arange(n) + begin).astype(dtype) + 0.5) for n, begin in zip(shape, first, strict=True)]
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))

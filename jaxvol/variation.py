@@ -33,6 +33,10 @@ class Windows(eqx.Module):
     low: Float[Array, "bx by bz"]
     high: Float[Array, "bx by bz"]
     bend: Float[Array, "bx by bz"]
+    first: Int[Array, "3"] | None = None
+    """Where the volume is only a part of its grid, the index of the first block."""
+    whole: tuple[int, int, int] | None = eqx.field(static=True, default=None)
+    """Number of blocks of the grid then."""
 
     @classmethod
     def of(cls, volume: Volume) -> "Windows":
@@ -41,7 +45,11 @@ class Windows(eqx.Module):
         if volume.field is not None:  # nothing is known about it
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
             bend = jnp.full_like(bend, jnp.inf)
-        return cls(low, high, bend)
+        corner = volume.first
+        if corner is None:
+            return cls(low, high, bend)
+        x, y, z = (-(-(n - 1) // BLOCK) for n in volume.shape)
+        return cls(low, high, bend, jnp.stack(corner).astype(jnp.int32) // BLOCK, (x, y, z))
 
 
 class Variation(NamedTuple):

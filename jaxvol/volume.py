@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, require
 from ._util.vec3 import Scalar, Vec3
-from ._util.voxel_fetch import Fetch, OneByOne, corners, fetched
+from ._util.voxel_fetch import Fetch, OneByOne, Windowed, corners, fetched
 from ._util.voxels import label_array, voxel_array
 
 
@@ -88,8 +88,15 @@ class Volume(eqx.Module):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of nodes along x, y, z."""
-        nx, ny, nz = self.data.shape
-        return nx, ny, nz
+        return self.fetch.shape(self.data)
+
+    @property
+    def first(self) -> Vec3 | None:
+        """Where `data` is only a part of the grid, the node at which it begins, in the type of `spacing`."""
+        if not isinstance(self.fetch, Windowed):
+            return None
+        x, y, z = self.fetch.first.astype(self.spacing.dtype)
+        return x, y, z
 
     @property
     def bounds(self) -> Float[Array, "6"]:
@@ -201,6 +208,12 @@ def without_voxels(volume: Volume) -> Volume:
 def with_voxels(volume: Volume, data: Array) -> Volume:
     """The volume with `data` as its voxels."""
     return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
+
+
+def part_of(volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int]) -> Volume:
+    """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing
+    and origin are those of the whole. Beyond the part nothing is known: its faces are read."""
+    return with_fetch(volume, Windowed(volume.fetch, first, whole))
 
 
 def with_fetch(volume: Volume, fetch: Fetch) -> Volume:

@@ -33,6 +33,19 @@ class Fetch(eqx.Module):
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
 
+    def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
+        """Number of nodes of the grid, which may be more than `data` holds."""
+        nx, ny, nz = data.shape
+        return nx, ny, nz
+
+    def of(self, how: "Fetch") -> "Fetch":
+        """The same voxels, read in this way."""
+        return how
+
+    def begin(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+        """Index into the flattened array of the node below a grid coordinate."""
+        return flat_index(split(coordinate, data.shape)[0], data.shape)
+
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
         """The same, where slopes are asked for at one coordinate only and its node, as an index into the
         flattened array, is known. XLA computes an index that several fetches share on one thread, as a kernel
@@ -173,6 +186,43 @@ class Packed(Fetch):
         word = gather(self.words, flat)
         # XLA repeats a fetch for each use of its value, but not for uses of the converted value
         return word.astype(jnp.int32)
+
+
+class Windowed(Fetch):
+    """Reads a box of a larger grid, of which nothing else is in memory. Outside of it nothing is known: there
+    the voxels of its faces are read.
+
+    - `inside`: how the voxels of the box are read.
+    - `first`: node of the grid at which the box begins.
+    - `whole`: number of nodes of the grid.
+    """
+
+    inside: Fetch
+    first: Int[Array, "3"]
+    whole: tuple[int, int, int] = eqx.field(static=True)
+
+    def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
+        return self.whole
+
+    def of(self, how: Fetch) -> "Windowed":
+        return Windowed(how, self.first, self.whole)
+
+    def of_slopes_at(self, begin: Int[Array, ""]) -> "Windowed":
+        return self.of(self.inside.of_slopes_at(begin))
+
+    def begin(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+        return self.inside.begin(data, self._within(coordinate))
+
+    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+        return self.inside.cube(data, self._within(coordinate))
+
+    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+        return self.inside.slopes(data, self._within(coordinate))
+
+    def _within(self, coordinate: Vec3) -> Vec3:
+        # exact inside the box: a smaller number, and a multiple of the same unit
+        x, y, z = (c - self.first[i].astype(c.dtype) for i, c in enumerate(coordinate))
+        return x, y, z
 
 
 class Recording(Fetch):

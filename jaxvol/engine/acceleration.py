@@ -63,7 +63,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
     visible |= blocks.unordered
     if march.may_shift:  # what is leapt over is taken as transparent
         visible |= transfer.visible(blocks)
-    occupancy = space.occupancy(visible)
+    corner = volume.first
+    occupancy = space.occupancy(visible) if corner is None else space.occupancy(visible, corner)
     if isinstance(source, OwnRays):
         return march.empty_space(occupancy, None)
 

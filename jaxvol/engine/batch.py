@@ -77,6 +77,7 @@ class Job(NamedTuple):
     """All that does not change while rays are marched.
 
     - `empty_space`: where it is known, and `prepared`, what it has found out about these beams.
+    - `resumable`: whether rays that are finished stay where they are, so that they can go on from there.
     """
 
     pipeline: Pipeline
@@ -85,6 +86,7 @@ class Job(NamedTuple):
     visitor: SampleVisitor | None
     empty_space: EmptySpaceIndex | None
     prepared: PyTree
+    resumable: bool = False
 
     def alive(self, at: Progress) -> Bool[Array, "*rays"]:
         """Rays that are not finished, and may take more samples."""
@@ -135,8 +137,10 @@ def march_batch(
 
     def advance(state: State, *, regular: bool) -> State:
         here, (mine, more, total) = state
-        here = _to_next_cell(job, beam, rays, here)
+        here = finished_after(range_, _to_next_cell(job, beam, rays, here, range_))
         after, samples = march_segment(job.pipeline, tiling, rays, here, regular=regular)
+        if job.resumable:
+            after = _staying(here, after)
         if visitor is not None:
             mine, found, total = visitor.visit(rays, here, samples, given, mine, total)
             more = jax.tree.map(jnp.add, more, found)
@@ -164,6 +168,13 @@ def with_fields(at: Progress, **changes: Array) -> Progress:
     return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
 
 
+def _staying(here: Progress, after: Progress) -> Progress:
+    """`after`, but where rays were finished before, where they are."""
+    names = [name for name in ("index", "offset", "shift", "stride") if getattr(here, name) is not None]
+    moved = {n: jnp.where(here.finished, getattr(here, n), getattr(after, n)) for n in names}
+    return with_fields(after, **moved)
+
+
 def over_transparent(pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
     """Moves a ray on by so many steps, over which all cells are transparent, or to where the cell begins
     that lies there."""
@@ -175,10 +186,14 @@ def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""] | int) ->
     return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
 
-def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
+def _to_next_cell(
+    job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress, range_: CellRange | None
+) -> Progress:
     """Moves rays to their next cell that is not proven empty, and decides its stride."""
     pipeline = job.pipeline
     steps = None if job.empty_space is None else _leap(job, job.empty_space, beam, rays, at)
+    if steps is not None and range_ is not None:  # behind it, nothing is known
+        steps = jnp.minimum(steps, jnp.maximum(range_.until - at.index, 0))
     if at.stride is not None:
         ahead = jnp.zeros_like(at.index) if steps is None else steps
         # in memory, since all that computes with cells would decide it again

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.trees import PyTree
 from .._util.vec3 import Vec3, along
-from .._util.voxel_fetch import flat_index, split
 from .._util.xla import in_memory
 from ..lighting.shading import Sample, Shader
 from ..march import Cell
@@ -41,7 +40,7 @@ def light_terms(
 
     def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
         coordinate = around.space.coordinate(_sample(pipeline, ray, cell).point)
-        return flat_index(split(coordinate, volume.shape)[0], volume.shape)
+        return volume.fetch.begin(volume.data, coordinate)
 
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
         sample = _sample(pipeline, ray, cell)

@@ -50,7 +50,7 @@ def with_words(
     volume: Volume, words: UInt32[Array, " voxels"] | None, slopes: UInt32[Array, " voxels"] | None = None
 ) -> Volume:
     """The volume, with its packed copy where there is one, and with the slopes of its nodes."""
-    return volume if words is None else with_fetch(volume, Packed(words, slopes))
+    return volume if words is None else with_fetch(volume, volume.fetch.of(Packed(words, slopes)))
 
 
 @jax.jit

@@ -46,28 +46,40 @@ def march_rays(
     tiling: Tiling,
     outputs: Outputs | None = "all",
     visitor: SampleVisitor | None = None,
+    resumed: Progress | None = None,
 ) -> State:
     """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
-    outputs or nothing but opacity; and the visitor's `carry`, `sums` and `total`."""
+    outputs or nothing but opacity; and the visitor's `carry`, `sums` and `total`.
+
+    `resumed`: where rays have come to, if not at their entries. Then `beams.range` says which of their cells
+    are marched, and `index` is asked about these alone; a ray ends where they do, or up to a segment behind,
+    and is `finished` there."""
     march, rays = pipeline.march, beams.rays
-    at = vmap_rays(lambda ray: begin(pipeline, ray, outputs))(rays)
-    finished, prepared = rays.length <= 0, None
+    visible, prepared = rays.length > 0, None
     if index is not None:
         prepared = index.prepare(beams.box, tiling.cells * march.step)
-        visible = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
-        finished |= ~jnp.repeat(visible, beams.groups // beams.count)[:, None]
-    job = Job(pipeline, beams, tiling, visitor, index, prepared)
-    at = with_fields(at, finished=finished)
+        seen = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
+        visible &= jnp.repeat(seen, beams.groups // beams.count)[:, None]
+    job = Job(pipeline, beams, tiling, visitor, index, prepared, resumable=resumed is not None)
+    if resumed is None:
+        at = vmap_rays(lambda ray: begin(pipeline, ray, outputs))(rays)
+        at = with_fields(at, finished=~visible)
+    else:
+        at = resumed
     # Rays that may shift begin behind a transparent first cell. Not for a `Selection`, to which such cells
     # may matter; not where rays leap, since a leap shifts them, too; not for a visitor, which must see every
     # sample.
     weighs = isinstance(pipeline.compositing, Weighting)
-    if march.may_shift and weighs and index is None and visitor is None:
+    if march.may_shift and weighs and index is None and visitor is None and resumed is None:
         at = _past_first_cell(pipeline, rays, at)
     if beams.range is not None:
         over = vmap_rays(partial(over_transparent, pipeline))
+        first, until = beams.range
+        if resumed is not None:
+            first = jnp.where(visible, first, until)
         # `first` is not a valid index for rays that see nothing: these are finished before, and so not moved.
-        at = over(rays, finished_after(beams.range, at), beams.range.first)
+        at = over(rays, finished_after(beams.range, at), jnp.maximum(first - at.index, 0))
+        at = finished_after(beams.range, at)
     visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
     state: State = varying((at, visited), rays)
     return _marched(job, state)

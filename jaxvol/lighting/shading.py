@@ -223,6 +223,11 @@ def lit_classification(
     return classification._replace(light=Shader(lighting.shading(around), around))
 
 
+def _plain(volume: Volume) -> Volume:
+    """The volume without the packed copy of its voxels."""
+    return with_fetch(volume, volume.fetch.of(OneByOne()))
+
+
 class Shader(NamedTuple):
     """What shades the samples of an image."""
 
@@ -232,7 +237,7 @@ class Shader(NamedTuple):
     @property
     def leaves(self) -> PyTree:
         """All that has a gradient, except the transfer function and the voxels."""
-        return self.shading, self.around.space, without_voxels(with_fetch(self.around.volume, OneByOne()))
+        return self.shading, self.around.space, without_voxels(_plain(self.around.volume))
 
     def with_leaves(self, leaves: PyTree, transfer: Transfer) -> "Shader":
         """The same with these leaves, a transfer function, and the same voxels."""

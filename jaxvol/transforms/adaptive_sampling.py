@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Float, Int, Int32
 
 from .._util.checks import number, power_of_two
 from .._util.vec3 import Scalar, Vec3
@@ -93,6 +93,8 @@ class AdaptiveSampling(Transform):
     finest: int = eqx.field(static=True)
     errors: Int32[Array, "levels bx by bz"] | None
     """By stride and block, the predicted error, `_coded`; None before the scene is known."""
+    first: Int[Array, "3"] | None
+    """Index of the first block, where only a part of the volume is known."""
 
     def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
         self.tolerance = number("tolerance", tolerance, above=0)
@@ -100,7 +102,7 @@ class AdaptiveSampling(Transform):
         self.finest = power_of_two("finest", finest, 64)
         if self.longest * self.finest > 64:
             raise ValueError(f"longest * finest must be at most 64; got {longest!r} * {finest!r}.")
-        self.errors = None
+        self.errors = self.first = None
 
     @property
     def longest_stride(self) -> int:
@@ -117,7 +119,8 @@ class AdaptiveSampling(Transform):
         # the tolerance must not make different cells where an image is made in `jax.jit`, or differentiated.
         predict = partial(_errors, self.longest_stride)
         errors = in_memory(march.step > 0, predict, march, space, windows, variation)
-        return eqx.tree_at(lambda of: of.errors, self, errors, is_leaf=lambda leaf: leaf is None)
+        found = errors, windows.first
+        return eqx.tree_at(lambda of: (of.errors, of.first), self, found, is_leaf=lambda leaf: leaf is None)
 
     def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
         # the windows around the middle hold all of the run
@@ -128,9 +131,10 @@ class AdaptiveSampling(Transform):
         """The coded error of a stride in the block of a grid coordinate."""
         assert self.errors is not None
         _, nx, ny, nz = self.errors.shape
+        begin = (0, 0, 0) if self.first is None else self.first
         i, j, k = (
-            jnp.clip(jnp.floor(c / BLOCK), 0, n - 1).astype(jnp.int32)
-            for c, n in zip(coordinate, (nx, ny, nz), strict=True)
+            jnp.clip(jnp.floor(c / BLOCK).astype(jnp.int32) - first, 0, n - 1)
+            for c, n, first in zip(coordinate, (nx, ny, nz), begin, strict=True)
         )
         return gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
 
@@ -151,13 +155,15 @@ def _errors(
 ) -> Int32[Array, "levels bx by bz"]:
     """By stride and block, the coded error of a run with its middle there."""
     dtype = march.step.dtype
-    windows, variation = jax.tree.map(lambda leaf: leaf.astype(dtype), (windows, variation))
-    distance = node_distance(space, windows.low.shape).astype(dtype)
-    spread, length = windows.high - windows.low, BLOCK * distance
+    low, high, bend, variation = jax.tree.map(
+        lambda leaf: leaf.astype(dtype), (windows.low, windows.high, windows.bend, variation)
+    )
+    distance = node_distance(space, low.shape, windows.first).astype(dtype)
+    spread, length, shortest = high - low, BLOCK * distance, BLOCK * _shortest(space, windows, distance)
     levels = []
     for stride in (2**k for k in range(longest.bit_length())):
         width = stride * march.step
-        bent = windows.bend * (width / distance) ** 2 / 8
+        bent = bend * (width / distance) ** 2 / 8
         error = length * variation.total * jnp.where(bent >= spread, 1, bent / spread)
         if not march.integrates:
             sampled = width * variation.total / 2
@@ -167,7 +173,7 @@ def _errors(
                 sampled = jnp.where(turned < sampled, turned, sampled)
             error = error + sampled
         # a window exceeds its block by half of one, and each block around it by one more
-        reach = jnp.max(RUN * width / 2 / length)
+        reach = RUN * width / 2 / shortest
         rounds = jnp.maximum(jnp.ceil(reach - MARGIN / BLOCK), 0)
         # a cell's front hides its back
         hidden = jnp.minimum(variation.hidden * width, variation.colored) * width / 8
@@ -175,6 +181,18 @@ def _errors(
         code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
         levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
     return jnp.stack(levels)
+
+
+def _shortest(space: Space, windows: Windows, distance: Float[Array, "bx by bz"]) -> Scalar:
+    """The least distance between nodes in all of the grid, of which the windows may be a part."""
+    if windows.whole is None:
+        return jnp.min(distance)
+    bx, by, bz = windows.whole
+    zero = jnp.zeros((), jnp.int32)
+    layers = jax.lax.map(
+        lambda x: jnp.min(node_distance(space, (1, by, bz), jnp.stack([x, zero, zero]))), jnp.arange(bx)
+    )
+    return jnp.min(layers).astype(distance.dtype)
 
 
 def _dilated(_: Any, codes: Int32[Array, "bx by bz"]) -> Int32[Array, "bx by bz"]:

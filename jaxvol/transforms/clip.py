@@ -184,9 +184,9 @@ class _Clipped(Space):
         between = (leaves > enters) & (enters > 0) & (leaves < length)
         return *gaps, (jnp.where(between, enters, jnp.inf), jnp.where(between, leaves, jnp.inf))
 
-    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         """Without the cells of which nothing is seen."""
-        grid = self.inner.occupancy(visible)
+        grid = self.inner.occupancy(visible, first)
         over = [side.over(grid) for side in self.sides]
         if self.inside_out:
             seen = reduce(jnp.logical_or, [height <= reach for height, reach in over])

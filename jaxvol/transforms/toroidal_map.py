@@ -175,7 +175,7 @@ class _Sector(Space):
         ]
         return apart(self.probe.to_world(jnp.stack(toroidal)))
 
-    def occupancy(self, visible: Bool[Array, "bx by bz"]) -> Occupancy:
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         """World cells around the sector. A cell is occupied if the sphere around it reaches a visible block:
         along a path, an angle changes by no more than the path's length over the distance to its axis."""
         low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
@@ -193,16 +193,18 @@ class _Sector(Space):
 
         ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
         changes = angle(rho), angle(off), radius
-        first, last, reached = [], [], jnp.ones(rho.shape, bool)
+        begin, end, reached = [], [], jnp.ones(rho.shape, bool)
         coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
+        if first is not None:
+            coordinate = tuple(c - corner for c, corner in zip(coordinate, first, strict=True))
         for c, change, ends, n, blocks in zip(
             coordinate, changes, ranges, self.shape, visible.shape, strict=True
         ):
             nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
-            reached &= (c + nodes >= 0) & (c - nodes <= n - 1)
-            first.append(jnp.clip(jnp.floor((c - nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
-            last.append(jnp.clip(jnp.floor((c + nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
-        seen = Sums.of(visible).any_between((first[0], first[1], first[2]), (last[0], last[1], last[2]))
+            reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, BLOCK * blocks))
+            begin.append(jnp.clip(jnp.floor((c - nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
+            end.append(jnp.clip(jnp.floor((c + nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
+        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (end[0], end[1], end[2]))
         return Occupancy(reached & seen, low, (x, y, z))
 
     def path(self, entry: Vec3, direction: Vec3) -> "_Curved":

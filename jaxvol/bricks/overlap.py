@@ -1,0 +1,49 @@
+"""By how much must bricks of a toroidal grid overlap, so that each is needed once?
+
+The faces of a brick across γ are curved in the world. A ray may enter a brick, pass through the one that lies
+nearer to the probe, and come back. If the farther one reaches over the cap between the curved face and its
+chord, it need not be rendered again. The height of the cap is K = l - l cos(θ / 2), where l is the distance of
+the face from the centre of its curvature, and θ the angle under which it sees the brick: in the plane of the
+fan l = b + γ and θ the part of the range of σ, and about the motor's axis l = a + b + γ and θ that of β. The
+larger of the two counts.
+
+Source: Kim, Kwon and Shin 2008, section 3.2.
+"""
+
+import math
+
+import numpy as np
+
+from ..transforms import ToroidalMap
+from .grid import BrickGrid, Node
+
+
+def heights(a: float, b: float, ranges: np.ndarray, grid: BrickGrid) -> list[float]:
+    """K* of each face between two bricks along γ, in voxels, from the probe outward. `ranges`: (first, last)
+    of β, σ and γ."""
+    (beta, sigma, gamma), cells = np.diff(ranges, axis=1)[:, 0], [n - 1 for n in grid.shape]
+    parts = [size / n for size, n in zip(grid.size, cells, strict=True)]
+    found = []
+    for face in range(1, grid.counts[2]):
+        at = ranges[2][0] + face * parts[2] * gamma
+        fan = (b + at) * (1 - math.cos(sigma * parts[1] / 2))
+        turn = (a + b + at) * (1 - math.cos(beta * parts[0] / 2))
+        found.append(max(fan, turn, 0.0) * cells[2] / gamma)
+    return found
+
+
+def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
+    """K* of each face between two bricks along γ, in voxels, for a probe's grid."""
+    ranges = np.array([np.asarray(r, float) for r in (probe.beta_range, probe.sigma_range, probe.gamma_range)])
+    return heights(float(probe.a), float(probe.b), ranges, grid)
+
+
+def share(found: list[float], nodes: int) -> float:
+    """What the overlap adds to a volume of so many nodes along γ: whole layers at each face."""
+    return sum(math.ceil(k) for k in found) / nodes
+
+
+def most(probe: ToroidalMap | None, grid: BrickGrid) -> Node:
+    """Nodes along each axis by which a brick may be larger, for any of its faces; 0 without a probe."""
+    found = [] if probe is None else overlap_of(probe, grid)
+    return 0, 0, math.ceil(max(found, default=0.0))

@@ -1,0 +1,153 @@
+"""Which cells of each ray does a brick take?
+
+A cell belongs to the brick in which it begins, if samples were not moved. In a grid with straight rays each ray
+meets a brick once, and its cells there follow from where it enters and leaves. Where rays are curved, a ray may
+come back to a brick that it has left. Bricks are then taken in turn, and a ray goes on while it is in this one,
+or in one that was taken before: those cells are taken from the overlap, by which a brick is read larger than it
+is (Kim, Kwon and Shin 2008).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._util.vec3 import Scalar, Vec3
+from ..engine.batch import CellRange
+from ..engine.rays import vmap_rays
+from ..march import RUN, March
+from ..space import Ray, Straight, slab_interval
+from .grid import BrickGrid
+
+
+SLACK = 3
+"""Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more for
+rounding."""
+CHUNK = 8
+"""Cells of a ray that are looked at at a time."""
+
+
+def reach(march: March, segment: int) -> int:
+    """Steps before and behind a brick's cells of a ray, in which its cells may read voxels."""
+    return SLACK + max(segment, RUN * march.longest_stride)
+
+
+class Turn(eqx.Module):
+    """One brick's turn.
+
+    - `brick`: its number.
+    - `over`: bricks over which rays move to it: those that are empty.
+    - `through`: bricks through which they go on from it: itself, those that are empty, and those that have had
+      their turn, unless it is only the brick that counts.
+    - `empty`: bricks of which no voxel is needed.
+
+    All three have an entry for each brick, and one more for what lies outside of the volume.
+    """
+
+    brick: Int[Array, ""]
+    over: Bool[Array, " bricks"]
+    through: Bool[Array, " bricks"]
+    empty: Bool[Array, " bricks"]
+
+
+class Found(NamedTuple):
+    """Cells of rays (tiles, groups, rays) in a brick's turn.
+
+    - `cells`: from the first to the last one, which lie in the brick, the overlap, or what is empty.
+    - `reached`: index to which each ray has then come.
+    - `low`, `high`: a box of grid coordinates that holds all points of these cells.
+    - `any`: whether there are any cells.
+    """
+
+    cells: CellRange
+    reached: Int[Array, "*rays"]
+    low: Float[Array, "3"]
+    high: Float[Array, "3"]
+    any: Bool[Array, ""]
+
+
+def of_straight(grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn) -> CellRange:
+    """The cells of straight rays in a brick; none of rays that miss it, or are not alive."""
+    path = rays.path
+    assert isinstance(path, Straight)
+    index = jnp.unravel_index(turn.brick, grid.counts)
+    low, high = [], []
+    for i, size, count in zip(index, grid.size, grid.counts, strict=True):
+        # what lies outside of the grid belongs to the bricks at its faces
+        low.append(jnp.where(i == 0, -jnp.inf, (i * size).astype(rays.length.dtype)))
+        high.append(jnp.where(i == count - 1, jnp.inf, ((i + 1) * size).astype(rays.length.dtype)))
+    near, far = slab_interval(path.start, path.rate, (low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    hit = alive & (near <= far) & (far >= 0) & (near < rays.length)
+    last = rays.length / march.step + 1  # clipped before it becomes an integer, whose range it may exceed
+    first = jnp.ceil(jnp.clip(near / march.step, 0, last)).astype(jnp.int32) - SLACK
+    until = jnp.floor(jnp.clip(far / march.step, 0, last)).astype(jnp.int32) + 1 + SLACK
+    none = jnp.zeros_like(first)
+    return CellRange(jnp.where(hit, jnp.maximum(first, 0), none), jnp.where(hit, until, none))
+
+
+def of_curved(
+    grid: BrickGrid,
+    march: March,
+    rays: Ray,
+    alive: Bool[Array, "*rays"],
+    reached: Int[Array, "*rays"],
+    turn: Turn,
+    beyond: int,
+) -> Found:
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other. `reached`: to which
+    each has come. `beyond`: steps before and behind its cells that `low` and `high` are to hold, too."""
+
+    def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "cells *rays"], Scalar]:
+        depth = index.astype(rays.length.dtype) * march.step
+        each = jax.vmap(vmap_rays(lambda ray, s: (ray.path(s), ~ray.in_gap(s))), in_axes=(None, 0))
+        coordinate, inside = each(rays, depth)
+        return coordinate, inside & (depth < rays.length), depth
+
+    def bricks(index: Int[Array, "cells *rays"]) -> tuple[Int[Array, "cells *rays"], Bool[Array, "cells *rays"]]:
+        coordinate, inside, depth = points(index)
+        return jnp.where(inside, grid.brick_of(coordinate), grid.number), depth < rays.length
+
+    number = jnp.arange(CHUNK)[:, None, None]
+
+    def while_in(allowed: Bool[Array, " bricks"], index: Array, going: Array) -> tuple[Array, Array]:
+        """Moves rays on while they are in these bricks; and the index behind the last cell on the way that
+        is not empty."""
+
+        def more(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            index, last, going = state
+            at, inside = bricks(index[None] + number)
+            passed = jnp.cumprod((allowed[at] & inside).astype(jnp.int32), axis=0) > 0
+            last = jnp.maximum(
+                last, jnp.max(jnp.where(passed & ~turn.empty[at] & going, index + number + 1, 0), axis=0)
+            )
+            steps = jnp.sum(passed, axis=0, dtype=index.dtype)
+            return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
+
+        start = index, jnp.zeros_like(index), going
+        index, last, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), more, start)
+        return index, last
+
+    first, _ = while_in(turn.over, reached, alive)
+    here, inside = bricks(first[None])
+    mine = alive & (here[0] == turn.brick) & inside[0]
+    _, until = while_in(turn.through, first, mine)
+    cells = CellRange(
+        jnp.where(mine, jnp.maximum(first - SLACK, 0), 0), jnp.where(mine, until + SLACK, 0)
+    )
+
+    def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        index, low, high = state
+        coordinate, inside, _ = points(index[None] + number)
+        inside &= mine & (index[None] + number <= until + beyond) & (index[None] + number >= 0)
+        point = jnp.stack(coordinate)
+        low = jnp.minimum(low, jnp.min(jnp.where(inside, point, jnp.inf), axis=(1, 2, 3)))
+        high = jnp.maximum(high, jnp.max(jnp.where(inside, point, -jnp.inf), axis=(1, 2, 3)))
+        return index + CHUNK, low, high
+
+    nothing = jnp.full(3, jnp.inf, rays.length.dtype)
+    _, low, high = jax.lax.while_loop(
+        lambda state: jnp.any(mine & (state[0] <= until + beyond)), widen, (first - beyond, nothing, -nothing)
+    )
+    return Found(cells, jnp.where(mine, until, first), low, high, jnp.any(mine))

@@ -1,0 +1,149 @@
+"""Renders a volume that does not fit into memory, brick by brick."""
+
+from collections.abc import Callable
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._util.checks import Arrayable, described, finite_array, integer, is_traced
+from .._util.memory import memory_of_device
+from .._util.trees import strong
+from .._util.xla import compiled
+from ..arguments import check_arguments
+from ..camera import Camera
+from ..compositing import Compositing
+from ..engine.acceleration import VolumeAcceleration
+from ..engine.driver import Asked
+from ..engine.image import RenderOptions
+from ..engine.parts import arrive, march_part, set_out
+from ..engine.scene import Scene
+from ..engine.tiling import Tiling
+from ..lighting.shading import Lighting
+from ..march import March
+from ..modes import Mode, compositing_of
+from ..occupancy import BLOCK, Blocks, widened
+from ..rendering import Rendering
+from ..transfer import Transfer
+from ..space import node_distance
+from ..transforms import ToroidalMap
+from ..volume import Volume, part_of
+from .grid import BrickGrid, is_straight
+from .sources import ArraySource, VoxelSource
+from .split import Margin, bytes_of, split, stored_of
+from .stream import Method, Stream
+from .summary import Summary, scan
+
+
+def render_bricks(
+    source: VoxelSource | Any,
+    transfer: Transfer | Any,
+    camera: Camera | Any,
+    march: March | Any,
+    *,
+    spacing: Arrayable | None = None,
+    origin: Arrayable | None = None,
+    memory: int | Any | None = None,
+    bricks: tuple[int, int, int] | Any | None = None,
+    method: Method | Any = "overlap",
+    compositing: Mode | Compositing[Any] | Any = "over",
+    lighting: Lighting | Any | None = None,
+    outputs: Asked | Any = "all",
+    summary: Summary | None = None,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Rendering:
+    source = source if isinstance(source, VoxelSource) else ArraySource(source)
+    order = "render_bricks(source, transfer, camera, march)"
+    check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
+    scene = _scene(source, spacing, origin, transfer, camera, march, compositing, lighting)
+    options = RenderOptions(outputs, Tiling.of_backend())
+    stream = _stream(source, scene, options, memory, bricks, method, summary, progress)
+    placeholder = VolumeAcceleration(None, None, None, None)
+    bare = scene._replace(lighting=None)
+    underway = _set_out(bare, options, placeholder)
+
+    def march_brick(scene: Scene, acceleration: VolumeAcceleration, cells: Any, state: Any) -> Any:
+        return _march_part(scene, options, acceleration, state, cells)
+
+    underway = stream.through(underway.rays, underway, lambda state: state.alive, march_brick)
+    rendering = _arrive(bare, options, placeholder, underway)
+    return Rendering(rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=stream.report()))
+
+
+_set_out = compiled(set_out)
+_march_part = compiled(march_part)
+_arrive = compiled(arrive)
+
+
+def _scene(
+    source: VoxelSource,
+    spacing: Arrayable | None,
+    origin: Arrayable | None,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    compositing: Any,
+    lighting: Lighting | None,
+) -> Scene:
+    """The scene, with a volume of which no voxel is known."""
+    spacing = spacing if spacing is not None else source.spacing or (1.0, 1.0, 1.0)
+    origin = origin if origin is not None else source.origin or (0.0, 0.0, 0.0)
+    nothing = np.zeros((2, 2, 2), source.dtype)
+    volume = part_of(Volume(nothing, spacing, origin), jnp.zeros(3, jnp.int32), source.shape)
+    return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
+
+
+def _stream(
+    source: VoxelSource,
+    scene: Scene,
+    options: RenderOptions,
+    memory: int | Any | None,
+    bricks: tuple[int, int, int] | Any | None,
+    method: Method | Any,
+    summary: Summary | None,
+    progress: Callable[[int, int], Any] | None,
+) -> Stream:
+    if method not in get_args(Method):
+        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
+    volume, transfer, camera, march, compositing, lighting = scene
+    space = march.locate(volume)
+    straight = is_straight(space)
+    probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
+    spacing = np.asarray(volume.spacing, float)
+    if not straight:
+        spacing = np.full(3, float(jnp.min(node_distance(space, _blocks(source.shape)))))
+    margin = Margin.of(march, spacing, options.tiling.cells, transfer, lighting)
+    memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
+    if bricks is None:
+        grid = split(source.shape, source.dtype, memory, margin, probe)
+    else:
+        counts = [integer("bricks", n, 1) for n in bricks]
+        x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
+        grid = BrickGrid(source.shape, (x, y, z))
+    stored = stored_of(grid, margin, probe)
+    if summary is None:
+        summary = scan(source, 16)
+    visible = _visible(scene, grid, summary)
+    return Stream(
+        *(source, scene, options, grid, margin, grid.order(space, camera), visible, straight, stored),
+        *(max(memory, bytes_of(stored, source.dtype)), method, progress),
+    )
+
+
+def _blocks(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(-(-(n - 1) // BLOCK) for n in shape)
+
+
+def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
+    """For each brick, whether anything may be visible in it."""
+    ranges = np.array(
+        [
+            summary.range_of(low, [end + 1 for end in high])
+            for low, high in (grid.cells(brick) for brick in range(grid.number))
+        ],
+        np.float32,
+    )
+    low, high = (jnp.asarray(end.reshape(grid.counts)) for end in ranges.T)
+    blocks = Blocks(*widened(low, high), None)
+    return np.asarray(scene.compositing.occupied(scene.transfer, blocks)).reshape(-1)

@@ -1,0 +1,214 @@
+"""Takes an image's rays through all bricks in turn, while the next brick is read."""
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from .._util.xla import compiled
+from ..engine.acceleration import VolumeAcceleration
+from ..engine.batch import CellRange
+from ..engine.image import RenderOptions
+from ..engine.scene import Scene
+from ..march import March
+from ..occupancy import BLOCK
+from ..rendering import BrickReport
+from ..space import Ray
+from ..volume import Volume, part_of
+from .grid import BrickGrid, Node
+from .ranges import Found, Turn, of_curved, of_straight
+from .sources import VoxelSource
+from .split import Margin, bytes_of, stored_shape
+
+
+Method = Literal["overlap", "reload", "naive"]
+State = TypeVar("State")
+
+BEAMS = 32
+"""Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
+rays."""
+
+
+class Load(NamedTuple):
+    """A brick that is being read, and the cells for which."""
+
+    brick: int
+    cells: CellRange
+    first: Node
+    voxels: "Future[np.ndarray]"
+
+
+@dataclass
+class Stream:
+    """The bricks of a scene.
+
+    - `scene`: with a volume without its voxels.
+    - `visible`: for each brick, whether anything may be visible in it.
+    - `straight`: whether rays are straight in the grid.
+    - `stored`: nodes along each axis that are read at a time. `memory`: bytes that these may take.
+    """
+
+    source: VoxelSource
+    scene: Scene
+    options: RenderOptions
+    grid: BrickGrid
+    margin: Margin
+    order: list[int]
+    visible: np.ndarray
+    straight: bool
+    stored: Node
+    memory: int
+    method: Method
+    progress: Callable[[int, int], Any] | None = None
+    loads: list[int] = field(default_factory=list)
+    bytes_read: int = 0
+
+    def through(
+        self,
+        rays: Ray,
+        state: State,
+        alive: Callable[[State], Bool[Array, "*rays"]],
+        march: Callable[[Scene, VolumeAcceleration, CellRange, State], State],
+    ) -> State:
+        """The state after `march(scene, acceleration, cells, state)` of all bricks."""
+        living = [alive(state)]
+        turns = self._turns(rays, living)
+        load = next(turns, None)
+        while load is not None:
+            voxels = load.voxels.result()
+            jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
+            scene, acceleration = self._with(voxels, load.first)
+            del voxels
+            following = next(turns, None)
+            state = march(scene, acceleration, load.cells, state)
+            living[0] = alive(state)
+            if self.progress is not None:
+                self.progress(len(self.loads), int(self.visible.sum()))
+            load = following
+        return state
+
+    def report(self) -> BrickReport:
+        """What all passes so far took."""
+        return BrickReport(
+            self.grid.counts,
+            int(self.visible.sum()),
+            len(self.loads),
+            len(self.loads) - len(set(self.loads)),
+            self.bytes_read,
+            self.stored,
+            bytes_of(self.stored, self.source.dtype),
+        )
+
+    def _with(self, voxels: np.ndarray, first: Node) -> tuple[Scene, VolumeAcceleration]:
+        volume = self.scene.volume
+        part = Volume(voxels, volume.spacing, volume.origin)
+        part = part_of(part, jnp.asarray(first, jnp.int32), self.grid.shape)
+        scene = self.scene._replace(volume=part)
+        return scene, VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
+
+    def _turns(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
+        """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the newest
+        answer."""
+        if self.straight:
+            for brick in self.order:
+                if not self.visible[brick]:
+                    continue
+                turn = self._turn(brick, {brick})
+                cells, any_ = _cells_of_straight(self.grid, self.scene.march, rays, living[0], turn)
+                if any_:
+                    yield self._load(brick, cells, *self._around(brick))
+            return
+        reached, going = jnp.zeros(rays.length.shape, jnp.int32), True
+        while going:
+            had, going = set[int](), False
+            for brick in self.order:
+                if not self.visible[brick]:
+                    continue
+                through = {brick} if self.method == "reload" else {brick, *had}
+                found = self._found(brick, through, rays, living[0], reached)
+                if found is not None and self._too_large(found):
+                    found = self._found(brick, {brick}, rays, living[0], reached)
+                had.add(brick)
+                if found is not None:
+                    going, reached = True, found.reached
+                    yield self._load(brick, found.cells, *self._box(found))
+            going &= self.method == "reload" or bool(jnp.any(living[0]))
+
+    def _turn(self, brick: int, through: set[int]) -> Turn:
+        number = self.grid.number
+        empty = np.append(~self.visible, True)
+        through_ = empty.copy()
+        through_[list(through)] = True
+        return Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(through_), jnp.asarray(empty))
+
+    def _found(
+        self, brick: int, through: set[int], rays: Ray, alive: Array, reached: Array
+    ) -> Found | None:
+        beyond = self.margin.steps
+        found = _cells_of_curved(
+            self.grid, beyond, self.scene.march, rays, alive, reached, self._turn(brick, through)
+        )
+        return found if bool(found.any) else None
+
+    def _around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
+        low, high = (np.asarray(end) for end in self.grid.cells(brick))
+        return low - self.margin.cells, high + self.margin.cells
+
+    def _box(self, found: Found) -> tuple[np.ndarray, np.ndarray]:
+        around = self.margin.around
+        low, high = np.asarray(found.low, float), np.asarray(found.high, float)
+        return np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
+
+    def _too_large(self, found: Found) -> bool:
+        """Whether a box does not fit into what is read at a time, also if that is made as large as it may
+        be."""
+        low, high = self._box(found)
+        low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
+        wanted = tuple(np.maximum(high - low + 1 + BLOCK, self.stored).tolist())
+        larger = stored_shape(self.grid.shape, wanted)
+        if bytes_of(larger, self.source.dtype) > self.memory:
+            return True
+        self.stored = larger
+        return False
+
+    def _load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:
+        """Starts to read a brick: a part that begins at a multiple of BLOCK and holds these nodes."""
+        shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
+        first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
+        assert np.all(np.minimum(high, shape - 1) < first + stored), (low, high, first, stored)
+        x, y, z = first.tolist()
+        self.loads.append(brick)
+        self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
+        return Load(brick, cells, (x, y, z), self.source.read_async(first, first + stored))
+
+
+def _straight(
+    grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn
+) -> tuple[CellRange, Bool[Array, ""]]:
+    cells = of_straight(grid, march, rays, alive, turn)
+    return cells, jnp.any(cells.until > cells.first)
+
+
+def _curved(
+    grid: BrickGrid, beyond: int, march: March, rays: Ray, alive: Array, reached: Array, turn: Turn
+) -> Found:
+    """By beams of rays, as many as are looked at at a time."""
+    shape = rays.length.shape
+    by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), (rays, alive, reached))
+    found = jax.lax.map(
+        lambda each: of_curved(grid, march, *each, turn, beyond), by_beam, batch_size=BEAMS
+    )
+    cells, at = jax.tree.map(lambda leaf: leaf.reshape(shape), (found.cells, found.reached))
+    return Found(cells, at, jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any))
+
+
+_cells_of_straight = compiled(_straight)
+_cells_of_curved = compiled(_curved)

@@ -1,0 +1,86 @@
+"""Marches an image through one part of a volume after the other.
+
+A volume that does not fit into memory is marched part by part. Of each ray, it is kept where it has come to;
+each part marches those cells of it that lie there (`CellRange`), from where the part before it left off. What
+is made of voxels, the packed copy, ranges of blocks and windows, is made of each part.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._util.trees import PyTree
+from ..reference import Pipeline, Progress, begin, end, front, stopped
+from ..rendering import Rendering
+from ..space import Ray, invalid
+from .acceleration import VolumeAcceleration, empty_space_of
+from .batch import Beams, CellRange, with_fields
+from .image import RenderOptions, fault_of, pipeline_of
+from .rays import RayTiles, vmap_rays
+from .scene import Scene
+from .wavefront import march_rays
+
+
+class Underway(eqx.Module):
+    """The rays of an image, and where they have come to, (tiles, groups, rays in a group)."""
+
+    rays: Ray
+    at: Progress
+
+    @property
+    def alive(self) -> Array:
+        """Which rays may still see more."""
+        return ~self.at.finished
+
+
+def set_out(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Underway:
+    """All rays at their entries. Of the volume, no voxel is read."""
+    tiles, fault = RayTiles.of(scene.source, options.tiling), fault_of(scene)
+    space, pipeline = pipeline_of(scene, acceleration)
+
+    def one(number: Int[Array, ""]) -> Underway:
+        rays = invalid(tiles.rays(scene.source, space, number), fault)
+        at = vmap_rays(lambda ray: begin(pipeline, ray, options.outputs))(rays)
+        return Underway(rays, with_fields(at, finished=rays.length <= 0))
+
+    return jax.lax.map(one, jnp.arange(tiles.number))
+
+
+def march_part(
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    underway: Underway,
+    ranges: CellRange,
+) -> Underway:
+    """The rays behind these of their cells. `scene`: with a part of the volume, which holds what they meet
+    there, and in a segment more."""
+    tiles, packed = RayTiles.of(scene.source, options.tiling), acceleration.packed(scene)
+    index = empty_space_of(packed, acceleration, options.tiling)
+    _, pipeline = pipeline_of(packed, acceleration)
+
+    def one(each: tuple[Int[Array, ""], Underway, CellRange]) -> Underway:
+        number, (rays, at), range_ = each[0], (each[1].rays, each[1].at), each[2]
+        beams = Beams(rays, tiles.beam_count, tiles.box(scene.source, rays, number), range_)
+        after, _ = march_rays(pipeline, index, beams, options.tiling, options.outputs, resumed=at)
+        return Underway(rays, with_fields(after, finished=at.finished | ended(pipeline, rays, after)))
+
+    return jax.lax.map(one, (jnp.arange(tiles.number), underway, ranges))
+
+
+def ended(pipeline: Pipeline, rays: Ray, at: Progress) -> Array:
+    """Which rays need no other cell, wherever it lies."""
+    return (front(pipeline.march, at) >= rays.length) | stopped(pipeline, at.composite)
+
+
+def arrive(
+    scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, underway: Underway
+) -> Rendering:
+    """The image of rays that have passed all parts."""
+    tiles = RayTiles.of(scene.source, options.tiling)
+    _, pipeline = pipeline_of(scene, acceleration)
+    renderings = jax.vmap(vmap_rays(partial(end, pipeline)))(underway.rays, underway.at)
+    return jax.tree.map(tiles.assemble, renderings)
