@@ -42,7 +42,7 @@ class Fetch(eqx.Module):
         """The same voxels, read in this way."""
         return how
 
-    def begin(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
         """Index into the flattened array of the node below a grid coordinate."""
         return flat_index(split(coordinate, data.shape)[0], data.shape)
 
@@ -210,8 +210,8 @@ class Windowed(Fetch):
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Windowed":
         return self.of(self.inside.of_slopes_at(begin))
 
-    def begin(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
-        return self.inside.begin(data, self._within(coordinate))
+    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+        return self.inside.base(data, self._within(coordinate))
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         return self.inside.cube(data, self._within(coordinate))

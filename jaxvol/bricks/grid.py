@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
@@ -74,7 +75,7 @@ class BrickGrid:
                 depth = np.sum(np.abs(centers - own) / scale, axis=-1)
         else:
             x, y, z = (jnp.asarray(c) for c in np.minimum(centers, np.asarray(self.shape) - 1).T)
-            toward = np.stack([np.asarray(p) for p in space.point((x, y, z))], axis=-1) - np.asarray(eye)
+            toward = np.stack([np.asarray(p) for p in jax.vmap(space.point)((x, y, z))], axis=-1) - np.asarray(eye)
             depth = toward @ np.asarray(forward) if parallel else np.linalg.norm(toward, axis=-1)
         return np.argsort(depth, kind="stable").tolist()
 

@@ -17,14 +17,16 @@ from ..compositing import Compositing
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.driver import Asked
 from ..engine.image import RenderOptions
-from ..engine.parts import arrive, march_part, set_out
+from ..engine.parts import NOTHING, arrive, march_part, resolve_part, set_out
+from ..engine.resolve import resolve_image
 from ..engine.scene import Scene
 from ..engine.tiling import Tiling
 from ..lighting.shading import Lighting
 from ..march import March
 from ..modes import Mode, compositing_of
 from ..occupancy import BLOCK, Blocks, widened
-from ..rendering import Rendering
+from ..rendering import Details, Rendering
+from ..selection import Selection
 from ..transfer import Transfer
 from ..space import node_distance
 from ..transforms import ToroidalMap
@@ -57,21 +59,46 @@ def render_bricks(
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     scene = _scene(source, spacing, origin, transfer, camera, march, compositing, lighting)
-    options = RenderOptions(outputs, Tiling.of_backend())
-    stream = _stream(source, scene, options, memory, bricks, method, summary, progress)
-    placeholder = VolumeAcceleration(None, None, None, None)
-    bare = scene._replace(lighting=None)
-    underway = _set_out(bare, options, placeholder)
+    how = scene.compositing
+    selects, resolves = isinstance(how, Selection), how.resolves
+    marched = scene
+    if resolves:  # rays are marched without light
+        transfer, march = how.marched(scene.transfer, scene.march, scene.volume)
+        marched = scene._replace(transfer=transfer, march=march, lighting=None)
+    options = RenderOptions("depth" if resolves and outputs == "rgba" else outputs, Tiling.of_backend())
+    stream = _stream(source, marched, scene, options, memory, bricks, method, summary, progress)
+    underway = _set_out(marched, options)
 
-    def march_brick(scene: Scene, acceleration: VolumeAcceleration, cells: Any, state: Any) -> Any:
-        return _march_part(scene, options, acceleration, state, cells)
+    def march_brick(part: Volume, cells: Any, state: Any) -> Any:
+        underway, pixels = state
+        here = marched._replace(volume=part)
+        acceleration = VolumeAcceleration.of(part, here.transfer, here.march, here.lighting)
+        after = _march_part(here, options, acceleration, underway, cells)
+        if selects:
+            whole = scene._replace(volume=part)
+            acceleration = VolumeAcceleration.of(part, whole.transfer, whole.march, whole.lighting)
+            pixels = _resolve_part(whole, options, acceleration, marched.march, underway.at, after, pixels)
+        return after, pixels
 
-    underway = stream.through(underway.rays, underway, lambda state: state.alive, march_brick)
-    rendering = _arrive(bare, options, placeholder, underway)
-    return Rendering(rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=stream.report()))
+    state = stream.through(underway.rays, (underway, None), lambda state: state[0].alive, march_brick)
+    underway, pixels = state
+    rendering = _arrive(marched, options, underway)
+    if resolves and not selects:
+        found = rendering.rgba, rendering.depth, None
+        pixels = _resolve(scene, options, NOTHING, found)
+    details = rendering.details._replace(bricks=stream.report(), selected=None)
+    if pixels is None:
+        return Rendering(rendering.rgba, rendering.exhausted, details)
+    normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
+    details = details._replace(depth=pixels[..., 4], normal=normal)
+    if outputs == "rgba":
+        details = Details(bricks=details.bricks)
+    return Rendering(pixels[..., :4], rendering.exhausted, details)
 
 
 _set_out = compiled(set_out)
+_resolve_part = compiled(resolve_part)
+_resolve = compiled(resolve_image)
 _march_part = compiled(march_part)
 _arrive = compiled(arrive)
 
@@ -97,6 +124,7 @@ def _scene(
 def _stream(
     source: VoxelSource,
     scene: Scene,
+    shown: Scene,
     options: RenderOptions,
     memory: int | Any | None,
     bricks: tuple[int, int, int] | Any | None,
@@ -106,14 +134,14 @@ def _stream(
 ) -> Stream:
     if method not in get_args(Method):
         raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
-    volume, transfer, camera, march, compositing, lighting = scene
+    volume, _, camera, march, _, _ = scene
     space = march.locate(volume)
     straight = is_straight(space)
     probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
     spacing = np.asarray(volume.spacing, float)
     if not straight:
         spacing = np.full(3, float(jnp.min(node_distance(space, _blocks(source.shape)))))
-    margin = Margin.of(march, spacing, options.tiling.cells, transfer, lighting)
+    margin = Margin.of(march, spacing, options.tiling.cells, shown.transfer, shown.lighting)
     memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
     if bricks is None:
         grid = split(source.shape, source.dtype, memory, margin, probe)

@@ -33,7 +33,7 @@ class Margin:
     - `cells`: along each axis, on both sides: as far as cells that begin in the brick may reach, and one more
       where the gradient is read.
     - `steps`: the same in steps along a ray.
-    - `around`: nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`.
+    - `around`: nodes more, for interpolation, slopes, the windows of `AdaptiveSampling`, and light.
     """
 
     cells: Node
@@ -51,6 +51,9 @@ class Margin:
         if march.looks_ahead:  # blocks around a run's own, and the windows of these
             rounds = math.ceil(RUN * march.longest_stride * float(np.max(length)) / (2 * BLOCK))
             around += BLOCK * (rounds + 2)
+        if lighting is not None:
+            assert lighting.farthest_read is not None
+            around += math.ceil(lighting.farthest_read / float(np.min(spacing)))
         x, y, z = (math.ceil(steps * d) + around for d in length)
         return cls((x, y, z), steps, around)
 

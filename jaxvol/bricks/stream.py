@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from .._util.xla import compiled
-from ..engine.acceleration import VolumeAcceleration
 from ..engine.batch import CellRange
 from ..engine.image import RenderOptions
 from ..engine.scene import Scene
@@ -76,19 +75,19 @@ class Stream:
         rays: Ray,
         state: State,
         alive: Callable[[State], Bool[Array, "*rays"]],
-        march: Callable[[Scene, VolumeAcceleration, CellRange, State], State],
+        march: Callable[[Volume, CellRange, State], State],
     ) -> State:
-        """The state after `march(scene, acceleration, cells, state)` of all bricks."""
+        """The state after `march(part, cells, state)` of all bricks."""
         living = [alive(state)]
         turns = self._turns(rays, living)
         load = next(turns, None)
         while load is not None:
             voxels = load.voxels.result()
             jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
-            scene, acceleration = self._with(voxels, load.first)
+            part = self._part(voxels, load.first)
             del voxels
             following = next(turns, None)
-            state = march(scene, acceleration, load.cells, state)
+            state = march(part, load.cells, state)
             living[0] = alive(state)
             if self.progress is not None:
                 self.progress(len(self.loads), int(self.visible.sum()))
@@ -107,12 +106,10 @@ class Stream:
             bytes_of(self.stored, self.source.dtype),
         )
 
-    def _with(self, voxels: np.ndarray, first: Node) -> tuple[Scene, VolumeAcceleration]:
+    def _part(self, voxels: np.ndarray, first: Node) -> Volume:
         volume = self.scene.volume
         part = Volume(voxels, volume.spacing, volume.origin)
-        part = part_of(part, jnp.asarray(first, jnp.int32), self.grid.shape)
-        scene = self.scene._replace(volume=part)
-        return scene, VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
+        return part_of(part, jnp.asarray(first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
         """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the newest

@@ -40,7 +40,7 @@ def light_terms(
 
     def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
         coordinate = around.space.coordinate(_sample(pipeline, ray, cell).point)
-        return volume.fetch.begin(volume.data, coordinate)
+        return volume.fetch.base(volume.data, coordinate)
 
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
         sample = _sample(pipeline, ray, cell)

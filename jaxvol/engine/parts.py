@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.trees import PyTree
+from ..march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
 from ..rendering import Rendering
 from ..space import Ray, invalid
@@ -20,8 +21,12 @@ from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, with_fields
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles, vmap_rays
+from .resolve import resolve_image
 from .scene import Scene
 from .wavefront import march_rays
+
+
+NOTHING = VolumeAcceleration(None, None, None, None)
 
 
 class Underway(eqx.Module):
@@ -36,10 +41,10 @@ class Underway(eqx.Module):
         return ~self.at.finished
 
 
-def set_out(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Underway:
+def set_out(scene: Scene, options: RenderOptions) -> Underway:
     """All rays at their entries. Of the volume, no voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), fault_of(scene)
-    space, pipeline = pipeline_of(scene, acceleration)
+    space, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
 
     def one(number: Int[Array, ""]) -> Underway:
         rays = invalid(tiles.rays(scene.source, space, number), fault)
@@ -76,11 +81,35 @@ def ended(pipeline: Pipeline, rays: Ray, at: Progress) -> Array:
     return (front(pipeline.march, at) >= rays.length) | stopped(pipeline, at.composite)
 
 
-def arrive(
-    scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, underway: Underway
-) -> Rendering:
-    """The image of rays that have passed all parts."""
+def resolve_part(
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    march: March,
+    before: Progress,
+    after: Underway,
+    pixels: Array | None,
+) -> Array:
+    """Pixels of a mode that chooses a sample: computed anew, from this part of the volume, where another one
+    was chosen in it than `before`. `march`: of the rays."""
     tiles = RayTiles.of(scene.source, options.tiling)
-    _, pipeline = pipeline_of(scene, acceleration)
+    rendering = _assembled(scene, march, tiles, after)
+    changed = jnp.zeros(after.rays.length.shape, bool)
+    for old, new in zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True):
+        changed |= old != new
+    changed = tiles.assemble(changed)
+    rgba = rendering.rgba * changed[..., None]
+    found = rgba, rendering.depth, rendering.details.selected
+    resolved = resolve_image(scene, options, acceleration, found)
+    return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)
+
+
+def _assembled(scene: Scene, march: March, tiles: RayTiles, underway: Underway) -> Rendering:
+    _, pipeline = pipeline_of(scene._replace(march=march, lighting=None), NOTHING)
     renderings = jax.vmap(vmap_rays(partial(end, pipeline)))(underway.rays, underway.at)
     return jax.tree.map(tiles.assemble, renderings)
+
+
+def arrive(scene: Scene, options: RenderOptions, underway: Underway) -> Rendering:
+    """The image of rays that have passed all parts."""
+    return _assembled(scene, scene.march, RayTiles.of(scene.source, options.tiling), underway)

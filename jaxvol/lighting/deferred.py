@@ -60,6 +60,10 @@ class Deferred(Lighting):
     def simpler(self) -> tuple[Simpler, ...]:
         return tuple(each for each in self.lighting.simpler if isinstance(each.lighting, Deferred))
 
+    @property
+    def farthest_read(self) -> float | None:
+        return self.lighting.farthest_read
+
     def shading(self, around: Surroundings) -> Shading:
         return self.lighting.shading(around)
 

@@ -80,6 +80,10 @@ class Phong(Lighting):
     def reads_gradient(self) -> bool:
         return True
 
+    @property
+    def farthest_read(self) -> float:
+        return 0.0
+
     def shading(self, around: Surroundings) -> Shading:
         return PhongShading(self)
 

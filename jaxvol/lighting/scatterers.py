@@ -267,6 +267,15 @@ class ScattererTemplates(Lighting):
         }
         return ScattererTemplates(self.materials, self.lights, **(own | changes))
 
+    @property
+    def farthest_read(self) -> float | None:
+        if self.baked:
+            return None
+        offset = np.asarray(self.grown(blend=self.blend).offset)
+        indices = [float(material.refractive_index) for material in self.materials]
+        stretched = max(indices) / min(indices)  # by refraction
+        return float(np.max(np.linalg.norm(offset, axis=-1))) * max(1.0, *self.reach) * stretched
+
     def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
         if not self.baked:
             return self

@@ -172,6 +172,12 @@ class Lighting(eqx.Module):
         """Whether samples read the volume's gradient, so that it is worth storing slopes. By default not."""
         return False
 
+    @property
+    def farthest_read(self) -> float | None:
+        """Distance from a sample, world length, up to which its shading reads the volume: more than 0 must be
+        read around a part of it. By default None: there is no such distance, or nobody knows it."""
+        return None
+
     @abstractmethod
     def shading(self, around: Surroundings) -> Shading:
         """The shading of one image. What does not depend on the sample is computed here, once."""
