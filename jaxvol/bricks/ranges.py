@@ -68,6 +68,13 @@ class Found(NamedTuple):
     any: Bool[Array, ""]
 
 
+def widened(cells: CellRange) -> CellRange:
+    """The cells, with those before and behind them whose samples may have been moved to there."""
+    some = cells.until > cells.first
+    first, until = jnp.maximum(cells.first - SLACK, 0), cells.until + SLACK
+    return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
+
+
 def of_straight(grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn) -> CellRange:
     """The cells of straight rays in a brick; none of rays that miss it, or are not alive."""
     path = rays.path
@@ -133,9 +140,7 @@ def of_curved(
     here, inside = bricks(first[None])
     mine = alive & (here[0] == turn.brick) & inside[0]
     _, until = while_in(turn.through, first, mine)
-    cells = CellRange(
-        jnp.where(mine, jnp.maximum(first - SLACK, 0), 0), jnp.where(mine, until + SLACK, 0)
-    )
+    cells = CellRange(jnp.where(mine, first, 0), jnp.where(mine, until, 0))
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         index, low, high = state

@@ -15,20 +15,22 @@ from ..arguments import check_arguments
 from ..camera import Camera
 from ..compositing import Compositing
 from ..engine.acceleration import VolumeAcceleration
+from ..engine.batch import with_fields
 from ..engine.driver import Asked
 from ..engine.image import RenderOptions
-from ..engine.parts import NOTHING, arrive, march_part, resolve_part, set_out
+from ..engine.parts import NOTHING, Underway, arrive, march_part, resolve_part, set_out
 from ..engine.resolve import resolve_image
 from ..engine.scene import Scene
 from ..engine.tiling import Tiling
 from ..lighting.shading import Lighting
 from ..march import March
 from ..modes import Mode, compositing_of
-from ..occupancy import BLOCK, Blocks, widened
+from ..occupancy import Blocks, widened
 from ..rendering import Details, Rendering
 from ..selection import Selection
 from ..transfer import Transfer
-from ..space import node_distance
+from .._util.vec3 import apart
+from ..space import Space
 from ..transforms import ToroidalMap
 from ..volume import Volume, part_of
 from .grid import BrickGrid, is_straight
@@ -73,7 +75,7 @@ def render_bricks(
         underway, pixels = state
         here = marched._replace(volume=part)
         acceleration = VolumeAcceleration.of(part, here.transfer, here.march, here.lighting)
-        after = _march_part(here, options, acceleration, underway, cells)
+        after = _march_part(here, options, acceleration, underway, cells, method == "naive")
         if selects:
             whole = scene._replace(volume=part)
             acceleration = VolumeAcceleration.of(part, whole.transfer, whole.march, whole.lighting)
@@ -82,6 +84,8 @@ def render_bricks(
 
     state = stream.through(underway.rays, (underway, None), lambda state: state[0].alive, march_brick)
     underway, pixels = state
+    if method == "naive":  # rays go back, and have no end
+        underway = Underway(underway.rays, with_fields(underway.at, finished=underway.at.index >= 0))
     rendering = _arrive(marched, options, underway)
     if resolves and not selects:
         found = rendering.rgba, rendering.depth, None
@@ -140,7 +144,7 @@ def _stream(
     probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
     spacing = np.asarray(volume.spacing, float)
     if not straight:
-        spacing = np.full(3, float(jnp.min(node_distance(space, _blocks(source.shape)))))
+        spacing = _distances(space, source.shape)
     margin = Margin.of(march, spacing, options.tiling.cells, shown.transfer, shown.lighting)
     memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
     if bricks is None:
@@ -159,8 +163,12 @@ def _stream(
     )
 
 
-def _blocks(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(-(-(n - 1) // BLOCK) for n in shape)
+def _distances(space: Space, shape: tuple[int, ...]) -> np.ndarray:
+    """World distances between nodes along the three axes, in the middle of a grid with curved rays. Where a
+    brick takes more of its surroundings, more is read."""
+    middle = jnp.asarray([(n - 1) / 2 for n in shape])
+    along = jax.jacfwd(lambda at: jnp.stack(space.point(apart(at))))(middle)
+    return np.linalg.norm(np.asarray(along, float), axis=0)
 
 
 def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:

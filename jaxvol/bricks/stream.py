@@ -23,7 +23,7 @@ from ..rendering import BrickReport
 from ..space import Ray
 from ..volume import Volume, part_of
 from .grid import BrickGrid, Node
-from .ranges import Found, Turn, of_curved, of_straight
+from .ranges import Found, Turn, of_curved, of_straight, widened
 from .sources import VoxelSource
 from .split import Margin, bytes_of, stored_shape
 
@@ -114,6 +114,9 @@ class Stream:
     def _turns(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
         """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the newest
         answer."""
+        if self.method == "naive":
+            yield from self._alone(rays, living)
+            return
         if self.straight:
             for brick in self.order:
                 if not self.visible[brick]:
@@ -136,8 +139,28 @@ class Stream:
                 had.add(brick)
                 if found is not None:
                     going, reached = True, found.reached
-                    yield self._load(brick, found.cells, *self._box(found))
+                    yield self._load(brick, widened(found.cells), *self._box(found))
             going &= self.method == "reload" or bool(jnp.any(living[0]))
+
+    def _alone(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
+        """Each brick with all its cells of each ray, whatever other bricks the ray meets between them."""
+        nowhere = np.append(np.ones(self.grid.number, bool), True)
+        for brick in self.order:
+            reached = jnp.zeros(rays.length.shape, jnp.int32)
+            others = nowhere.copy()
+            others[brick] = False
+            own, load = jnp.asarray(~others), None
+            turn = Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(others), own, jnp.asarray(others))
+            while self.visible[brick]:
+                found = _cells_of_curved(self.grid, 0, self.scene.march, rays, living[0], reached, turn)
+                if not bool(found.any):
+                    break
+                if load is None:
+                    load = self._load(brick, found.cells, *self._around(brick))
+                else:
+                    load = load._replace(cells=found.cells)
+                reached = found.reached
+                yield load
 
     def _turn(self, brick: int, through: set[int]) -> Turn:
         number = self.grid.number

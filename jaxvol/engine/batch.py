@@ -77,7 +77,8 @@ class Job(NamedTuple):
     """All that does not change while rays are marched.
 
     - `empty_space`: where it is known, and `prepared`, what it has found out about these beams.
-    - `resumable`: whether rays that are finished stay where they are, so that they can go on from there.
+    - `resumable`: whether rays that are finished stay where they are, so that they can go on from there;
+      and `exact`: whether they take no cell behind the last one of their range.
     """
 
     pipeline: Pipeline
@@ -87,6 +88,7 @@ class Job(NamedTuple):
     empty_space: EmptySpaceIndex | None
     prepared: PyTree
     resumable: bool = False
+    exact: bool = False
 
     def alive(self, at: Progress) -> Bool[Array, "*rays"]:
         """Rays that are not finished, and may take more samples."""
@@ -138,7 +140,8 @@ def march_batch(
     def advance(state: State, *, regular: bool) -> State:
         here, (mine, more, total) = state
         here = finished_after(range_, _to_next_cell(job, beam, rays, here, range_))
-        after, samples = march_segment(job.pipeline, tiling, rays, here, regular=regular)
+        until = range_.until if job.exact and range_ is not None else None
+        after, samples = march_segment(job.pipeline, tiling, rays, here, regular=regular, until=until)
         if job.resumable:
             after = _staying(here, after)
         if visitor is not None:
@@ -147,7 +150,7 @@ def march_batch(
         return finished_after(range_, after), (mine, more, total)
 
     # segments in which a ray may shift, or run out of samples, cost a tenth more: so as few as possible
-    limited = job.pipeline.march.max_samples is not None
+    limited = job.pipeline.march.max_samples is not None or job.exact
     marched: State = here, (mine, more, total)
     if job.pipeline.march.may_shift or limited:
         marched = jax.lax.while_loop(

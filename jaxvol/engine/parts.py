@@ -60,9 +60,11 @@ def march_part(
     acceleration: VolumeAcceleration,
     underway: Underway,
     ranges: CellRange,
+    anew: bool = False,
 ) -> Underway:
     """The rays behind these of their cells. `scene`: with a part of the volume, which holds what they meet
-    there, and in a segment more."""
+    there, and in a segment more. `anew`: the cells are marched whatever was before them, also what lies behind
+    them; and none beside them."""
     tiles, packed = RayTiles.of(scene.source, options.tiling), acceleration.packed(scene)
     index = empty_space_of(packed, acceleration, options.tiling)
     _, pipeline = pipeline_of(packed, acceleration)
@@ -70,8 +72,16 @@ def march_part(
     def one(each: tuple[Int[Array, ""], Underway, CellRange]) -> Underway:
         number, (rays, at), range_ = each[0], (each[1].rays, each[1].at), each[2]
         beams = Beams(rays, tiles.beam_count, tiles.box(scene.source, rays, number), range_)
-        after, _ = march_rays(pipeline, index, beams, options.tiling, options.outputs, resumed=at)
-        return Underway(rays, with_fields(after, finished=at.finished | ended(pipeline, rays, after)))
+        start = at
+        if anew:
+            seen = stopped(pipeline, at.composite) | (range_.until <= range_.first)
+            start = with_fields(at, index=range_.first, finished=seen)
+        after, _ = march_rays(
+            pipeline, index, beams, options.tiling, options.outputs, resumed=start, exact=anew
+        )
+        # where marched anew, a ray may go back
+        over = stopped(pipeline, after.composite) if anew else at.finished | ended(pipeline, rays, after)
+        return Underway(rays, with_fields(after, finished=over))
 
     return jax.lax.map(one, (jnp.arange(tiles.number), underway, ranges))
 

@@ -82,10 +82,17 @@ def regular_from_here(at: Progress) -> Bool[Array, "*rays"]:
 
 
 def march_segment(
-    pipeline: Pipeline, tiling: Tiling, ray: Ray, at: Progress, *, regular: bool
+    pipeline: Pipeline,
+    tiling: Tiling,
+    ray: Ray,
+    at: Progress,
+    *,
+    regular: bool,
+    until: Int[Array, " rays"] | None = None,
 ) -> tuple[Progress, Samples]:
     """Marches rays by a segment, or to where they are finished, shifted off the cells that were sampled, or
-    at the end of a run. `regular`: no ray has a shift ahead of it."""
+    at the end of a run; or to `until`, where that is given. `regular`: no ray has a shift or such an end ahead
+    of it."""
     march, classification = pipeline.march, pipeline.classification
     number = tiling.cells if at.stride is None else min(tiling.cells, RUN)
     every = samples = _sampled(pipeline, number, ray, at)
@@ -94,7 +101,7 @@ def march_segment(
     # otherwise runs begin and end with segments
     partly = at.phase is not None or RUN % number > 0
     if not regular or (at.stride is not None and partly):
-        fewer = in_memory(always(at), partial(_taken, march), at, every.opacity)
+        fewer = in_memory(always(at), partial(_taken, march), at, every.opacity, until)
         (taken, shifted), samples = fewer, _without(every, fewer[0], ray)
     colors: list[Vec3] | list[None]
     values = [read[:1] for read in every.measured]
@@ -234,11 +241,13 @@ def _measured_over(
 
 
 def _taken(
-    march: March, at: Progress, opacity: list[Scalar]
+    march: March, at: Progress, opacity: list[Scalar], until: Int[Array, " rays"] | None
 ) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
     """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
     shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
     left = march.most_samples - at.index
+    if until is not None:
+        left = jnp.clip(until - at.index, 0, left)
     number = jnp.arange(opacity[0].shape[0], dtype=at.index.dtype)
     if at.stride is not None:
         run, phase = RUN * at.stride, 0 if at.phase is None else at.phase

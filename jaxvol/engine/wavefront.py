@@ -47,20 +47,21 @@ def march_rays(
     outputs: Outputs | None = "all",
     visitor: SampleVisitor | None = None,
     resumed: Progress | None = None,
+    exact: bool = False,
 ) -> State:
     """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
     outputs or nothing but opacity; and the visitor's `carry`, `sums` and `total`.
 
     `resumed`: where rays have come to, if not at their entries. Then `beams.range` says which of their cells
     are marched, and `index` is asked about these alone; a ray ends where they do, or up to a segment behind,
-    and is `finished` there."""
+    and is `finished` there; or, if `exact`, just where they do."""
     march, rays = pipeline.march, beams.rays
     visible, prepared = rays.length > 0, None
     if index is not None:
         prepared = index.prepare(beams.box, tiling.cells * march.step)
         seen = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
         visible &= jnp.repeat(seen, beams.groups // beams.count)[:, None]
-    job = Job(pipeline, beams, tiling, visitor, index, prepared, resumable=resumed is not None)
+    job = Job(pipeline, beams, tiling, visitor, index, prepared, resumed is not None, exact)
     if resumed is None:
         at = vmap_rays(lambda ray: begin(pipeline, ray, outputs))(rays)
         at = with_fields(at, finished=~visible)
