@@ -189,7 +189,14 @@ def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array,
 
 @jax.jit
 def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-    low, high = over_blocks(data, jnp.minimum), over_blocks(data, jnp.maximum)
+    return widened(over_blocks(data, jnp.minimum), over_blocks(data, jnp.maximum))
+
+
+@jax.jit
+def widened(
+    low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]
+) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+    """Ranges of the values interpolated between nodes, from those of the nodes."""
     low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     slack = ROUNDING * jnp.maximum(abs(low), abs(high))
     return low - slack, high + slack

@@ -47,6 +47,7 @@ ORDER = [
     "metrics",
     "phantoms",
     "formats",
+    "bricks",
     "fitting",
     "unseen",
     "cli",

@@ -58,7 +58,9 @@ def _opened(path: Path) -> Iterator[tuple[list[str], Callable[[str], np.ndarray]
         yield list(members), read
 
 
-def _npy_array(path: Path, stream: Stream, size: int) -> np.ndarray:
+def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether the first axis is fastest, and type of the array that a `.npy` stream holds; the stream
+    then stands at its first byte."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, fortran, dtype = readers[np.lib.format.read_magic(stream)](stream)
@@ -71,6 +73,11 @@ def _npy_array(path: Path, stream: Stream, size: int) -> np.ndarray:
             f"path: {path} holds an array of type {dtype}; expected integers or floats. "
             "Arrays of objects are pickles, which are never read."
         )
+    return shape, fortran, dtype
+
+
+def _npy_array(path: Path, stream: Stream, size: int) -> np.ndarray:
+    shape, fortran, dtype = npy_header(path, stream)
     if not 0 < math.prod(shape) <= MOST_VOXELS or min(shape, default=1) < 0:
         raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
     expected = math.prod(shape) * dtype.itemsize

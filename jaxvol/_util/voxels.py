@@ -23,21 +23,13 @@ WHOLE = {
 
 
 def voxel_array(data: Arrayable) -> Array:
-    data = _array("data", data)
-    if data.ndim != 3 or min(data.shape) < 2:
-        raise ValueError(
-            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {data.shape}. "
-            "For a stack of images, stack them along the last axis."
-        )
+    data = given_array("data", data)
+    check_shape(data.shape)
     if data.size >= 2**31:
         raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
     if data.dtype.kind in "bui" and str(data.dtype) not in DTYPES:
         return jnp.asarray(_narrow(data))
-    if str(data.dtype) not in (*DTYPES, "float64"):
-        raise ValueError(
-            f"data must be of type {', '.join(DTYPES)}; got {data.dtype}. Convert it, for example with "
-            "data.astype(np.float32), if that keeps the values distinct."
-        )
+    check_type(data.dtype)
     if data.dtype.kind in "ui":
         return jnp.asarray(data)
     if is_traced(data):
@@ -54,6 +46,24 @@ def voxel_array(data: Arrayable) -> Array:
             "NaN or infinite. Replace them, or rescale all, first."
         )
     return jnp.asarray(stored if stored.dtype != data.dtype else data)
+
+
+def check_shape(shape: tuple[int, ...]) -> None:
+    """**Raises** `ValueError` unless an array of this shape can be a volume's voxels."""
+    if len(shape) != 3 or min(shape) < 2:
+        raise ValueError(
+            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {shape}. "
+            "For a stack of images, stack them along the last axis."
+        )
+
+
+def check_type(dtype: np.dtype) -> None:
+    """**Raises** `ValueError` unless voxels of this type are supported or can be converted."""
+    if dtype.kind not in "bui" and dtype.name not in (*DTYPES, "float64"):
+        raise ValueError(
+            f"data must be of type {', '.join(DTYPES)}; got {dtype}. Convert it, for example with "
+            "data.astype(np.float32), if that keeps the values distinct."
+        )
 
 
 def _narrow(data: Array | np.ndarray) -> np.ndarray:
@@ -74,7 +84,7 @@ def _narrow(data: Array | np.ndarray) -> np.ndarray:
 
 
 def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
-    labels = _array("labels", labels)
+    labels = given_array("labels", labels)
     if labels.dtype.kind not in "bui":
         raise ValueError(
             f"labels must be integers; got {labels.dtype}. Convert them: labels.astype(np.int32)."
@@ -94,7 +104,7 @@ def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
     return jnp.asarray(np.asarray(labels).astype(np.int32))
 
 
-def _array(name: str, value: Arrayable) -> Array | np.ndarray:
+def given_array(name: str, value: Arrayable) -> Array | np.ndarray:
     """`value` as a JAX array or, in native byte order, a NumPy array."""
     if isinstance(value, str | os.PathLike):
         raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")

@@ -24,15 +24,7 @@ RAW_DTYPE = re.compile(r"(u?int8|u?int16|float16|float32|float64)(le|be)?", re.I
 def read_raw(path: Path, header: Header) -> dict[str, Any]:
     """Reader for `.raw` and `.raw.gz`, x fastest."""
     size = file_size(path)
-    given = {name: value for name, value in header._asdict().items() if value is not None}
-    fields = _name_header(path) | _json_header(path) | given
-    if not {"shape", "dtype"} <= fields.keys():
-        raise ValueError(
-            f"path: the shape and dtype of {path} are unknown. Use load(path, shape=(nx, ny, nz), "
-            f'dtype="uint8"), or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
-            '{"size": [nx, ny, nz], "type": "uint8"}.'
-        )
-    shape, dtype = _raw_shape(path, fields.pop("shape")), _raw_dtype(path, fields.pop("dtype"))
+    shape, dtype, fields = raw_header(path, header, MOST_VOXELS)
     expected = math.prod(shape) * dtype.itemsize
     if path.name.lower().endswith(".gz"):
         # the size in gzip's trailer is unverified and modulo 2**32: only decompressing tells
@@ -43,6 +35,22 @@ def read_raw(path: Path, header: Header) -> dict[str, Any]:
         with path.open("rb") as stream:
             content = read_all(path, stream, expected)
     return {"data": as_array(content, shape, dtype, "F"), **fields}
+
+
+def raw_header(
+    path: Path, header: Header, most: int
+) -> tuple[tuple[int, int, int], np.dtype, dict[str, Any]]:
+    """Shape (nx, ny, nz) with at most `most` voxels, stored type, and spacing and origin where they are
+    known, of a raw file: as given by the caller, else by a JSON file beside it, else by its name."""
+    given = {name: value for name, value in header._asdict().items() if value is not None}
+    fields = _name_header(path) | _json_header(path) | given
+    if not {"shape", "dtype"} <= fields.keys():
+        raise ValueError(
+            f"path: the shape and dtype of {path} are unknown. Use load(path, shape=(nx, ny, nz), "
+            f'dtype="uint8"), or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
+            '{"size": [nx, ny, nz], "type": "uint8"}.'
+        )
+    return _raw_shape(path, fields.pop("shape"), most), _raw_dtype(path, fields.pop("dtype")), fields
 
 
 def _name_header(path: Path) -> dict[str, Any]:
@@ -67,17 +75,18 @@ def _json_header(path: Path) -> dict[str, Any]:
     return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
 
 
-def _raw_shape(path: Path, shape: Any) -> tuple[int, ...]:
+def _raw_shape(path: Path, shape: Any, most: int) -> tuple[int, int, int]:
     try:
         sizes = tuple(map(operator.index, shape))
     except TypeError:
         sizes = ()
-    if len(sizes) != 3 or min(sizes) < 1 or math.prod(sizes) > MOST_VOXELS:
+    if len(sizes) != 3 or min(sizes) < 1 or math.prod(sizes) > most:
         raise ValueError(
-            "shape must be three positive integers (nx, ny, nz) with a product less than 2**31; "
+            f"shape must be three positive integers (nx, ny, nz) with a product of at most {most}; "
             f"got {shape!r} for {path}."
         )
-    return sizes
+    nx, ny, nz = sizes
+    return nx, ny, nz
 
 
 def _raw_dtype(path: Path, dtype: Any) -> np.dtype:

@@ -1,0 +1,58 @@
+"""Of which type are the voxels of a source once they are read?
+
+The same types as in a `Volume`, decided before any voxel is read, where a `Volume` looks at all of them.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._util.voxels import DTYPES, WHOLE, check_type
+
+
+Box = tuple[tuple[int, int, int], tuple[int, int, int]]
+
+
+def voxel_type(stored: np.dtype) -> np.dtype:
+    """The type in which voxels stored as `stored` are read: one of `Volume`'s types, in native byte order.
+
+    Booleans become uint8. Integers of 32 and 64 bits become float32, which holds them exactly up to 2**24.
+    float64 is kept if JAX's 64-bit types are enabled, and becomes float32 otherwise.
+
+    **Raises:** `ValueError` for a type that no volume has, such as a complex one.
+    """
+    check_type(stored)
+    if stored.kind == "b":
+        return np.dtype(np.uint8)
+    if stored.name in DTYPES:
+        return stored.newbyteorder("=")
+    return np.dtype(np.float32) if stored.kind in "iu" else np.dtype(jnp.result_type(float))
+
+
+def converted(voxels: np.ndarray, box: Box, what: str) -> np.ndarray:
+    """Voxels as `voxel_type` says, and C-contiguous. `box`: what they were read from.
+
+    **Raises:** `ValueError` for NaN, infinity, and integers that float32 does not hold exactly, with the
+    place of the first.
+    """
+    dtype = voxel_type(voxels.dtype)
+    if dtype == np.float32 and voxels.dtype.kind in "iu":
+        least, most = WHOLE["float32"]
+        low, high = int(voxels.min()), int(voxels.max())
+        if low < least or high > most:
+            raise ValueError(
+                f"{what}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; "
+                f"got {voxels.dtype} from {low} to {high} in the box {box[0]} to {box[1]}. Subtract an "
+                "offset, or rescale them."
+            )
+    with np.errstate(over="ignore"):  # overflow to infinity is rejected below
+        voxels = np.ascontiguousarray(voxels, dtype)
+    # the extremes are NaN or infinite if any voxel is; unlike a mask, they take no memory
+    if dtype.kind not in "iu" and not np.isfinite(np.float64(voxels.min()) + np.float64(voxels.max())):
+        wrong = ~(abs(voxels) < np.inf)
+        first = np.unravel_index(np.argmax(wrong), voxels.shape)
+        place = tuple(int(i) + start for i, start in zip(first, box[0], strict=True))
+        raise ValueError(
+            f"{what}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite in the "
+            f"box {box[0]} to {box[1]}, the first at {place}. Replace them first."
+        )
+    return voxels

@@ -1,0 +1,139 @@
+"""Where do the voxels of a brick come from? What every source answers, and arrays in memory.
+
+A source is a volume that need not be in memory: it reads boxes of voxels. Indices are those of a `Volume`,
+data[x, y, z], whatever the order of axes in a file.
+"""
+
+import operator
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from .._util.checks import Arrayable
+from .._util.voxels import check_shape, given_array
+from ..volume import Volume
+from .dtypes import Box, converted, voxel_type
+
+
+Corner: TypeAlias = Sequence[int] | np.ndarray | Any
+"""Three voxel indices along x, y, z, checked at run time."""
+
+_READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
+
+
+class VoxelSource(ABC):
+    """A volume of which boxes are read.
+
+    - `name`: what it is called in errors: its path, or "array".
+    - `shape`: number of voxels along x, y, z.
+    - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`); the stored type may be another.
+    - `spacing`, `origin`: as in `Volume`, where the source knows them, or else None.
+    - `chunks`: voxels along x, y, z of the parts in which it is stored. Reading parts of these costs as much
+      as reading all. Boxes that are longest along the axes of long chunks are read fastest.
+    - `beside`: the path that files derived from the data are named after; None for data in memory.
+    """
+
+    name: str
+    shape: tuple[int, int, int]
+    dtype: np.dtype
+    spacing: tuple[float, float, float] | None
+    origin: tuple[float, float, float] | None
+    chunks: tuple[int, int, int]
+    beside: Path | None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all voxels, as they are read."""
+        nx, ny, nz = self.shape
+        return nx * ny * nz * self.dtype.itemsize
+
+    def read(self, low: Corner, high: Corner) -> np.ndarray:
+        """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
+
+        **Returns:** a C-contiguous array of type `dtype` in native byte order. It may be a view of the source
+        where that is an array: do not write to it.
+
+        **Raises:** `ValueError` for a box that is empty or exceeds the volume; for voxels that are NaN,
+        infinite, or not exact in `dtype`; and where the data are missing, damaged, or changed since the
+        source was made.
+        """
+        box = self._box(low, high)
+        return converted(self._stored(*box), box, self.name)
+
+    def read_async(self, low: Corner, high: Corner) -> "Future[np.ndarray]":
+        """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
+        return _READERS.submit(self.read, low, high)
+
+    @abstractmethod
+    def fingerprint(self) -> dict[str, Any] | None:
+        """Identifies the data, as a tree that JSON can hold. Equal fingerprints mean equal voxels.
+
+        None: nothing identifies them, such as an array that anybody may write to. What is computed from the
+        voxels is then valid for this object alone, and while nobody writes to it."""
+
+    @abstractmethod
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        """The voxels of a box that lies inside, as they are stored: of any byte order and memory layout."""
+
+    def _box(self, low: Corner, high: Corner) -> Box:
+        try:
+            x0, y0, z0 = (operator.index(i) for i in low)
+            x1, y1, z1 = (operator.index(i) for i in high)
+        except (TypeError, ValueError) as fault:
+            raise ValueError(
+                f"low and high must be three voxel indices each, along x, y, z; got {low!r} and {high!r}."
+            ) from fault
+        first, last = (x0, y0, z0), (x1, y1, z1)
+        if not all(0 <= a < b <= n for a, b, n in zip(first, last, self.shape, strict=True)):
+            raise ValueError(
+                f"low and high must be the corners of a box of at least one voxel inside {self.shape}, "
+                f"`high` exclusive; got {first} and {last}."
+            )
+        return first, last
+
+
+class ArraySource(VoxelSource):
+    """Voxels of an array in memory, data[x, y, z], of any memory layout. It is not copied.
+
+    **Raises:** `ValueError` for arrays of a shape or type that no volume has.
+    """
+
+    def __init__(
+        self,
+        data: Arrayable,
+        spacing: tuple[float, float, float] | None = None,
+        origin: tuple[float, float, float] | None = None,
+    ):
+        array = given_array("data", data)
+        check_shape(array.shape)
+        self._data = np.asarray(array)
+        self.name, self.beside = "array", None
+        self.shape = nx, ny, nz = self._data.shape
+        self.dtype = voxel_type(self._data.dtype)
+        self.spacing, self.origin = spacing, origin
+        slowest = int(np.argmax(np.abs(self._data.strides)))
+        self.chunks = (1, ny, nz) if slowest == 0 else (nx, 1, nz) if slowest == 1 else (nx, ny, 1)
+
+    def fingerprint(self) -> dict[str, Any] | None:
+        return None
+
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        return self._data[tuple(map(slice, low, high))]
+
+
+def array_of(volume: Volume) -> ArraySource:
+    """The voxels of a `Volume`.
+
+    **Raises:** `ValueError` for one with labels or a field, which are not voxels."""
+    for part in ("labels", "field"):
+        if getattr(volume, part) is not None:
+            raise ValueError(
+                f"source must be a volume of voxels alone; got a Volume with {part}. Pass volume.data, or "
+                "render it with jv.render."
+            )
+    (dx, dy, dz), (x, y, z) = (np.asarray(part, float).tolist() for part in (volume.spacing, volume.origin))
+    return ArraySource(volume.data, (dx, dy, dz), (x, y, z))

@@ -1,0 +1,136 @@
+"""In which order are all voxels of a source read once, with bounded memory?
+
+A source is cut into columns, which are read slab by slab along the axis where a layer of chunks is smallest.
+Slabs end where chunks do, and what the next slab needs of this one is kept, so that a chunk is read once in
+its column.
+"""
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise, product
+from typing import NamedTuple
+
+import numpy as np
+
+from ..occupancy import BLOCK
+from .sources import VoxelSource
+
+
+COPIES = 8
+"""Slabs in memory at once: this one, as read and as an array of JAX; the next; and what JAX needs to find the
+extremes of blocks."""
+
+LAYER = 1024
+"""Bytes for each voxel of a face across x, that the ranges of slopes and of windows need: they are found
+layer by layer along x, in single precision."""
+
+
+class Slab(NamedTuple):
+    """A part of a volume that is read at once.
+
+    - `voxels`: those of its blocks; if there is a margin, also of one block more on each side, where the
+      volume has one.
+    - `first`: index of its first block along each axis, and `count`: number of blocks, without the margin.
+    - `skipped`: blocks of `voxels` along each axis that come before `first`.
+    """
+
+    voxels: np.ndarray
+    first: tuple[int, int, int]
+    count: tuple[int, int, int]
+    skipped: tuple[int, int, int]
+
+
+def slabs(source: VoxelSource, memory: int, *, margin: bool = False) -> Iterator[Slab]:
+    """Cut a source into slabs of whole blocks of BLOCK³ cells, of which each is in one slab.
+
+    `memory`: bytes for what is computed of a slab; it is exceeded if a single chunk exceeds it. `margin`:
+    whether slabs overlap by one block on each side, and more is computed of each.
+    """
+    extra = BLOCK if margin else 0
+    axis = _axis(source)
+    extent = _extent(source, axis, memory, margin)
+    cuts = [[*range(0, n - 1, step), n - 1] for n, step in zip(source.shape, extent, strict=True)]
+    across = [[(0, 0)] if a == axis else list(pairwise(cut)) for a, cut in enumerate(cuts)]
+    for column in product(*across):
+        yield from _column(source, axis, extent[axis], column, extra)
+
+
+def _column(
+    source: VoxelSource, axis: int, step: int, nodes: tuple[tuple[int, int], ...], extra: int
+) -> Iterator[Slab]:
+    """The slabs of the blocks between these first and last nodes across `axis`, along which they are read."""
+    length = source.shape[axis]
+    low = [max(0, first - extra) for first, _ in nodes]
+    high = [min(n, last + 1 + extra) for (_, last), n in zip(nodes, source.shape, strict=True)]
+    ends = [*range(step, length - 1, step), length]
+
+    def part(begin: int, end: int) -> tuple[list[int], list[int]]:
+        return ([begin if a == axis else i for a, i in enumerate(low)], [
+            end if a == axis else i for a, i in enumerate(high)
+        ])  # fmt: skip
+
+    coming = source.read_async(*part(0, ends[0]))
+    kept, begin, done = None, 0, 0
+    for end, following in zip(ends, [*ends[1:], None], strict=True):
+        new = coming.result()
+        if following is not None:
+            coming = source.read_async(*part(end, following))
+        voxels = new if kept is None else np.concatenate([kept, new], axis)
+        # complete blocks, with their margins
+        blocks = -(-(length - 1) // BLOCK) if following is None else max(0, (end - 1 - extra) // BLOCK)
+        if blocks > done:
+            last = min(length, BLOCK * blocks + 1 + extra)
+            spans = [(done, blocks) if a == axis else _blocks(*ends) for a, ends in enumerate(nodes)]
+            (x0, x1), (y0, y1), (z0, z1) = spans
+            start = [begin if a == axis else i for a, i in enumerate(low)]
+            x, y, z = (s[0] - at // BLOCK for s, at in zip(spans, start, strict=True))
+            yield Slab(
+                _along(voxels, axis, 0, last - begin), (x0, y0, z0), (x1 - x0, y1 - y0, z1 - z0), (x, y, z)
+            )
+            done = blocks
+        needed = max(0, BLOCK * done - extra)
+        kept, begin = _along(voxels, axis, needed - begin, end - begin), needed
+
+
+def _blocks(first: int, last: int) -> tuple[int, int]:
+    return first // BLOCK, -(-last // BLOCK)
+
+
+def _along(voxels: np.ndarray, axis: int, begin: int, end: int) -> np.ndarray:
+    return voxels[tuple(slice(begin, end) if a == axis else slice(None) for a in range(3))]
+
+
+def _axis(source: VoxelSource) -> int:
+    """The axis along which one layer of chunks has the fewest voxels."""
+    return int(np.argmax([n / c for n, c in zip(source.shape, source.chunks, strict=True)]))
+
+
+def _extent(source: VoxelSource, axis: int, memory: int, margin: bool) -> list[int]:
+    """Voxels of a slab along each axis: multiples of BLOCK, and of chunks where memory allows."""
+    steps = [-(-c // BLOCK) * BLOCK for c in source.chunks]
+    wide = 2 * BLOCK if margin else 1
+
+    def cost(extent: list[int]) -> int:
+        x, y, z = (min(e + wide, n) for e, n in zip(extent, source.shape, strict=True))
+        return COPIES * source.dtype.itemsize * x * y * z + (LAYER * y * z if margin else 0)
+
+    extent = [-(-n // BLOCK) * BLOCK for n in source.shape]
+    thinnest = min(max(steps[axis], 2 * BLOCK), extent[axis])
+    extent[axis] = thinnest
+    others = [a for a in range(3) if a != axis]
+    for least in (steps, [BLOCK] * 3):  # whole chunks first, then parts of them
+        while cost(extent) > memory:
+            a = max(others, key=lambda a: extent[a] / least[a])
+            if extent[a] <= least[a]:
+                break
+            extent[a] = max(least[a], math.ceil(extent[a] / 2 / least[a]) * least[a])
+        if cost(extent) <= memory:
+            break
+    while cost(extent) > memory and extent[axis] > 2 * BLOCK:
+        extent[axis] = max(2 * BLOCK, extent[axis] // 2 // BLOCK * BLOCK)
+    while extent[axis] < source.shape[axis]:
+        more = [e + thinnest if a == axis else e for a, e in enumerate(extent)]
+        if cost(more) > memory:
+            break
+        extent = more
+    return extent

@@ -1,0 +1,211 @@
+"""Which values occur where in a source? Ranges of its blocks, found in one pass over all voxels.
+
+From these, a renderer tells which bricks are empty without reading them, and leaps within the others. They
+are the ranges that `occupancy.Blocks` and `variation.Windows` have of a volume in memory.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._util.checks import Arrayable, finite_array, integer
+from ..occupancy import BLOCK, Blocks, SlopeRanges, over_blocks, widened
+from ..variation import Windows
+from ..volume import Volume
+from .sources import Corner, VoxelSource
+from .streaming import Slab, slabs
+
+
+VALUES = {"low": np.minimum, "high": np.maximum}
+SLOPES = {"slope_low": np.minimum, "slope_high": np.maximum, "steepest": np.maximum}
+WINDOWS = {"window_low": np.minimum, "window_high": np.maximum, "bend": np.maximum}
+COMBINED = VALUES | SLOPES | WINDOWS
+"""Each kind of range, and how those of two blocks are combined."""
+
+Progress = Callable[[int, int], Any]
+"""Called with the number of voxels done and the number of all."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Ranges of the voxels in each block of `cell`³ cells, including the nodes on its faces.
+
+    - `shape`: of the volume, in voxels.
+    - `cell`: cells along the side of a block, a multiple of `occupancy.BLOCK`.
+    - `ranges`: arrays that end in (bx, by, bz). `low`, `high`: least and greatest voxel, in the voxels' type.
+      If they were asked for: `slope_low`, `slope_high`, `steepest`, as in `occupancy.SlopeRanges`, and
+      `window_low`, `window_high`, `bend`, as in `variation.Windows`.
+    """
+
+    shape: tuple[int, int, int]
+    cell: int
+    ranges: dict[str, np.ndarray]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all ranges."""
+        return sum(each.nbytes for each in self.ranges.values())
+
+    def has(self, kinds: dict[str, Any]) -> bool:
+        """Whether these ranges are known: `VALUES`, `SLOPES`, `WINDOWS`."""
+        return kinds.keys() <= self.ranges.keys()
+
+    def range_of(self, low: Corner, high: Corner) -> tuple[float, float]:
+        """A range that holds all voxels with `low` <= (x, y, z) < `high`: the range of the blocks that hold
+        these. Interpolation between them stays within it up to rounding (`occupancy.ROUNDING`)."""
+        touched = tuple(
+            slice(first, last + 1)
+            for first, last in (
+                self._touched(a, b - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
+            )
+        )
+        return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
+
+    def blocks(
+        self,
+        low: Corner | None = None,
+        high: Corner | None = None,
+        *,
+        spacing: Arrayable = (1.0, 1.0, 1.0),
+    ) -> Blocks:
+        """The `Blocks` of the volume, or of the voxels with `low` <= (x, y, z) < `high` as a volume of their
+        own. They have slopes if the summary has; `spacing` is for these.
+
+        They equal those of the voxels in memory if `cell` is `occupancy.BLOCK` and the box is the volume.
+        Otherwise each range holds all voxels of its block, and others around it: up to `cell` away."""
+        found = self._of_box(low, high, (VALUES | SLOPES) if self.has(SLOPES) else VALUES)
+        least, most = widened(jnp.asarray(found["low"]), jnp.asarray(found["high"]))
+        slopes = None
+        if "steepest" in found:
+            parts = (jnp.asarray(found[name]) for name in SLOPES)
+            slopes = SlopeRanges(*parts, finite_array("spacing", spacing, (3,)))
+        return Blocks(least, most, None, slopes)
+
+    def windows(self, low: Corner | None = None, high: Corner | None = None) -> Windows:
+        """The `Windows` of the volume or of a box, as `blocks` has them.
+
+        **Raises:** `ValueError` if the summary was made without."""
+        if not self.has(WINDOWS):
+            raise ValueError("this summary has no windows; ask for them: summary_of(source, windows=True).")
+        found = self._of_box(low, high, WINDOWS)
+        return Windows(*(jnp.asarray(found[name], jnp.float32) for name in WINDOWS))
+
+    def _of_box(
+        self, low: Corner | None, high: Corner | None, kinds: dict[str, Any]
+    ) -> dict[str, np.ndarray]:
+        """Ranges of the blocks of BLOCK³ cells of a box of voxels."""
+        found = {name: self.ranges[name] for name in kinds}
+        low, high = (0, 0, 0) if low is None else low, self.shape if high is None else high
+        for axis in range(3):
+            begin, end, n = low[axis], high[axis], self.shape[axis]
+            nodes = range(begin, end - 1, BLOCK)
+            touched = [self._touched(node, min(node + BLOCK, end - 1), n) for node in nodes]
+            found = {
+                name: over_intervals(part, axis - 3, touched, COMBINED[name]) for name, part in found.items()
+            }
+        return found
+
+    def _touched(self, first: int, last: int, count: int) -> tuple[int, int]:
+        """First and last block along an axis of `count` nodes, that together hold the nodes `first` to
+        `last`."""
+        final = -(-(count - 1) // self.cell) - 1
+        begin = min(first // self.cell, final)
+        return begin, min(max(begin, (last - 1) // self.cell), final)
+
+
+def over_intervals(
+    values: np.ndarray, axis: int, intervals: Sequence[tuple[int, int]], combine: np.ufunc
+) -> np.ndarray:
+    """Combine the entries of each interval along an axis, from its first to its last."""
+    first, last = np.array(intervals).T
+    found = np.take(values, first, axis)
+    for offset in range(1, int(np.max(last - first)) + 1):
+        found = combine(found, np.take(values, np.minimum(first + offset, last), axis))
+    return found
+
+
+def scan(
+    source: VoxelSource,
+    cell: int | Any = BLOCK,
+    *,
+    slopes: bool = False,
+    windows: bool = False,
+    memory: int = 2**28,
+    progress: Progress | None = None,
+) -> Summary:
+    """The summary of a source, from one pass over its voxels. `summary_of` keeps it in a file.
+
+    **Arguments:**
+
+    - `cell`: cells along the side of a block, a multiple of `occupancy.BLOCK`. A summary takes
+      2 / `cell`³ of the voxels' memory.
+    - `slopes`, `windows`: which ranges are wanted beside those of values. In blocks of 4³ cells, each takes
+      more memory than a fifth of the voxels.
+    - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk of the source does.
+    - `progress`: called after each slab; what it raises ends the pass.
+
+    **Raises:** `ValueError` for what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
+    """
+    cell = integer("cell", cell, BLOCK)
+    if cell % BLOCK:
+        raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
+    kinds = VALUES | (SLOPES if slopes else {}) | (WINDOWS if windows else {})
+    blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
+    ranges: dict[str, np.ndarray] = {}
+    done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
+    nx, ny, nz = source.shape
+    for slab in slabs(source, memory, margin=slopes or windows):
+        for name, part in _ranges_of(slab, slopes, windows).items():
+            merged, place = _merged(part, slab.first, cell // BLOCK, kinds[name])
+            if name not in ranges:
+                ranges[name] = np.full(
+                    part.shape[:-3] + blocks, _neutral(part.dtype, kinds[name]), part.dtype
+                )
+            ranges[name][place] = kinds[name](ranges[name][place], merged)
+        done += int(np.prod(slab.count))
+        if progress is not None:
+            progress(done * (nx * ny * nz) // whole, nx * ny * nz)
+    return Summary(source.shape, cell, ranges)
+
+
+def _ranges_of(slab: Slab, slopes: bool, windows: bool) -> dict[str, np.ndarray]:
+    """Ranges of a slab's blocks of BLOCK³ cells."""
+    volume = Volume(slab.voxels)
+    found = dict(zip(VALUES, _extremes(volume.data), strict=True))
+    if slopes:
+        of = SlopeRanges.of(volume)
+        found |= zip(SLOPES, (of.low, of.high, of.steepest), strict=True)
+    if windows:
+        of = Windows.of(volume)
+        found |= zip(WINDOWS, (of.low, of.high, of.bend), strict=True)
+    own = (..., *(slice(s, s + n) for s, n in zip(slab.skipped, slab.count, strict=True)))
+    return {name: np.asarray(part)[own] for name, part in found.items()}
+
+
+@jax.jit
+def _extremes(data: Array) -> tuple[Array, Array]:
+    return over_blocks(data, jnp.minimum), over_blocks(data, jnp.maximum)
+
+
+def _merged(
+    part: np.ndarray, first: tuple[int, int, int], several: int, combine: np.ufunc
+) -> tuple[np.ndarray, tuple[Any, ...]]:
+    """Ranges of blocks that are `several` times as long, as far as `part`, from block `first` on, tells; and
+    their place among all."""
+    place = []
+    for axis, begin in zip((-3, -2, -1), first, strict=True):
+        block = np.arange(begin, begin + part.shape[axis]) // several
+        starts = np.flatnonzero(np.diff(block, prepend=-1))
+        part = combine.reduceat(part, starts, axis)
+        place.append(slice(block[0], block[-1] + 1))
+    return part, (..., *place)
+
+
+def _neutral(dtype: np.dtype, combine: np.ufunc) -> Any:
+    limits = jnp.iinfo(dtype) if dtype.kind in "iu" else jnp.finfo(dtype)
+    return limits.max if combine is np.minimum else limits.min
