@@ -132,7 +132,7 @@ class FileSource(VoxelSource):
                         part = buffer[plane, number * between : (number + 1) * between]
                         self._fill(file, at + number * row_stride, memoryview(part))
                 ordered[begin : begin + planes] = np.ndarray(
-                    (planes, rows, row), self._type, buffer.data, 0, (run, between, size)
+                    (planes, rows, row), self._type, memoryview(buffer), 0, (run, between, size)
                 )
         return voxels
 
