@@ -40,9 +40,9 @@ def converted(voxels: np.ndarray, box: Box, what: str) -> np.ndarray:
         low, high = int(voxels.min()), int(voxels.max())
         if low < least or high > most:
             raise ValueError(
-                f"{what}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; got "
-                f"{voxels.dtype} from {low} to {high} in the box {box[0]} to {box[1]}. Subtract an offset, or "
-                "rescale them."
+                f"{what}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; "
+                f"got {voxels.dtype} from {low} to {high} in the box {box[0]} to {box[1]}. Subtract an "
+                "offset, or rescale them."
             )
     with np.errstate(over="ignore"):  # overflow to infinity is rejected below
         voxels = np.ascontiguousarray(voxels, dtype)

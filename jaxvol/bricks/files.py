@@ -132,7 +132,7 @@ class FileSource(VoxelSource):
                         part = buffer[plane, number * between : (number + 1) * between]
                         self._fill(file, at + number * row_stride, memoryview(part))
                 ordered[begin : begin + planes] = np.ndarray(
-                    (planes, rows, row), self._type, buffer.data, 0, (run, between, size)
+                    (planes, rows, row), self._type, memoryview(buffer), 0, (run, between, size)
                 )
         return voxels
 
@@ -171,7 +171,8 @@ def raw(
     **Raises:** `ValueError` for a compressed file, and one whose size is not what shape and type say."""
     if path.name.lower().endswith(".gz"):
         raise ValueError(
-            f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: gunzip {path}."
+            f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: "
+            f"gunzip {path}."
         )
     (nx, ny, nz), stored, fields = raw_header(path, Header(shape, dtype), MOST_VOXELS)
     check_size(path, file_size(path), nx * ny * nz * stored.itemsize)

@@ -90,8 +90,8 @@ class VoxelSource(ABC):
         first, last = (x0, y0, z0), (x1, y1, z1)
         if not all(0 <= a < b <= n for a, b, n in zip(first, last, self.shape, strict=True)):
             raise ValueError(
-                f"low and high must be the corners of a box of at least one voxel inside {self.shape}, `high` "
-                f"exclusive; got {first} and {last}."
+                f"low and high must be the corners of a box of at least one voxel inside {self.shape}, "
+                f"`high` exclusive; got {first} and {last}."
             )
         return first, last
 

@@ -7,14 +7,17 @@ its column.
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import Future
 from itertools import pairwise, product
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ..occupancy import BLOCK
 from .sources import VoxelSource
 
+
+T = TypeVar("T")
 
 COPIES = 8
 """Slabs in memory at once: this one, as read and as an array of JAX; the next; and what JAX needs to find the
@@ -28,14 +31,15 @@ layer by layer along x, in single precision."""
 class Slab(NamedTuple):
     """A part of a volume that is read at once.
 
-    - `voxels`: those of its blocks, and of one block more on each side within the volume if there is a margin.
-    - `first`: index of its first block along each axis, and `count`: number of blocks, without the margin.
+    - `voxels`: those of its blocks; if there is a margin, also of one block more on each side, where the
+      volume has one.
+    - `first`: index of its first block along each axis, and `blocks`: number of blocks, without the margin.
     - `skipped`: blocks of `voxels` along each axis that come before `first`.
     """
 
     voxels: np.ndarray
     first: tuple[int, int, int]
-    count: tuple[int, int, int]
+    blocks: tuple[int, int, int]
     skipped: tuple[int, int, int]
 
 
@@ -49,8 +53,8 @@ def slabs(source: VoxelSource, memory: int, *, margin: bool = False) -> Iterator
     axis = _axis(source)
     extent = _extent(source, axis, memory, margin)
     cuts = [[*range(0, n - 1, step), n - 1] for n, step in zip(source.shape, extent, strict=True)]
-    across = [[(0, 0)] if a == axis else list(pairwise(cut)) for a, cut in enumerate(cuts)]
-    for column in product(*across):
+    columns = product(*_with([list(pairwise(cut)) for cut in cuts], axis, [(0, 0)]))
+    for column in columns:
         yield from _column(source, axis, extent[axis], column, extra)
 
 
@@ -59,40 +63,40 @@ def _column(
 ) -> Iterator[Slab]:
     """The slabs of the blocks between these first and last nodes across `axis`, along which they are read."""
     length = source.shape[axis]
+    ends = [*range(step, length - 1, step), length]
     low = [max(0, first - extra) for first, _ in nodes]
     high = [min(n, last + 1 + extra) for (_, last), n in zip(nodes, source.shape, strict=True)]
-    ends = [*range(step, length - 1, step), length]
 
-    def part(begin: int, end: int) -> tuple[list[int], list[int]]:
-        return ([begin if a == axis else i for a, i in enumerate(low)], [
-            end if a == axis else i for a, i in enumerate(high)
-        ])  # fmt: skip
+    def reading(begin: int, end: int) -> "Future[np.ndarray]":
+        return source.read_async(_with(low, axis, begin), _with(high, axis, end))
 
-    coming = source.read_async(*part(0, ends[0]))
-    kept, begin, done = None, 0, 0
+    coming, kept = reading(0, ends[0]), None
+    begin = done = 0  # the first voxel kept, and the blocks done
     for end, following in zip(ends, [*ends[1:], None], strict=True):
         new = coming.result()
         if following is not None:
-            coming = source.read_async(*part(end, following))
+            coming = reading(end, following)
         voxels = new if kept is None else np.concatenate([kept, new], axis)
-        # complete blocks, with their margins
+        # blocks that are complete, with their margins
         blocks = -(-(length - 1) // BLOCK) if following is None else max(0, (end - 1 - extra) // BLOCK)
         if blocks > done:
             last = min(length, BLOCK * blocks + 1 + extra)
-            spans = [(done, blocks) if a == axis else _blocks(*ends) for a, ends in enumerate(nodes)]
-            (x0, x1), (y0, y1), (z0, z1) = spans
-            start = [begin if a == axis else i for a, i in enumerate(low)]
-            x, y, z = (s[0] - at // BLOCK for s, at in zip(spans, start, strict=True))
+            spans = [(first // BLOCK, -(-final // BLOCK)) for first, final in nodes]
+            (x0, x1), (y0, y1), (z0, z1) = _with(spans, axis, (done, blocks))
+            x, y, z = (at // BLOCK for at in _with(low, axis, begin))
             yield Slab(
-                _along(voxels, axis, 0, last - begin), (x0, y0, z0), (x1 - x0, y1 - y0, z1 - z0), (x, y, z)
+                _along(voxels, axis, 0, last - begin),
+                (x0, y0, z0),
+                (x1 - x0, y1 - y0, z1 - z0),
+                (x0 - x, y0 - y, z0 - z),
             )
             done = blocks
         needed = max(0, BLOCK * done - extra)
         kept, begin = _along(voxels, axis, needed - begin, end - begin), needed
 
 
-def _blocks(first: int, last: int) -> tuple[int, int]:
-    return first // BLOCK, -(-last // BLOCK)
+def _with(of_axes: list[T], axis: int, one: T) -> list[T]:
+    return [one if a == axis else other for a, other in enumerate(of_axes)]
 
 
 def _along(voxels: np.ndarray, axis: int, begin: int, end: int) -> np.ndarray:
@@ -128,7 +132,7 @@ def _extent(source: VoxelSource, axis: int, memory: int, margin: bool) -> list[i
     while cost(extent) > memory and extent[axis] > 2 * BLOCK:
         extent[axis] = max(2 * BLOCK, extent[axis] // 2 // BLOCK * BLOCK)
     while extent[axis] < source.shape[axis]:
-        more = [e + thinnest if a == axis else e for a, e in enumerate(extent)]
+        more = _with(extent, axis, extent[axis] + thinnest)
         if cost(more) > memory:
             break
         extent = more

@@ -60,7 +60,9 @@ class Summary:
         these. Interpolation between them stays within it up to rounding (`occupancy.ROUNDING`)."""
         touched = tuple(
             slice(first, last + 1)
-            for first, last in (self._touched(a, b - 1, n) for a, b, n in zip(low, high, self.shape, strict=True))
+            for first, last in (
+                self.touched(a, b - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
+            )
         )
         return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
 
@@ -80,8 +82,8 @@ class Summary:
         least, most = widened(jnp.asarray(found["low"]), jnp.asarray(found["high"]))
         slopes = None
         if "steepest" in found:
-            parts = (jnp.asarray(found[name]) for name in SLOPES)
-            slopes = SlopeRanges(*parts, finite_array("spacing", spacing, (3,)))
+            down, up, steepest = (jnp.asarray(found[name]) for name in SLOPES)
+            slopes = SlopeRanges(down, up, steepest, finite_array("spacing", spacing, (3,)))
         return Blocks(least, most, None, slopes)
 
     def windows(self, low: Corner | None = None, high: Corner | None = None) -> Windows:
@@ -91,22 +93,24 @@ class Summary:
         if not self.has(WINDOWS):
             raise ValueError("this summary has no windows; ask for them: summary_of(source, windows=True).")
         found = self._of_box(low, high, WINDOWS)
-        return Windows(*(jnp.asarray(found[name], jnp.float32) for name in WINDOWS))
+        return Windows(*(jnp.asarray(found[name]) for name in WINDOWS))
 
-    def _of_box(self, low: Corner | None, high: Corner | None, kinds: dict[str, Any]) -> dict[str, np.ndarray]:
+    def _of_box(
+        self, low: Corner | None, high: Corner | None, kinds: dict[str, Any]
+    ) -> dict[str, np.ndarray]:
         """Ranges of the blocks of BLOCK³ cells of a box of voxels."""
         found = {name: self.ranges[name] for name in kinds}
-        low, high = (0, 0, 0) if low is None else low, self.shape if high is None else high
+        first, last = (0, 0, 0) if low is None else low, self.shape if high is None else high
         for axis in range(3):
-            begin, end, n = low[axis], high[axis], self.shape[axis]
+            begin, end, n = int(first[axis]), int(last[axis]), self.shape[axis]
             nodes = range(begin, end - 1, BLOCK)
-            touched = [self._touched(node, min(node + BLOCK, end - 1), n) for node in nodes]
+            touched = [self.touched(node, min(node + BLOCK, end - 1), n) for node in nodes]
             found = {
                 name: over_intervals(part, axis - 3, touched, COMBINED[name]) for name, part in found.items()
             }
         return found
 
-    def _touched(self, first: int, last: int, count: int) -> tuple[int, int]:
+    def touched(self, first: int, last: int, count: int) -> tuple[int, int]:
         """First and last block along an axis of `count` nodes, that together hold the nodes `first` to
         `last`."""
         final = -(-(count - 1) // self.cell) - 1
@@ -159,9 +163,11 @@ def scan(
         for name, part in _ranges_of(slab, slopes, windows).items():
             merged, place = _merged(part, slab.first, cell // BLOCK, kinds[name])
             if name not in ranges:
-                ranges[name] = np.full(part.shape[:-3] + blocks, _neutral(part.dtype, kinds[name]), part.dtype)
+                ranges[name] = np.full(
+                    part.shape[:-3] + blocks, _neutral(part.dtype, kinds[name]), part.dtype
+                )
             ranges[name][place] = kinds[name](ranges[name][place], merged)
-        done += int(np.prod(slab.count))
+        done += int(np.prod(slab.blocks))
         if progress is not None:
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
     return Summary(source.shape, cell, ranges)
@@ -177,7 +183,7 @@ def _ranges_of(slab: Slab, slopes: bool, windows: bool) -> dict[str, np.ndarray]
     if windows:
         of = Windows.of(volume)
         found |= zip(WINDOWS, (of.low, of.high, of.bend), strict=True)
-    own = (..., *(slice(s, s + n) for s, n in zip(slab.skipped, slab.count, strict=True)))
+    own = (..., *(slice(s, s + n) for s, n in zip(slab.skipped, slab.blocks, strict=True)))
     return {name: np.asarray(part)[own] for name, part in found.items()}
 
 

@@ -1,0 +1,128 @@
+"""Is a summary already known? Keeps summaries in files beside the data.
+
+A file holds the fingerprint of the data it was made from and is used for no other. It appears whole or not at
+all, and whoever finds it damaged makes it anew.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from .._util.checks import described, integer
+from .._util.npy import read_arrays
+from ..occupancy import BLOCK
+from .sources import VoxelSource
+from .summary import COMBINED, SLOPES, VALUES, WINDOWS, Progress, Summary, scan
+
+
+VERSION = 1
+"""Of the files and of what is in them; others are made anew."""
+
+
+def summary_of(
+    source: VoxelSource,
+    cell: int | Any = BLOCK,
+    *,
+    slopes: bool = False,
+    windows: bool = False,
+    memory: int = 2**28,
+    cache: Literal["beside"] | str | os.PathLike[str] | Any | None = "beside",
+    progress: Progress | None = None,
+) -> Summary:
+    """The summary of a source: from a file, if it was made before, else from one pass over the voxels.
+
+    **Arguments:**
+
+    - `cell`, `slopes`, `windows`, `memory`, `progress`: see `summary.scan`. A file with more ranges than are
+      asked for is used; where it has fewer, the pass finds all of both. `progress` is called only in a pass.
+    - `cache`: where files lie. `"beside"`: beside the data, `NAME.jaxvol-summary-CELL.npz`; a folder: in it;
+      None: nowhere. Arrays in memory have no files, and neither has a memory map that is open for writing.
+
+    **Raises:** `ValueError` as `summary.scan` does, and if the source changes during the pass. A file that
+    cannot be written is a warning. A pass that is interrupted leaves files as they were.
+    """
+    cell = integer("cell", cell, BLOCK)
+    before = None if cache is None or source.beside is None else source.fingerprint()
+    if before is None or source.beside is None:
+        return scan(source, cell, slopes=slopes, windows=windows, memory=memory, progress=progress)
+    path, about = _path(source.beside, cell, cache), _about(source, before, cell)
+    known = _read(path, source, about) if path.is_file() else None
+    wanted = VALUES | (SLOPES if slopes else {}) | (WINDOWS if windows else {})
+    if known is not None and known.has(wanted):
+        return known
+    slopes, windows = (
+        asked or (known is not None and known.has(kinds))
+        for asked, kinds in ((slopes, SLOPES), (windows, WINDOWS))
+    )
+    summary = scan(source, cell, slopes=slopes, windows=windows, memory=memory, progress=progress)
+    if source.fingerprint() != before:
+        raise ValueError(f"{source.name} changed while it was read. Open it again once it is complete.")
+    try:
+        _write(path, summary.ranges, about)
+    except OSError as fault:
+        warnings.warn(
+            f"{path} cannot be written ({fault.strerror or fault}), so that the pass over {source.name} will "
+            "be repeated next time. Pass cache= the path of a folder, or cache=None.",
+            stacklevel=2,
+        )
+    return summary
+
+
+def _path(beside: Path, cell: int, cache: str | os.PathLike[str] | Any) -> Path:
+    name = f"{beside.name}.jaxvol-summary-{cell}.npz"
+    if cache == "beside":
+        return beside.with_name(name)
+    if not isinstance(cache, str | os.PathLike):
+        raise ValueError(f'cache must be "beside", a folder, or None; got {described(cache)}.')
+    # data of the same name may lie in different folders
+    return Path(cache) / f"{hashlib.blake2b(str(beside).encode(), digest_size=4).hexdigest()}-{name}"
+
+
+def _about(source: VoxelSource, fingerprint: dict[str, Any], cell: int) -> dict[str, Any]:
+    """What a summary is valid for, as JSON gives it back."""
+    about = {"version": VERSION, "cell": cell, "dtype": source.dtype.name, "data": fingerprint}
+    return json.loads(json.dumps(about))
+
+
+def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> None:
+    told = np.frombuffer(json.dumps(about | {"ranges": [*ranges]}).encode(), np.uint8)
+    # bfloat16, which NumPy's files do not know, as integers of its bits
+    arrays = {
+        name: part if part.dtype.kind in "iuf" else part.view(np.uint16) for name, part in ranges.items()
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, part = tempfile.mkstemp(prefix=f"{path.name}.", suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            np.savez(file, about=told, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException:
+        os.unlink(part)
+        raise
+
+
+def _read(path: Path, source: VoxelSource, about: dict[str, Any]) -> Summary | None:
+    """The summary in a file, if it is whole and belongs to these data."""
+    cell = about["cell"]
+    blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
+    try:
+        told = json.loads(read_arrays(path, ("about",))["about"].tobytes())
+        if {name: value for name, value in told.items() if name != "ranges"} != about:
+            return None
+        ranges = read_arrays(path, tuple(told["ranges"]))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):  # damaged
+        return None
+    for name, part in ranges.items():
+        if name in VALUES and part.dtype != source.dtype:
+            ranges[name] = part = part.view(source.dtype)
+        if name not in COMBINED or part.shape[-3:] != blocks:
+            return None
+    return Summary(source.shape, cell, ranges)
