@@ -17,8 +17,8 @@ class BrickReport(NamedTuple):
     - `counts`: bricks along each axis. `needed`: how many of them may hold anything visible.
     - `loads`: how often a brick was read. `reloads`: how many of these were not the first of their brick.
     - `bytes_read`: of voxels, with what is read around each brick.
-    - `stored`: voxels along each axis that are read at a time. `bytes_held`: memory that these take, with what
-      is made of them and with the next ones.
+    - `stored`: voxels along each axis that are read at a time. `bytes_held`: memory that these take, with
+      what is made of them and with the next ones.
     """
 
     counts: tuple[int, int, int]

@@ -220,7 +220,9 @@ def node_distance(
     the index of the first one."""
     first = jnp.zeros(3, jnp.int32) if first is None else first
     dtype = space.middle[0].dtype
-    middle = [BLOCK * ((jnp.arange(n) + begin).astype(dtype) + 0.5) for n, begin in zip(shape, first, strict=True)]
+    middle = [
+        BLOCK * ((jnp.arange(n) + begin).astype(dtype) + 0.5) for n, begin in zip(shape, first, strict=True)
+    ]
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))

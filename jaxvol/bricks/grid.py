@@ -58,9 +58,10 @@ class BrickGrid:
         """All bricks, front to back, by the depth of their centres as the camera sees them.
 
         Where rays are straight in the grid, no ray meets a brick after one that is behind it in this order:
-        depth is counted in bricks there, as the sum of the distances along the three axes, none of which falls
-        along a ray. (The distance itself would do for bricks of equal size; the last ones may be smaller.)
-        Where rays are curved it is the paper's rule, by distance, and a ray may meet them in another order."""
+        depth is counted in bricks there, as the sum of the distances along the three axes, none of which
+        falls along a ray. (The distance itself would do for bricks of equal size; the last ones may be
+        smaller.) Where rays are curved it is the paper's rule, by distance, and a ray may meet them in
+        another order."""
         index = np.stack(np.unravel_index(np.arange(self.number), self.counts), axis=-1)
         centers = (index + 0.5) * self.size
         eye, (_, _, forward) = camera.position, axes_of(camera)
@@ -75,7 +76,9 @@ class BrickGrid:
                 depth = np.sum(np.abs(centers - own) / scale, axis=-1)
         else:
             x, y, z = (jnp.asarray(c) for c in np.minimum(centers, np.asarray(self.shape) - 1).T)
-            toward = np.stack([np.asarray(p) for p in jax.vmap(space.point)((x, y, z))], axis=-1) - np.asarray(eye)
+            toward = np.stack(
+                [np.asarray(p) for p in jax.vmap(space.point)((x, y, z))], axis=-1
+            ) - np.asarray(eye)
             depth = toward @ np.asarray(forward) if parallel else np.linalg.norm(toward, axis=-1)
         return np.argsort(depth, kind="stable").tolist()
 

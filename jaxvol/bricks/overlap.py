@@ -2,10 +2,10 @@
 
 The faces of a brick across γ are curved in the world. A ray may enter a brick, pass through the one that lies
 nearer to the probe, and come back. If the farther one reaches over the cap between the curved face and its
-chord, it need not be rendered again. The height of the cap is K = l - l cos(θ / 2), where l is the distance of
-the face from the centre of its curvature, and θ the angle under which it sees the brick: in the plane of the
-fan l = b + γ and θ the part of the range of σ, and about the motor's axis l = a + b + γ and θ that of β. The
-larger of the two counts.
+chord, it need not be rendered again. The height of the cap is K = l - l cos(θ / 2), where l is the distance
+of the face from the centre of its curvature, and θ the angle under which it sees the brick: in the plane of
+the fan l = b + γ and θ the part of the range of σ, and about the motor's axis l = a + b + γ and θ that of β.
+The larger of the two counts.
 
 Source: Kim, Kwon and Shin 2008, section 3.2.
 """
@@ -34,7 +34,9 @@ def heights(a: float, b: float, ranges: np.ndarray, grid: BrickGrid) -> list[flo
 
 def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     """K* of each face between two bricks along γ, in voxels, for a probe's grid."""
-    ranges = np.array([np.asarray(r, float) for r in (probe.beta_range, probe.sigma_range, probe.gamma_range)])
+    ranges = np.array(
+        [np.asarray(r, float) for r in (probe.beta_range, probe.sigma_range, probe.gamma_range)]
+    )
     return heights(float(probe.a), float(probe.b), ranges, grid)
 
 

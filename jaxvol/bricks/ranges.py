@@ -1,10 +1,10 @@
 """Which cells of each ray does a brick take?
 
-A cell belongs to the brick in which it begins, if samples were not moved. In a grid with straight rays each ray
-meets a brick once, and its cells there follow from where it enters and leaves. Where rays are curved, a ray may
-come back to a brick that it has left. Bricks are then taken in turn, and a ray goes on while it is in this one,
-or in one that was taken before: those cells are taken from the overlap, by which a brick is read larger than it
-is (Kim, Kwon and Shin 2008).
+A cell belongs to the brick in which it begins, if samples were not moved. In a grid with straight rays each
+ray meets a brick once, and its cells there follow from where it enters and leaves. Where rays are curved, a
+ray may come back to a brick that it has left. Bricks are then taken in turn, and a ray goes on while it is
+in this one, or in one that was taken before: those cells are taken from the overlap, by which a brick is
+read larger than it is (Kim, Kwon and Shin 2008).
 """
 
 from typing import NamedTuple
@@ -23,8 +23,8 @@ from .grid import BrickGrid
 
 
 SLACK = 3
-"""Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more for
-rounding."""
+"""Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more
+for rounding."""
 CHUNK = 8
 """Cells of a ray that are looked at at a time."""
 
@@ -39,8 +39,8 @@ class Turn(eqx.Module):
 
     - `brick`: its number.
     - `over`: bricks over which rays move to it: those that are empty.
-    - `through`: bricks through which they go on from it: itself, those that are empty, and those that have had
-      their turn, unless it is only the brick that counts.
+    - `through`: bricks through which they go on from it: itself, those that are empty, and those that have
+      had their turn, unless it is only the brick that counts.
     - `empty`: bricks of which no voxel is needed.
 
     All three have an entry for each brick, and one more for what lies outside of the volume.
@@ -75,7 +75,9 @@ def widened(cells: CellRange) -> CellRange:
     return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
 
 
-def of_straight(grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn) -> CellRange:
+def of_straight(
+    grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn
+) -> CellRange:
     """The cells of straight rays in a brick; none of rays that miss it, or are not alive."""
     path = rays.path
     assert isinstance(path, Straight)
@@ -103,8 +105,9 @@ def of_curved(
     turn: Turn,
     beyond: int,
 ) -> Found:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other. `reached`: to which
-    each has come. `beyond`: steps before and behind its cells that `low` and `high` are to hold, too."""
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other. `reached`: to
+    which each has come. `beyond`: steps before and behind its cells that `low` and `high` are to hold,
+    too."""
 
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "cells *rays"], Scalar]:
         depth = index.astype(rays.length.dtype) * march.step
@@ -112,7 +115,9 @@ def of_curved(
         coordinate, inside = each(rays, depth)
         return coordinate, inside & (depth < rays.length), depth
 
-    def bricks(index: Int[Array, "cells *rays"]) -> tuple[Int[Array, "cells *rays"], Bool[Array, "cells *rays"]]:
+    def bricks(
+        index: Int[Array, "cells *rays"],
+    ) -> tuple[Int[Array, "cells *rays"], Bool[Array, "cells *rays"]]:
         coordinate, inside, depth = points(index)
         return jnp.where(inside, grid.brick_of(coordinate), grid.number), depth < rays.length
 

@@ -1,47 +1,48 @@
-"""Renders a volume that does not fit into memory, brick by brick."""
+"""Renders a volume that need not fit into memory, brick by brick."""
 
 from collections.abc import Callable
-from typing import Any, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import Arrayable, described, finite_array, integer, is_traced
+from .._util.checks import Arrayable, described, integer, is_traced
 from .._util.memory import memory_of_device
-from .._util.trees import strong
+from .._util.trees import PyTree, strong
 from .._util.xla import compiled
 from ..arguments import check_arguments
 from ..camera import Camera
 from ..compositing import Compositing
 from ..engine.acceleration import VolumeAcceleration
-from ..engine.batch import with_fields
+from ..engine.batch import CellRange, with_fields
 from ..engine.driver import Asked
+from ..engine.gradients import of_all_outputs, of_perturbed
 from ..engine.image import RenderOptions
 from ..engine.parts import NOTHING, Underway, arrive, march_part, resolve_part, set_out
+from ..engine.parts_gradient import Pulled, end_pull, pull_part, start_pull
 from ..engine.resolve import resolve_image
 from ..engine.scene import Scene
 from ..engine.tiling import Tiling
+from ..labels import LabelTransferFunction
 from ..lighting.shading import Lighting
 from ..march import March
 from ..modes import Mode, compositing_of
-from ..occupancy import Blocks, widened
 from ..rendering import Details, Rendering
 from ..selection import Selection
 from ..transfer import Transfer
-from .._util.vec3 import apart
-from ..space import Space
-from ..transforms import ToroidalMap
+from ..transforms import SpaceLeaping
 from ..volume import Volume, part_of
-from .grid import BrickGrid, is_straight
-from .sources import ArraySource, VoxelSource
-from .split import Margin, bytes_of, split, stored_of
-from .stream import Method, Stream
-from .summary import Summary, scan
+from .detail import level_for
+from .opening import levels_of
+from .sources import VoxelSource
+from .stream import CELL, Method, Stream
+from .summary_files import summary_of
 
 
 def render_bricks(
-    source: VoxelSource | Any,
+    source: VoxelSource | Volume | str | Any,
     transfer: Transfer | Any,
     camera: Camera | Any,
     march: March | Any,
@@ -54,132 +55,246 @@ def render_bricks(
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
-    summary: Summary | None = None,
+    level: int | Literal["auto"] | Any = "auto",
+    tolerance: float | None = None,
+    cache: Literal["beside"] | str | Any | None = "beside",
     progress: Callable[[int, int], Any] | None = None,
+    **options: Any,
 ) -> Rendering:
-    source = source if isinstance(source, VoxelSource) else ArraySource(source)
+    """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
+
+    The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
+    is read. Of each ray it is kept how far it has come. A brick that no ray needs is not read: one in which
+    nothing is visible, outside of the view, or behind what is opaque. The image is that of `render`, to
+    2e-5 in float32, whatever the bricks.
+
+    **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
+    but `SpaceLeaping("min_distance")`.
+
+    - `source`: an array or a memory map, data[x, y, z]; the path of a raw, .npy, Zarr or OME-Zarr file; a
+      `Volume`; a `bricks.VoxelSource`. See `bricks.levels_of`, which also takes `options` (`shape` and
+      `dtype` of a raw file, and `axes`, `index` and `missing` of a Zarr array).
+    - `spacing`, `origin`: as in `Volume`; by default what the source says.
+    - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
+      them an image takes some 300 bytes for each pixel. By default a quarter of the device's memory.
+    - `bricks`: number of bricks along x, y and z, in place of as few as fit into `memory`. A toroidal volume
+      is split across σ first.
+    - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
+      left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
+      fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
+      them. `"naive"`: each brick shows at once all that a ray meets in it, in the wrong order: what the
+      paper compares with, not an image to use.
+    - `lighting`: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
+      (`Lighting.farthest_read`).
+    - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
+      are no larger than a pixel; or, with a `tolerance`, whose error by ranges of values stays below that
+      (`bricks.level_for`).
+    - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
+      first image; see `bricks.summary_of`.
+    - `progress`: called with the numbers of bricks read and of those that hold anything visible.
+
+    **Returns:** as `render`, and in `Rendering.bricks` what it took.
+
+    Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
+    spacing and origin: a second march reads the bricks again. Where the march does not leap, that one reads
+    bricks of no extinction, too, whose gradient need not be 0. There is no gradient to the voxels, none of
+    modes that choose a sample or resolve (`"maximum"`, `"average"`, `Isosurface`), and none inside `jax.jit`
+    or `jax.vmap`.
+
+    **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
+    unknown; for less memory than the smallest bricks take; and for what needs the whole volume at once
+    (labels, baked or deferred light). Nothing is written but the cache, which appears whole or not at all.
+
+    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
+    are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the
+    image, so that it suffices for all faces and from everywhere; `bricks.overlap_of` has their formula.
+    """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    scene = _scene(source, spacing, origin, transfer, camera, march, compositing, lighting)
-    how = scene.compositing
-    selects, resolves = isinstance(how, Selection), how.resolves
-    marched = scene
-    if resolves:  # rays are marched without light
-        transfer, march = how.marched(scene.transfer, scene.march, scene.volume)
-        marched = scene._replace(transfer=transfer, march=march, lighting=None)
-    options = RenderOptions("depth" if resolves and outputs == "rgba" else outputs, Tiling.of_backend())
-    stream = _stream(source, marched, scene, options, memory, bricks, method, summary, progress)
-    underway = _set_out(marched, options)
+    _check(march, transfer, lighting, method, outputs)
+    levels = levels_of(source, spacing=spacing, origin=origin, **options)
+    chosen = _level(levels, level, camera, transfer, tolerance, cache)
+    nothing = np.zeros((2, 2, 2), chosen.dtype)
+    place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
+    volume = part_of(Volume(nothing, *place), jnp.zeros(3, jnp.int32), chosen.shape)
+    how = compositing_of(compositing)
+    scene = strong(Scene(volume, transfer, camera, march.divided(), how, lighting))
+    memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
+    job = _Job(chosen, memory, _counts(bricks), method, outputs, cache, progress, [])
+    rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
+    return Rendering(
+        rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=job.streams[0].report())
+    )
 
-    def march_brick(part: Volume, cells: Any, state: Any) -> Any:
+
+@dataclass(frozen=True)
+class _Job:
+    """How a scene is rendered. `streams`: those that did it, filled as they do."""
+
+    source: VoxelSource
+    memory: int
+    counts: tuple[int, int, int] | None
+    method: Method
+    outputs: Asked
+    cache: Any
+    progress: Callable[[int, int], Any] | None
+    streams: list[Stream]
+
+    def stream(self, marched: Scene, shown: Scene, options: RenderOptions) -> Stream:
+        """The bricks of a scene, as rays are marched, and as they are shown."""
+        cell = CELL if min(self.source.shape) > CELL else 4
+        summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
+        where = self.memory, self.counts, self.method, self.progress
+        stream = Stream.of(self.source, summary, marched, shown, options, *where)
+        self.streams.append(stream)
+        return stream
+
+
+_set_out, _march_part, _arrive = map(compiled, (set_out, march_part, arrive))
+_resolve_part, _resolve = map(compiled, (resolve_part, resolve_image))
+_start_pull, _pull_part, _end_pull = map(compiled, (start_pull, pull_part, end_pull))
+
+
+def _image(scene: Scene, job: _Job) -> Rendering:
+    mode, outputs = scene.compositing, job.outputs
+    marched, selects = scene, isinstance(mode, Selection)
+    if mode.resolves:  # rays are marched without light, and pixels are computed from what that finds
+        transfer, march = mode.marched(scene.transfer, scene.march, scene.volume)
+        marched = scene._replace(transfer=transfer, march=march, lighting=None)
+    options = _options("depth" if mode.resolves and outputs == "rgba" else outputs)
+    stream = job.stream(marched, scene, options)
+    naive = job.method == "naive"
+
+    def march_brick(
+        part: Volume, cells: CellRange, state: tuple[Underway, PyTree]
+    ) -> tuple[Underway, PyTree]:
         underway, pixels = state
-        here = marched._replace(volume=part)
-        acceleration = VolumeAcceleration.of(part, here.transfer, here.march, here.lighting)
-        after = _march_part(here, options, acceleration, underway, cells, method == "naive")
+        after = _march_part(*_on(part, marched, options), underway, cells, naive)
         if selects:
-            whole = scene._replace(volume=part)
-            acceleration = VolumeAcceleration.of(part, whole.transfer, whole.march, whole.lighting)
-            pixels = _resolve_part(whole, options, acceleration, marched.march, underway.at, after, pixels)
+            pixels = _resolve_part(*_on(part, scene, options), marched.march, underway.at, after, pixels)
         return after, pixels
 
+    underway = _set_out(marched, options)
     state = stream.through(underway.rays, (underway, None), lambda state: state[0].alive, march_brick)
     underway, pixels = state
-    if method == "naive":  # rays go back, and have no end
+    if naive:  # rays go back, and have no end
         underway = Underway(underway.rays, with_fields(underway.at, finished=underway.at.index >= 0))
     rendering = _arrive(marched, options, underway)
-    if resolves and not selects:
-        found = rendering.rgba, rendering.depth, None
-        pixels = _resolve(scene, options, NOTHING, found)
-    details = rendering.details._replace(bricks=stream.report(), selected=None)
-    if pixels is None:
-        return Rendering(rendering.rgba, rendering.exhausted, details)
-    normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
-    details = details._replace(depth=pixels[..., 4], normal=normal)
-    if outputs == "rgba":
-        details = Details(bricks=details.bricks)
+    if not mode.resolves:
+        return rendering
+    if not selects:
+        pixels = _resolve(scene, options, NOTHING, (rendering.rgba, rendering.depth, None))
+    elif pixels is None:  # no brick was read
+        pixels = jnp.zeros((*rendering.rgba.shape[:-1], 5), rendering.rgba.dtype).at[..., 4].set(jnp.inf)
+    details = Details()
+    if outputs == "all":
+        normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
+        details = rendering.details._replace(depth=pixels[..., 4], normal=normal, selected=None)
     return Rendering(pixels[..., :4], rendering.exhausted, details)
 
 
-_set_out = compiled(set_out)
-_resolve_part = compiled(resolve_part)
-_resolve = compiled(resolve_image)
-_march_part = compiled(march_part)
-_arrive = compiled(arrive)
+@eqx.filter_custom_vjp
+def _differentiable(scene: Scene, job: _Job) -> Rendering:
+    if is_traced(scene):
+        raise ValueError(
+            "render_bricks reads its source while it runs, and so not inside jax.jit, jax.vmap or forward "
+            "mode: call it outside of them, or jv.render on a volume in memory."
+        )
+    return _image(scene, job)
 
 
-def _scene(
-    source: VoxelSource,
-    spacing: Arrayable | None,
-    origin: Arrayable | None,
-    transfer: Transfer,
+@_differentiable.def_fwd
+def _(perturbed: Any, scene: Scene, job: _Job) -> tuple[Rendering, Rendering]:
+    mode, method = scene.compositing, job.method
+    if mode.resolves:
+        raise ValueError(
+            f"compositing by {type(mode).__name__} has no gradient through bricks; use jv.render on a volume "
+            "in memory."
+        )
+    if method == "naive":
+        raise ValueError('method="naive" has no gradient; use "overlap".')
+    rendering = _differentiable(scene, job)
+    return rendering, rendering
+
+
+@_differentiable.def_bwd
+def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _Job) -> Any:
+    options, whole = _options(job.outputs), of_all_outputs(rendering, cotangent)
+    stream = job.stream(scene, scene, options)
+    if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
+        stream = replace(stream, visible=np.ones_like(stream.visible))
+
+    def pull_brick(part: Volume, cells: CellRange, pulled: Pulled) -> Pulled:
+        here, options_, acceleration = _on(part, scene, options)
+        return _pull_part(here, perturbed, options_, acceleration, pulled, cells)
+
+    pulled = _start_pull(scene, perturbed, options, rendering, whole)
+    pulled = stream.through(pulled.underway.rays, pulled, lambda state: state.underway.alive, pull_brick)
+    found = _end_pull(scene, perturbed, options, pulled, rendering, whole)
+    return of_perturbed(found, perturbed, rendering, whole)
+
+
+def _options(outputs: Any) -> RenderOptions:
+    return RenderOptions(outputs, Tiling.of_backend())
+
+
+def _on(
+    part: Volume, scene: Scene, options: RenderOptions
+) -> tuple[Scene, RenderOptions, VolumeAcceleration]:
+    """The scene with a part of its volume."""
+    acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
+    return scene._replace(volume=part), options, acceleration
+
+
+def _level(
+    levels: tuple[VoxelSource, ...],
+    level: int | Literal["auto"] | Any,
     camera: Camera,
-    march: March,
-    compositing: Any,
-    lighting: Lighting | None,
-) -> Scene:
-    """The scene, with a volume of which no voxel is known."""
-    spacing = spacing if spacing is not None else source.spacing or (1.0, 1.0, 1.0)
-    origin = origin if origin is not None else source.origin or (0.0, 0.0, 0.0)
-    nothing = np.zeros((2, 2, 2), source.dtype)
-    volume = part_of(Volume(nothing, spacing, origin), jnp.zeros(3, jnp.int32), source.shape)
-    return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
+    transfer: Transfer,
+    tolerance: float | None,
+    cache: Any,
+) -> VoxelSource:
+    if level != "auto":
+        return levels[integer("level", level, 0, len(levels) - 1)]
+    if len(levels) == 1:
+        return levels[0]
+    if is_traced(camera, transfer):
+        raise ValueError(
+            f"level must be one of 0 to {len(levels) - 1} where gradients are taken; got 'auto', which "
+            "depends on what is differentiated."
+        )
+    summaries = [summary_of(each, CELL, cache=cache) for each in levels] if tolerance is not None else None
+    return levels[level_for(levels, camera, transfer, summaries, tolerance=tolerance)]
 
 
-def _stream(
-    source: VoxelSource,
-    scene: Scene,
-    shown: Scene,
-    options: RenderOptions,
-    memory: int | Any | None,
-    bricks: tuple[int, int, int] | Any | None,
-    method: Method | Any,
-    summary: Summary | None,
-    progress: Callable[[int, int], Any] | None,
-) -> Stream:
-    if method not in get_args(Method):
-        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
-    volume, _, camera, march, _, _ = scene
-    space = march.locate(volume)
-    straight = is_straight(space)
-    probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
-    spacing = np.asarray(volume.spacing, float)
-    if not straight:
-        spacing = _distances(space, source.shape)
-    margin = Margin.of(march, spacing, options.tiling.cells, shown.transfer, shown.lighting)
-    memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
+def _counts(bricks: Any) -> tuple[int, int, int] | None:
     if bricks is None:
-        grid = split(source.shape, source.dtype, memory, margin, probe)
-    else:
-        counts = [integer("bricks", n, 1) for n in bricks]
-        x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
-        grid = BrickGrid(source.shape, (x, y, z))
-    stored = stored_of(grid, margin, probe)
-    if summary is None:
-        summary = scan(source, 16)
-    visible = _visible(scene, grid, summary)
-    return Stream(
-        *(source, scene, options, grid, margin, grid.order(space, camera), visible, straight, stored),
-        *(max(memory, bytes_of(stored, source.dtype)), method, progress),
-    )
+        return None
+    try:
+        x, y, z = bricks
+    except (TypeError, ValueError) as fault:
+        raise ValueError(
+            f"bricks must be three numbers of bricks, along x, y and z; got {described(bricks)}."
+        ) from fault
+    return integer("bricks", x, 1), integer("bricks", y, 1), integer("bricks", z, 1)
 
 
-def _distances(space: Space, shape: tuple[int, ...]) -> np.ndarray:
-    """World distances between nodes along the three axes, in the middle of a grid with curved rays. Where a
-    brick takes more of its surroundings, more is read."""
-    middle = jnp.asarray([(n - 1) / 2 for n in shape])
-    along = jax.jacfwd(lambda at: jnp.stack(space.point(apart(at))))(middle)
-    return np.linalg.norm(np.asarray(along, float), axis=0)
-
-
-def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
-    """For each brick, whether anything may be visible in it."""
-    ranges = np.array(
-        [
-            summary.range_of(low, [end + 1 for end in high])
-            for low, high in (grid.cells(brick) for brick in range(grid.number))
-        ],
-        np.float32,
-    )
-    low, high = (jnp.asarray(end.reshape(grid.counts)) for end in ranges.T)
-    blocks = Blocks(*widened(low, high), None)
-    return np.asarray(scene.compositing.occupied(scene.transfer, blocks)).reshape(-1)
+def _check(march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any) -> None:
+    for name, given, known in (("method", method, Method), ("outputs", outputs, Asked)):
+        if given not in get_args(known):
+            raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
+    if isinstance(transfer, LabelTransferFunction):
+        raise ValueError(
+            "transfer must be of values: bricks have no labels. Use jv.render for labelled volumes."
+        )
+    if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
+        raise ValueError(
+            'SpaceLeaping("min_distance") starts rays at what is visible first in the whole volume; use '
+            '"hierarchy", "distance" or "beam" with bricks.'
+        )
+    if lighting is not None and (lighting.shades_pixels or lighting.farthest_read is None):
+        raise ValueError(
+            "lighting must say how far around a sample it reads (Lighting.farthest_read), and light samples; "
+            f"{type(lighting).__name__} needs the whole volume here. Phong does not, and neither do "
+            "ScattererTemplates that are not baked."
+        )

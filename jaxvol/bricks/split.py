@@ -4,14 +4,12 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 
 from .._util.checks import integer
-from ..lighting.shading import Lighting
+from ..engine.scene import Scene
 from ..march import RUN, March
 from ..occupancy import BLOCK
-from ..transfer import Transfer
 from ..transforms import ToroidalMap
 from .grid import BrickGrid, Node
 from .overlap import most
@@ -22,8 +20,8 @@ EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
 STORED, MADE = 2, 8
-"""Of each voxel of a brick: copies of its own type, since the next brick is read meanwhile; and bytes for what
-is made of it, while it is made."""
+"""Of each voxel of a brick: copies of its own type, since the next brick is read meanwhile; and bytes for
+what is made of it, while it is made."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +39,10 @@ class Margin:
     around: int
 
     @classmethod
-    def of(
-        cls, march: March, spacing: np.ndarray, segment: int, transfer: Transfer, lighting: Lighting | None
-    ) -> "Margin":
-        """That of a march in a grid of this spacing, which takes `segment` cells of a ray at a time."""
+    def of(cls, march: March, spacing: np.ndarray, segment: int, shown: Scene) -> "Margin":
+        """That of a march in a grid of this spacing, which takes `segment` cells of a ray at a time. `shown`:
+        what is measured and lit there."""
+        transfer, lighting = shown.transfer, shown.lighting
         steps, length = reach(march, segment), float(march.step) / spacing
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
         around = 2 if slopes else 1
@@ -66,7 +64,8 @@ def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
 
 
 def bytes_of(stored: Node, dtype: Any) -> int:
-    """Memory that parts of this shape take: the one that is rendered, what is made of it, and the next one."""
+    """Memory that parts of this shape take: the one that is rendered, what is made of it, and the next
+    one."""
     return math.prod(stored) * (STORED * np.dtype(dtype).itemsize + MADE)
 
 
@@ -86,8 +85,8 @@ def split(shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalM
         longest = max(range(3), key=lambda axis: (size[axis] > min(EDGE, cells[axis])) * size[axis])
         if size[longest] <= min(EDGE, cells[longest]):
             raise ValueError(
-                f"memory must be at least {needed} bytes, for bricks of {' x '.join(map(str, size))} cells and what "
-                f"is read around them; got {memory}."
+                f"memory must be at least {needed} bytes, for bricks of {' x '.join(map(str, size))} cells "
+                f"and what is read around them; got {memory}."
             )
         parts[longest] *= 2
 

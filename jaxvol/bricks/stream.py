@@ -1,35 +1,38 @@
 """Takes an image's rays through all bricks in turn, while the next brick is read."""
 
-import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool
 
+from .._util.vec3 import apart
 from .._util.xla import compiled
 from ..engine.batch import CellRange
 from ..engine.image import RenderOptions
 from ..engine.scene import Scene
 from ..march import March
-from ..occupancy import BLOCK
+from ..occupancy import BLOCK, Blocks, widened as with_slack
 from ..rendering import BrickReport
-from ..space import Ray
+from ..space import Ray, Space
+from ..transforms import ToroidalMap
 from ..volume import Volume, part_of
-from .grid import BrickGrid, Node
+from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
 from .sources import VoxelSource
-from .split import Margin, bytes_of, stored_shape
+from .split import Margin, bytes_of, split, stored_of, stored_shape
+from .summary import Summary
 
 
 Method = Literal["overlap", "reload", "naive"]
 State = TypeVar("State")
+
+CELL = 16
+"""Cells along the side of the blocks whose ranges of values tell which bricks are empty."""
 
 BEAMS = 32
 """Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
@@ -69,6 +72,38 @@ class Stream:
     progress: Callable[[int, int], Any] | None = None
     loads: list[int] = field(default_factory=list)
     bytes_read: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        source: VoxelSource,
+        summary: Summary,
+        marched: Scene,
+        shown: Scene,
+        options: RenderOptions,
+        memory: int,
+        counts: Node | None,
+        method: Method,
+        progress: Callable[[int, int], Any] | None,
+    ) -> "Stream":
+        """The bricks of a scene: as its rays are marched, and as it is `shown`. `counts`: along each axis, in
+        place of as few as fit into `memory`."""
+        march = marched.march
+        space = march.locate(marched.volume)
+        straight = is_straight(space)
+        probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
+        margin = Margin.of(march, _distances(space, source.shape), options.tiling.cells, shown)
+        if counts is None:
+            grid = split(source.shape, source.dtype, memory, margin, probe)
+        else:
+            x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
+            grid = BrickGrid(source.shape, (x, y, z))
+        stored = stored_of(grid, margin, probe)
+        order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
+        return cls(
+            *(source, marched, options, grid, margin, order, visible, straight, stored),
+            *(max(memory, bytes_of(stored, source.dtype)), method, progress),
+        )
 
     def through(
         self,
@@ -112,8 +147,8 @@ class Stream:
         return part_of(part, jnp.asarray(first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
-        """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the newest
-        answer."""
+        """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the
+        newest answer."""
         if self.method == "naive":
             yield from self._alone(rays, living)
             return
@@ -163,15 +198,14 @@ class Stream:
                 yield load
 
     def _turn(self, brick: int, through: set[int]) -> Turn:
-        number = self.grid.number
         empty = np.append(~self.visible, True)
         through_ = empty.copy()
         through_[list(through)] = True
-        return Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(through_), jnp.asarray(empty))
+        return Turn(
+            jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(through_), jnp.asarray(empty)
+        )
 
-    def _found(
-        self, brick: int, through: set[int], rays: Ray, alive: Array, reached: Array
-    ) -> Found | None:
+    def _found(self, brick: int, through: set[int], rays: Ray, alive: Array, reached: Array) -> Found | None:
         beyond = self.margin.steps
         found = _cells_of_curved(
             self.grid, beyond, self.scene.march, rays, alive, reached, self._turn(brick, through)
@@ -210,6 +244,23 @@ class Stream:
         return Load(brick, cells, (x, y, z), self.source.read_async(first, first + stored))
 
 
+def _distances(space: Space, shape: Node) -> np.ndarray:
+    """World distances between nodes along the three axes, in the middle of the grid. Where rays are curved,
+    they differ elsewhere, and what a brick reads is found from its rays."""
+    middle = jnp.asarray([(n - 1) / 2 for n in shape])
+    along = jax.jacfwd(lambda at: jnp.stack(space.point(apart(at))))(middle)
+    return np.linalg.norm(np.asarray(along, float), axis=0)
+
+
+def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
+    """For each brick, whether anything may be visible in it."""
+    corners = [grid.cells(brick) for brick in range(grid.number)]
+    ranges = np.array([summary.range_of(low, [end + 1 for end in high]) for low, high in corners])
+    low, high = (jnp.asarray(end.reshape(grid.counts), jnp.float32) for end in ranges.T)
+    blocks = Blocks(*with_slack(low, high), None)
+    return np.asarray(scene.compositing.occupied(scene.transfer, blocks)).reshape(-1)
+
+
 def _straight(
     grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn
 ) -> tuple[CellRange, Bool[Array, ""]]:
@@ -223,9 +274,7 @@ def _curved(
     """By beams of rays, as many as are looked at at a time."""
     shape = rays.length.shape
     by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), (rays, alive, reached))
-    found = jax.lax.map(
-        lambda each: of_curved(grid, march, *each, turn, beyond), by_beam, batch_size=BEAMS
-    )
+    found = jax.lax.map(lambda each: of_curved(grid, march, *each, turn, beyond), by_beam, batch_size=BEAMS)
     cells, at = jax.tree.map(lambda leaf: leaf.reshape(shape), (found.cells, found.reached))
     return Found(cells, at, jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any))
 

@@ -44,14 +44,23 @@ def render_vjp(
     `residuals`: the image, and the visible cells of its rays where they were recorded. `cotangent`: of the
     image, None for what the loss does not use. A loss that uses a pixel that is NaN has the gradient NaN."""
     rendering, ranges = residuals
-    whole = jax.tree.map(
+    whole = of_all_outputs(rendering, cotangent)
+    found = _vjp_by_tiles(scene, perturbed, options, acceleration, rendering, ranges, whole)
+    return of_perturbed(found, perturbed, rendering, whole)
+
+
+def of_all_outputs(rendering: Rendering, cotangent: Any) -> Rendering:
+    """The cotangent of an image, with zeros for what the loss does not use."""
+    return jax.tree.map(
         lambda leaf, part: jnp.zeros_like(leaf) if part is None and eqx.is_inexact_array(leaf) else part,
         *(rendering, cotangent),
         is_leaf=lambda leaf: leaf is None,
     )
-    found = eqx.filter(
-        _vjp_by_tiles(scene, perturbed, options, acceleration, rendering, ranges, whole), perturbed
-    )
+
+
+def of_perturbed(found: Any, perturbed: Any, rendering: Rendering, whole: Rendering) -> Any:
+    """Of the cotangents of a scene those that are asked for; NaN if the loss uses a pixel that is NaN."""
+    found = eqx.filter(found, perturbed)
     # rays that are NaN are not marched, and would leave a gradient of 0
     floats_of = (jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)) for tree in (rendering, whole))
     lost = [jnp.any(jnp.isnan(leaf) & (part != 0)) for leaf, part in zip(*floats_of, strict=True)]
@@ -59,17 +68,18 @@ def render_vjp(
     return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
 
 
-class _Sums(NamedTuple):
+class Sums(NamedTuple):
     """Gradients summed over the tiles so far: of the scene's parts, and of where its rays come from."""
 
     total: Total
     source: PyTree
 
 
-class _Image(NamedTuple):
+class Pull(NamedTuple):
     """What the tiles of an image share.
 
-    `pipeline`: without lighting, since samples are shaded by `shader`.
+    `pipeline`: without lighting, since samples are shaded by `shader`. `pull_shader`: from its leaves to
+    volume, transfer function, march and lighting.
     """
 
     scene: Scene
@@ -77,19 +87,41 @@ class _Image(NamedTuple):
     fetch: Fetch
     empty_space: EmptySpaceIndex | None
     shader: Shader | None
+    pull_shader: Callable[[PyTree], Any] | None
     fault: Bool[Array, ""]
     tiles: RayTiles
     tiling: Tiling
 
-    def pull_tile(
-        self,
-        sums: _Sums,
-        number: Int[Array, ""],
-        range_: CellRange | None,
-        rendering: Rendering,
-        cotangent: Rendering,
-    ) -> _Sums:
-        """The sums with the gradients of one more tile, from its part of the image and of its cotangent."""
+    @classmethod
+    def of(
+        cls, scene: Scene, perturbed: Any, options: RenderOptions, acceleration: VolumeAcceleration
+    ) -> "Pull":
+        """That of a scene."""
+        packed, tiling = acceleration.packed(scene), options.tiling
+        index = empty_space_of(scene, acceleration, tiling)
+        _, pipeline = pipeline_of(packed._replace(lighting=None), acceleration)
+        shader, pull_shader = None, None
+        if scene.lighting is not None:
+            shader, pull_shader = _shader_of(scene, packed.volume, voxels=_of_voxels(scene, perturbed))
+        tiles, fetch = RayTiles.of(scene.source, tiling), packed.volume.fetch
+        return cls(scene, pipeline, fetch, index, shader, pull_shader, fault_of(scene), tiles, tiling)
+
+    def zeros(self, perturbed: Any) -> Sums:
+        """Sums of no tile yet, for what is perturbed."""
+        around = without_voxels(perturbed.volume), perturbed.source, perturbed.march
+        geometric = any(jax.tree.leaves(around))
+        of_transfer = any(jax.tree.leaves(perturbed.transfer))
+        total = Total.zeros(
+            self.scene,
+            self.shader,
+            transfer=of_transfer,
+            geometric=geometric,
+            voxels=_of_voxels(self.scene, perturbed),
+        )
+        return Sums(total, zeros_of(self.scene.source) if geometric else None)
+
+    def rays(self, number: Int[Array, ""]) -> tuple[Ray, Callable[[PyTree], Any]]:
+        """The rays of a tile, and their pull-back to volume, source and march."""
         volume, source, march = self.scene.volume, self.scene.source, self.scene.march
 
         def made(moving: PyTree) -> Ray:
@@ -97,15 +129,28 @@ class _Image(NamedTuple):
             space = march_.locate(with_voxels(volume_, volume.data))
             return invalid(self.tiles.rays(source_, space, number), self.fault)
 
-        rays, pull = eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
-        replay = Replay(
-            *(self.pipeline, self.scene, self.fetch, rays, Cotangents.of(rays, rendering, cotangent)),
-            *(sums.total, self.shader, self.tiling),
-        )
-        beams = Beams(rays, self.tiles.beam_count, self.tiles.box(source, rays, number), range_)
-        _, (_, of_rays, total) = march_rays(self.pipeline, self.empty_space, beams, self.tiling, None, replay)
+        return eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
+
+    def replay(self, rays: Ray, given: Cotangents, total: Total) -> Replay:
+        """What looks at the samples of rays."""
+        return Replay(self.pipeline, self.scene, self.fetch, rays, given, total, self.shader, self.tiling)
+
+    def beams(self, rays: Ray, number: Int[Array, ""], range_: CellRange | None) -> Beams:
+        """The rays of a tile, to be marched."""
+        return Beams(rays, self.tiles.beam_count, self.tiles.box(self.scene.source, rays, number), range_)
+
+    def of_rays(
+        self,
+        sums: Sums,
+        pull: Callable[[PyTree], Any],
+        of_rays: PyTree,
+        rendering: Rendering,
+        cotangent: Rendering,
+    ) -> Sums:
+        """The sums with what a tile's rays pull back to, from the cotangents that their samples gave them."""
+        total = sums.total
         if not total.geometric:
-            return _Sums(total, sums.source)
+            return sums
         if cotangent.details.depth is not None:
             # depth is measured from the ray's origin, and a sample's from the entry
             toward = jnp.where(rendering.rgba[..., 3] > 0, cotangent.depth, 0)
@@ -113,7 +158,11 @@ class _Image(NamedTuple):
         of_volume, of_source, of_march = pull(of_rays)[0]
         of_parts = added(total.volume, of_volume), added(total.march, of_march)
         total = eqx.tree_at(lambda t: (t.volume, t.march), total, of_parts)
-        return _Sums(total, added(sums.source, of_source))
+        return Sums(total, added(sums.source, of_source))
+
+
+def _of_voxels(scene: Scene, perturbed: Any) -> bool:
+    return eqx.is_inexact_array(scene.volume.data) and perturbed.volume.data
 
 
 def _vjp_by_tiles(
@@ -126,34 +175,27 @@ def _vjp_by_tiles(
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
-    volume, source, lighting = scene.volume, scene.source, scene.lighting
-    of_voxels = eqx.is_inexact_array(volume.data) and perturbed.volume.data
-    around = without_voxels(perturbed.volume), perturbed.source, perturbed.march
-    geometric = any(jax.tree.leaves(around))
-    packed, tiling = acceleration.packed(scene), options.tiling
-    tiles, index = RayTiles.of(source, tiling), empty_space_of(scene, acceleration, tiling)
-    if index is not None and ranges is not None:
-        index = index.within_ranges()
-    _, pipeline = pipeline_of(packed._replace(lighting=None), acceleration)
-    shader, pull_shader = None, None
-    if lighting is not None:
-        shader, pull_shader = _shader_of(scene, packed.volume, voxels=of_voxels)
-    image = _Image(*(scene, pipeline, packed.volume.fetch, index, shader, fault_of(scene), tiles, tiling))
-    of_transfer = any(jax.tree.leaves(perturbed.transfer))
-    sums = _Sums(
-        Total.zeros(scene, shader, transfer=of_transfer, geometric=geometric, voxels=of_voxels),
-        zeros_of(source) if geometric else None,
-    )
-    parts = jax.tree.map(tiles.disassemble, (rendering, cotangent))
-    sums, _ = jax.lax.scan(
-        lambda sums, each: (image.pull_tile(sums, *each), None),
-        varying(sums, parts),
-        (jnp.arange(tiles.number), ranges, *parts),
-    )
-    return _cotangents(scene, *sums, pull_shader)
+    image = Pull.of(scene, perturbed, options, acceleration)
+    if image.empty_space is not None and ranges is not None:
+        image = image._replace(empty_space=image.empty_space.within_ranges())
+
+    def tile(sums: Sums, each: Any) -> tuple[Sums, None]:
+        number, range_, rendering, cotangent = each
+        rays, pull = image.rays(number)
+        replay = image.replay(rays, Cotangents.of(rays, rendering, cotangent), sums.total)
+        beams = image.beams(rays, number, range_)
+        _, (_, of_rays, total) = march_rays(
+            image.pipeline, image.empty_space, beams, image.tiling, None, replay
+        )
+        return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
+
+    parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
+    every = jnp.arange(image.tiles.number), ranges, *parts
+    sums, _ = jax.lax.scan(tile, varying(image.zeros(perturbed), parts), every)
+    return cotangents_of(scene, *sums, image.pull_shader)
 
 
-def _cotangents(
+def cotangents_of(
     scene: Scene, total: Total, of_source: PyTree, pull_shader: Callable[[PyTree], Any] | None
 ) -> Any:
     """The cotangents of a scene's parts; 0 for those that are not asked for."""

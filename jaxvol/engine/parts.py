@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from .._util.trees import PyTree
 from ..march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
 from ..rendering import Rendering
@@ -63,8 +62,8 @@ def march_part(
     anew: bool = False,
 ) -> Underway:
     """The rays behind these of their cells. `scene`: with a part of the volume, which holds what they meet
-    there, and in a segment more. `anew`: the cells are marched whatever was before them, also what lies behind
-    them; and none beside them."""
+    there, and in a segment more. `anew`: the cells are marched whatever was before them, also what lies
+    behind them; and none beside them."""
     tiles, packed = RayTiles.of(scene.source, options.tiling), acceleration.packed(scene)
     index = empty_space_of(packed, acceleration, options.tiling)
     _, pipeline = pipeline_of(packed, acceleration)

@@ -91,8 +91,8 @@ def march_segment(
     until: Int[Array, " rays"] | None = None,
 ) -> tuple[Progress, Samples]:
     """Marches rays by a segment, or to where they are finished, shifted off the cells that were sampled, or
-    at the end of a run; or to `until`, where that is given. `regular`: no ray has a shift or such an end ahead
-    of it."""
+    at the end of a run; or to `until`, where that is given. `regular`: no ray has a shift or such an end
+    ahead of it."""
     march, classification = pipeline.march, pipeline.classification
     number = tiling.cells if at.stride is None else min(tiling.cells, RUN)
     every = samples = _sampled(pipeline, number, ray, at)

@@ -126,7 +126,9 @@ def _chunk_vjp(
             if perturbations is None:
                 return shading.term(around.in_memory_by(number >= 0, sample), sample, shared, number), []
             record = Recording(perturbations, [])
-            here = Surroundings(with_fetch(around.volume, around.volume.fetch.of(record)), around.transfer, around.space)
+            here = Surroundings(
+                with_fetch(around.volume, around.volume.fetch.of(record)), around.transfer, around.space
+            )
             return shading.term(here, sample, shared, number), record.bases
 
         return jax.vmap(one)(each, eqx.combine(parts.shared, fixed_shared), perturbations)

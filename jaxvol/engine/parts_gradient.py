@@ -1,0 +1,106 @@
+"""VJP of an image that was marched through one part of a volume after the other: as `gradients`, with a
+second march through all parts, in the same order."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .._util.trees import PyTree
+from ..reference import begin
+from ..rendering import Rendering
+from .acceleration import VolumeAcceleration
+from .batch import CellRange, with_fields
+from .gradients import Pull, Sums, cotangents_of
+from .image import RenderOptions
+from .parts import NOTHING, Underway, ended
+from .rays import vmap_rays
+from .replay import Cotangents
+from .scene import Scene
+from .wavefront import march_rays
+
+
+class Pulled(eqx.Module):
+    """The second march of an image, underway: all but `sums` are of (tiles, groups, rays in a group).
+
+    - `given`: cotangents of the rays.
+    - `carry`: what the samples so far are worth. `of_rays`: what they gave the rays.
+    """
+
+    underway: Underway
+    given: Cotangents
+    carry: Array
+    of_rays: PyTree
+    sums: Sums
+
+
+def start_pull(
+    scene: Scene, perturbed: Any, options: RenderOptions, rendering: Rendering, cotangent: Rendering
+) -> Pulled:
+    """All rays at their entries, with the cotangents of their pixels. Of the volume, no voxel is read."""
+    image = Pull.of(scene, perturbed, options, NOTHING)
+    sums = image.zeros(perturbed)
+
+    def one(each: tuple[Int[Array, ""], Rendering, Rendering]) -> tuple[Underway, Cotangents, Array, PyTree]:
+        number, rendering, cotangent = each
+        rays, _ = image.rays(number)
+        at = vmap_rays(lambda ray: begin(image.pipeline, ray, None))(rays)
+        given = Cotangents.of(rays, rendering, cotangent)
+        replay = image.replay(rays, given, sums.total)
+        underway = Underway(rays, with_fields(at, finished=rays.length <= 0))
+        return underway, given, replay.carry, replay.sums
+
+    parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
+    return Pulled(*jax.lax.map(one, (jnp.arange(image.tiles.number), *parts)), sums)
+
+
+def pull_part(
+    scene: Scene,
+    perturbed: Any,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    pulled: Pulled,
+    ranges: CellRange,
+) -> Pulled:
+    """The second march behind these cells of its rays, as `march_part`."""
+    image = Pull.of(scene, perturbed, options, acceleration)
+
+    def one(sums: Sums, each: Any) -> tuple[Sums, Any]:
+        number, underway, given, carry, of_rays, range_ = each
+        replay = image.replay(underway.rays, given, sums.total)
+        replay.carry, replay.sums = carry, of_rays
+        after, (carry, of_rays, total) = march_rays(
+            *(image.pipeline, image.empty_space, image.beams(underway.rays, number, range_), image.tiling),
+            *(None, replay, underway.at),
+        )
+        over = underway.at.finished | ended(image.pipeline, underway.rays, after)
+        underway = Underway(underway.rays, with_fields(after, finished=over))
+        return sums._replace(total=total), (underway, given, carry, of_rays)
+
+    numbers = jnp.arange(image.tiles.number)
+    every = numbers, pulled.underway, pulled.given, pulled.carry, pulled.of_rays, ranges
+    sums, rays = jax.lax.scan(one, pulled.sums, every)
+    return Pulled(*rays, sums)
+
+
+def end_pull(
+    scene: Scene,
+    perturbed: Any,
+    options: RenderOptions,
+    pulled: Pulled,
+    rendering: Rendering,
+    cotangent: Rendering,
+) -> Any:
+    """The cotangents of a scene's parts, from a march through all parts of its volume."""
+    image = Pull.of(scene, perturbed, options, NOTHING)
+
+    def one(sums: Sums, each: Any) -> tuple[Sums, None]:
+        number, of_rays, rendering, cotangent = each
+        _, pull = image.rays(number)
+        return image.of_rays(sums, pull, of_rays, rendering, cotangent), None
+
+    parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
+    sums, _ = jax.lax.scan(one, pulled.sums, (jnp.arange(image.tiles.number), pulled.of_rays, *parts))
+    return cotangents_of(scene, *sums, image.pull_shader)
