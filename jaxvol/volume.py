@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, require
 from ._util.vec3 import Scalar, Vec3
-from ._util.voxel_fetch import Fetch, OneByOne, Windowed, corners, fetched
+from ._util.voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by
 from ._util.voxels import label_array, voxel_array
 
 
@@ -93,9 +93,9 @@ class Volume(eqx.Module):
     @property
     def first(self) -> Vec3 | None:
         """Where `data` is only a part of the grid, the node at which it begins, in the type of `spacing`."""
-        if not isinstance(self.fetch, Windowed):
+        if self.fetch.window is None:
             return None
-        x, y, z = self.fetch.first.astype(self.spacing.dtype)
+        x, y, z = self.fetch.window.first.astype(self.spacing.dtype)
         return x, y, z
 
     @property
@@ -213,7 +213,15 @@ def with_voxels(volume: Volume, data: Array) -> Volume:
 def part_of(volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int]) -> Volume:
     """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing
     and origin are those of the whole. Beyond the part nothing is known: its faces are read."""
-    return with_fetch(volume, Windowed(volume.fetch, first, whole))
+    fetch = eqx.tree_at(
+        lambda fetch: fetch.window, volume.fetch, Window(first, whole), is_leaf=lambda leaf: leaf is None
+    )
+    return with_fetch(volume, fetch)
+
+
+def read_as(volume: Volume, fetch: Fetch) -> Volume:
+    """The volume with another way to read its voxels, which are the same."""
+    return with_fetch(volume, read_by(volume.fetch, fetch))
 
 
 def with_fetch(volume: Volume, fetch: Fetch) -> Volume:

@@ -26,25 +26,52 @@ SLOPE_BITS = 10
 """Bits of a doubled slope of 8-bit voxels, an integer between -510 and 510."""
 
 
+class Window(eqx.Module):
+    """The box of a grid that is in memory. Beyond it nothing is known: there its faces are read.
+
+    - `first`: node at which the box begins. `whole`: number of nodes of the grid.
+    """
+
+    first: Int[Array, "3"]
+    whole: tuple[int, int, int] = eqx.field(static=True)
+
+
 class Fetch(eqx.Module):
-    """How voxels are read from memory."""
+    """How voxels are read from memory, where all or only a `window` of the grid is."""
+
+    window: Window | None = eqx.field(default=None, kw_only=True)
 
     @abstractmethod
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+        """The eight voxels that begin with this one of those in memory."""
+
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
+        node, fraction = self.split(data, coordinate)
+        return self.cube_at(data, node, coordinate[0].dtype), fraction
 
     def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
-        """Number of nodes of the grid, which may be more than `data` holds."""
+        """Number of nodes of the grid."""
+        if self.window is not None:
+            return self.window.whole
         nx, ny, nz = data.shape
         return nx, ny, nz
 
-    def of(self, how: "Fetch") -> "Fetch":
-        """The same voxels, read in this way."""
-        return how
+    def split(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Node, Vec3]:
+        """The node below a grid coordinate, among those in memory, and the fractions past it."""
+        node, fraction = split(coordinate, self.shape(data))
+        if self.window is None:
+            return node, fraction
+        # of integers, so that the fractions are those of the whole grid
+        i, j, k = (
+            jnp.clip(index - self.window.first[axis], 0, data.shape[axis] - 2)
+            for axis, index in enumerate(node)
+        )
+        return (i, j, k), fraction
 
     def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
-        """Index into the flattened array of the node below a grid coordinate."""
-        return flat_index(split(coordinate, data.shape)[0], data.shape)
+        """The node below a grid coordinate, as an index into the flattened array."""
+        return flat_index(self.split(data, coordinate)[0], data.shape)
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
         """The same, where slopes are asked for at one coordinate only and its node, as an index into the
@@ -56,7 +83,7 @@ class Fetch(eqx.Module):
         """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
         the nodes. That of a node is half the difference of the two voxels beside it, or at the border the
         difference between itself and the one beside it. From six cubes, unless they are stored."""
-        node, fraction = split(coordinate, data.shape)
+        node, fraction = self.split(data, coordinate)
         x, y, z = (
             interpolated(self._slopes_of_nodes(data, node, axis, coordinate[0].dtype), fraction)
             for axis in range(3)
@@ -67,9 +94,10 @@ class Fetch(eqx.Module):
         """Slopes along an axis of the eight nodes that begin with this one."""
 
         def beside(offset: int) -> Cube:
-            # of nodes, not of a coordinate moved by one, which may round to another node
-            i, j, k = ((n + offset * (a == axis)).astype(dtype) for a, n in enumerate(node))
-            return _with_first(axis, self.cube(data, (i, j, k))[0])
+            i, j, k = (
+                jnp.clip(n + offset, 0, data.shape[a] - 2) if a == axis else n for a, n in enumerate(node)
+            )
+            return _with_first(axis, self.cube_at(data, (i, j, k), dtype))
 
         def slope(whole: Bool[Array, ""], before: Scalar, after: Scalar) -> Scalar:
             return (after - before) * jnp.where(whole, 1, 0.5).astype(dtype)
@@ -83,6 +111,11 @@ class Fetch(eqx.Module):
         )
         lower, upper = jax.tree.map(partial(slope, first), a, c), jax.tree.map(partial(slope, last), b, d)
         return _with_first(axis, [lower, upper])
+
+
+def read_by(fetch: Fetch, how: Fetch) -> Fetch:
+    """The same voxels as of `fetch`, read as by `how`."""
+    return eqx.tree_at(lambda fetch: fetch.window, how, fetch.window, is_leaf=lambda leaf: leaf is None)
 
 
 def _with_first(axis: int, cube: Cube) -> Cube:
@@ -110,8 +143,8 @@ def interpolated(cube: Cube, fraction: Vec3) -> Scalar:
 class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
-    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
-        return cube_of(lambda flat: fetched(data, flat), data.shape, coordinate)
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+        return cube_of(lambda flat: fetched(data, flat), data.shape, node, dtype)
 
 
 class Packed(Fetch):
@@ -128,11 +161,9 @@ class Packed(Fetch):
     begin: Int[Array, ""] | None = None
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
-        return Packed(self.words, self.nodes, begin)
+        return Packed(self.words, self.nodes, begin, window=self.window)
 
-    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
-        dtype = coordinate[0].dtype
-        node, fraction = split(coordinate, data.shape)
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         _, ny, nz = data.shape
         base = flat_index(node, data.shape)
         bits = 8 * data.dtype.itemsize
@@ -150,13 +181,13 @@ class Packed(Fetch):
             words = self._word(flat), self._word(flat + nz)
             return [[voxel(word, 0), voxel(word, 1)] for word in words]
 
-        return [row(base), row(base + ny * nz)], fraction
+        return [row(base), row(base + ny * nz)]
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
         nodes = self.nodes
         if nodes is None:
             return super().slopes(data, coordinate)
-        node, fraction = split(coordinate, data.shape)
+        node, fraction = self.split(data, coordinate)
         base = flat_index(node, data.shape) if self.begin is None else self.begin
         dtype = coordinate[0].dtype
         _, ny, nz = data.shape
@@ -188,43 +219,6 @@ class Packed(Fetch):
         return word.astype(jnp.int32)
 
 
-class Windowed(Fetch):
-    """Reads a box of a larger grid, of which nothing else is in memory. Outside of it nothing is known: there
-    the voxels of its faces are read.
-
-    - `inside`: how the voxels of the box are read.
-    - `first`: node of the grid at which the box begins.
-    - `whole`: number of nodes of the grid.
-    """
-
-    inside: Fetch
-    first: Int[Array, "3"]
-    whole: tuple[int, int, int] = eqx.field(static=True)
-
-    def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
-        return self.whole
-
-    def of(self, how: Fetch) -> "Windowed":
-        return Windowed(how, self.first, self.whole)
-
-    def of_slopes_at(self, begin: Int[Array, ""]) -> "Windowed":
-        return self.of(self.inside.of_slopes_at(begin))
-
-    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
-        return self.inside.base(data, self._within(coordinate))
-
-    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
-        return self.inside.cube(data, self._within(coordinate))
-
-    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
-        return self.inside.slopes(data, self._within(coordinate))
-
-    def _within(self, coordinate: Vec3) -> Vec3:
-        # exact inside the box: a smaller number, and a multiple of the same unit
-        x, y, z = (c - self.first[i].astype(c.dtype) for i, c in enumerate(coordinate))
-        return x, y, z
-
-
 class Recording(Fetch):
     """Records which voxels are fetched, and adds a value to each, so that the VJP with respect to these
     values returns their cotangents.
@@ -238,16 +232,13 @@ class Recording(Fetch):
     perturbations: list[Cube]
     bases: list[Int[Array, "..."]] = eqx.field(static=True)
 
-    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         number = len(self.bases)
-        cube, fraction = cube_of(
-            lambda flat: jax.lax.stop_gradient(fetched(data, flat)), data.shape, coordinate
-        )
-        node, _ = split(coordinate, data.shape)
+        cube = cube_of(lambda flat: jax.lax.stop_gradient(fetched(data, flat)), data.shape, node, dtype)
         self.bases.append(flat_index(node, data.shape))
         if self.perturbations:
             cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
-        return cube, fraction
+        return cube
 
 
 def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
@@ -280,18 +271,14 @@ def scatter_add(
 
 
 def cube_of(
-    voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], coordinate: Vec3
-) -> tuple[Cube, Vec3]:
-    """The eight voxels around a coordinate, each by its index into the flattened array, and the fractional
-    position between them."""
-    dtype = coordinate[0].dtype
-    node, fraction = split(coordinate, shape)
+    voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], node: Node, dtype: Any
+) -> Cube:
+    """The eight voxels that begin with this one, each by its index into the flattened array."""
     _, ny, nz = shape
     base = flat_index(node, shape)
-    cube = [
+    return [
         [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
     ]
-    return cube, fraction
 
 
 def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:

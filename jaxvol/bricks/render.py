@@ -112,10 +112,18 @@ def render_bricks(
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     _check(march, transfer, lighting, method, outputs)
-    levels = levels_of(source, spacing=spacing, origin=origin, **options)
+    known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
+    levels = levels_of(source, **known, **options)
     chosen = _level(levels, level, camera, transfer, tolerance, cache)
     nothing = np.zeros((2, 2, 2), chosen.dtype)
     place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
+    if len(known) < 2:
+        if len(levels) > 1:
+            raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
+        place = (
+            part if name in known else given
+            for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
+        )
     volume = part_of(Volume(nothing, *place), jnp.zeros(3, jnp.int32), chosen.shape)
     how = compositing_of(compositing)
     scene = strong(Scene(volume, transfer, camera, march.divided(), how, lighting))

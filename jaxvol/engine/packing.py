@@ -16,7 +16,7 @@ from jaxtyping import Array, Shaped, UInt32
 from .._util.checks import is_traced
 from .._util.memo import memoized
 from .._util.voxel_fetch import SLOPE_BITS, Packed
-from ..volume import Volume, with_fetch
+from ..volume import Volume, read_as
 
 
 LIMIT = 2**30
@@ -50,7 +50,7 @@ def with_words(
     volume: Volume, words: UInt32[Array, " voxels"] | None, slopes: UInt32[Array, " voxels"] | None = None
 ) -> Volume:
     """The volume, with its packed copy where there is one, and with the slopes of its nodes."""
-    return volume if words is None else with_fetch(volume, volume.fetch.of(Packed(words, slopes)))
+    return volume if words is None else read_as(volume, Packed(words, slopes))
 
 
 @jax.jit

@@ -18,7 +18,7 @@ from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
 from ..reference import Pipeline
 from ..space import Ray
-from ..volume import with_fetch
+from ..volume import read_as
 from .segment import Samples
 from .visible_samples import Weights, samples_of, visible
 
@@ -126,9 +126,7 @@ def _chunk_vjp(
             if perturbations is None:
                 return shading.term(around.in_memory_by(number >= 0, sample), sample, shared, number), []
             record = Recording(perturbations, [])
-            here = Surroundings(
-                with_fetch(around.volume, around.volume.fetch.of(record)), around.transfer, around.space
-            )
+            here = Surroundings(read_as(around.volume, record), around.transfer, around.space)
             return shading.term(here, sample, shared, number), record.bases
 
         return jax.vmap(one)(each, eqx.combine(parts.shared, fixed_shared), perturbations)

@@ -24,7 +24,7 @@ from .._util.xla import in_memory
 from ..march import March
 from ..space import Line, Space
 from ..transfer import Classification, Measured, Transfer, classification_of
-from ..volume import Volume, with_fetch, with_voxels, without_voxels
+from ..volume import Volume, read_as, with_fetch, with_voxels, without_voxels
 
 
 T = TypeVar("T")
@@ -231,7 +231,7 @@ def lit_classification(
 
 def _plain(volume: Volume) -> Volume:
     """The volume without the packed copy of its voxels."""
-    return with_fetch(volume, volume.fetch.of(OneByOne()))
+    return read_as(volume, OneByOne())
 
 
 class Shader(NamedTuple):
