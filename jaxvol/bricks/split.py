@@ -19,9 +19,9 @@ from .ranges import reach
 EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
-STORED, MADE = 2, 8
-"""Of each voxel of a brick: copies of its own type, since the next brick is read meanwhile; and bytes for
-what is made of it, while it is made."""
+COPIES = 4.5
+"""Of each voxel of a brick: as read, and in the device; of the next brick, as read; and what finding the
+extremes of blocks takes."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,14 @@ class Margin:
     - `cells`: along each axis, on both sides: as far as cells that begin in the brick may reach, and one more
       where the gradient is read.
     - `steps`: the same in steps along a ray.
+    - `slopes`: whether the gradient is read.
     - `around`: nodes more, for interpolation, slopes, the windows of `AdaptiveSampling`, and light.
     """
 
     cells: Node
     steps: int
     around: int
+    slopes: bool
 
     @classmethod
     def of(cls, march: March, spacing: np.ndarray, segment: int, shown: Scene) -> "Margin":
@@ -53,7 +55,7 @@ class Margin:
             assert lighting.farthest_read is not None
             around += math.ceil(lighting.farthest_read / float(np.min(spacing)))
         x, y, z = (math.ceil(steps * d) + around for d in length)
-        return cls((x, y, z), steps, around)
+        return cls((x, y, z), steps, around, slopes)
 
 
 def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
@@ -63,10 +65,12 @@ def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
     return x, y, z
 
 
-def bytes_of(stored: Node, dtype: Any) -> int:
+def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
     """Memory that parts of this shape take: the one that is rendered, what is made of it, and the next
     one."""
-    return math.prod(stored) * (STORED * np.dtype(dtype).itemsize + MADE)
+    kind = np.dtype(dtype)
+    packed = (8 if kind.itemsize == 1 else 4) if margin.slopes and kind.kind in "ui" else 0
+    return math.ceil(math.prod(stored) * (COPIES * kind.itemsize + packed))
 
 
 def split(shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None) -> BrickGrid:
@@ -79,7 +83,7 @@ def split(shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalM
     while True:
         size = [_rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
         grid = BrickGrid(shape, (size[0], size[1], size[2]))
-        needed = bytes_of(stored_of(grid, margin, probe), dtype)
+        needed = bytes_of(stored_of(grid, margin, probe), dtype, margin)
         if needed <= memory:
             return grid
         longest = max(range(3), key=lambda axis: (size[axis] > min(EDGE, cells[axis])) * size[axis])

@@ -102,7 +102,7 @@ class Stream:
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
         return cls(
             *(source, marched, options, grid, margin, order, visible, straight, stored),
-            *(max(memory, bytes_of(stored, source.dtype)), method, progress),
+            *(max(memory, bytes_of(stored, source.dtype, margin)), method, progress),
         )
 
     def through(
@@ -117,12 +117,12 @@ class Stream:
         turns = self._turns(rays, living)
         load = next(turns, None)
         while load is not None:
-            voxels = load.voxels.result()
             jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
-            part = self._part(voxels, load.first)
-            del voxels
+            part, cells = self._part(load), load.cells
+            load = None  # and with it the voxels as they were read
             following = next(turns, None)
-            state = march(part, load.cells, state)
+            state = march(part, cells, state)
+            del part, cells
             living[0] = alive(state)
             if self.progress is not None:
                 self.progress(len(self.loads), int(self.visible.sum()))
@@ -138,13 +138,14 @@ class Stream:
             len(self.loads) - len(set(self.loads)),
             self.bytes_read,
             self.stored,
-            bytes_of(self.stored, self.source.dtype),
+            bytes_of(self.stored, self.source.dtype, self.margin),
         )
 
-    def _part(self, voxels: np.ndarray, first: Node) -> Volume:
+    def _part(self, load: Load) -> Volume:
+        """A part of the volume, once it is read."""
         volume = self.scene.volume
-        part = Volume(voxels, volume.spacing, volume.origin)
-        return part_of(part, jnp.asarray(first, jnp.int32), self.grid.shape)
+        part = Volume(load.voxels.result(), volume.spacing, volume.origin)
+        return part_of(part, jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
         """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the
@@ -228,7 +229,7 @@ class Stream:
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
         wanted = tuple(np.maximum(high - low + 1 + BLOCK, self.stored).tolist())
         larger = stored_shape(self.grid.shape, wanted)
-        if bytes_of(larger, self.source.dtype) > self.memory:
+        if bytes_of(larger, self.source.dtype, self.margin) > self.memory:
             return True
         self.stored = larger
         return False

@@ -39,9 +39,13 @@ class VolumeAcceleration(eqx.Module):
         cls, volume: Volume, transfer: Transfer, march: March, lighting: Lighting | None = None
     ) -> "VolumeAcceleration":
         lit_by_gradient = lighting is not None and lighting.reads_gradient
+        slopes = transfer.reads_gradient or lit_by_gradient
+        # a part of a volume is rendered once: to pack it takes longer than to fetch voxels one by one, unless
+        # six cubes of them are fetched for a sample
+        packs = slopes or volume.first is None
         return cls(
-            words_of(volume),
-            slopes_of(volume) if transfer.reads_gradient or lit_by_gradient else None,
+            words_of(volume) if packs else None,
+            slopes_of(volume) if slopes else None,
             Blocks.of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
             Windows.of(volume) if march.looks_ahead else None,
         )

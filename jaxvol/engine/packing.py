@@ -11,7 +11,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Shaped, UInt32
+from jaxtyping import Array, Int, Shaped, UInt32
 
 from .._util.checks import is_traced
 from .._util.memo import memoized
@@ -56,30 +56,37 @@ def with_words(
 @jax.jit
 def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
     bits = 8 * data.dtype.itemsize
-    unsigned = data.view(f"uint{bits}").astype(jnp.uint32)
 
-    def beside(voxels: UInt32[Array, "nx ny nz"], axis: int) -> UInt32[Array, "nx ny nz"]:
+    def plane(voxels: Shaped[Array, "ny nz"]) -> UInt32[Array, "ny nz"]:
+        unsigned = voxels.view(f"uint{bits}").astype(jnp.uint32)
         # the neighbour of the last voxel is never used
-        return jnp.roll(voxels, -1, axis)
+        words = unsigned | jnp.roll(unsigned, -1, 1) << bits
+        return words | jnp.roll(words, -1, 0) << 16 if bits == 8 else words
 
-    words = unsigned | beside(unsigned, 2) << bits
-    if bits == 8:
-        words = words | beside(words, 1) << 16
-    return words.reshape(-1)
+    # plane by plane: the neighbours of all voxels would take several times the memory of the words
+    return jax.lax.map(plane, data).reshape(-1)
 
 
 @jax.jit
 def _packed_slopes(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
-    voxels = data.astype(jnp.int32)
+    last = data.shape[0] - 1
 
-    def doubled(axis: int) -> UInt32[Array, "nx ny nz"]:
+    def doubled(voxels: Int[Array, "..."], axis: int) -> Int[Array, "..."]:
         n = voxels.shape[axis]
         rise = jnp.diff(voxels, axis=axis)
         before, after = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, n - 2), (1, n - 1)))
         ends = (2 * jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 2, n - 1)))
-        first, last = ends
-        whole = jnp.concatenate([first, before + after, last], axis)
-        return (whole & (2**SLOPE_BITS - 1)).astype(jnp.uint32)
+        first, final = ends
+        return jnp.concatenate([first, before + after, final], axis)
 
-    x, y, z = (doubled(axis) for axis in range(3))
-    return (x << (32 - SLOPE_BITS) | y << 12 | z).reshape(-1)
+    def plane(i: Int[Array, ""]) -> UInt32[Array, "ny nz"]:
+        before, here, after = (data[jnp.clip(i + step, 0, last)].astype(jnp.int32) for step in (-1, 0, 1))
+        across = (after - before) * jnp.where((i == 0) | (i == last), 2, 1)
+        x, y, z = (
+            (slope & (2**SLOPE_BITS - 1)).astype(jnp.uint32)
+            for slope in (across, doubled(here, 0), doubled(here, 1))
+        )
+        return x << (32 - SLOPE_BITS) | y << 12 | z
+
+    # plane by plane, as `_packed`
+    return jax.lax.map(plane, jnp.arange(last + 1)).reshape(-1)
