@@ -80,10 +80,11 @@ def test_blocks_beside_the_view_do_not_count():
 @pytest.mark.parametrize("parallel", [False, True])
 def test_pixels_are_those_of_the_rays(parallel):
     """The distance between the points where neighbouring rays meet the face."""
-    source = ArraySource(ball(), (0.5, 1.5, 1.0), (-3.0, 2.0, 5.0))
+    spacing, first = (0.5, 1.5, 1.0), (-3.0, 2.0, 5.0)
+    source = ArraySource(ball(), spacing, first)
     for direction in ((0, 0, 1.0), (0, -1.0, 0)):
         view = jv.Camera.looking_at(
-            jv.Volume(ball(), (0.5, 1.5, 1.0), (-3.0, 2.0, 5.0)),
+            jv.Volume(ball(), spacing, first),
             direction,
             (1, 0, 0),
             parallel=parallel,
@@ -91,7 +92,7 @@ def test_pixels_are_those_of_the_rays(parallel):
         )
         origin, along = view.ray(40.0, 30.0), view.ray(41.0, 30.0)
         axis = int(np.argmax(np.abs(direction)))
-        face = source.origin[axis] + (source.spacing[axis] * 63 if direction[axis] > 0 else 0)
+        face = first[axis] + (spacing[axis] * 63 if direction[axis] > 0 else 0)
 
         def point(ray, axis=axis, face=face):
             start, way = (np.array([float(c) for c in part]) for part in ray)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,9 +30,8 @@ WHOLE = {"config": {"write_empty_chunks": True}}
 
 
 def written(path, data, chunks=(8, 8, 16), **options):
-    array = zarr.create_array(
-        path, shape=data.shape, dtype=data.dtype, chunks=chunks, **({"zarr_format": 3} | WHOLE | options)
-    )
+    layout: dict[str, Any] = {"zarr_format": 3} | WHOLE | options
+    array = zarr.create_array(path, shape=data.shape, dtype=data.dtype, chunks=chunks, **layout)
     array[...] = data
     return path
 
@@ -257,8 +257,8 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
     assert len(found) == 3
     for number, (source, data) in enumerate(zip(found, levels, strict=True)):
         assert_reads(source, data)
-        np.testing.assert_allclose(source.spacing, np.array([0.3, 0.4, 2.0]) * 2**number)
-        np.testing.assert_allclose(source.origin, np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
+        np.testing.assert_allclose(np.array(source.spacing), np.array([0.3, 0.4, 2.0]) * 2**number)
+        np.testing.assert_allclose(np.array(source.origin), np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
         assert source.beside == tmp_path / f"image.ome.zarr.{number}"
     assert_reads(source_of(path), levels[0])
 
@@ -280,16 +280,16 @@ def test_transformations_of_all_levels_come_after_their_own(tmp_path):
     ]
     write_image(tmp_path, image | {"coordinateTransformations": outer}, "0.5")
     second = levels_of(tmp_path)[1]
-    np.testing.assert_allclose(second.spacing, (6, 8, 40))
-    np.testing.assert_allclose(second.origin, (1.5 + 1, 2 + 2, 10 + 3))
+    np.testing.assert_allclose(np.array(second.spacing), (6, 8, 40))
+    np.testing.assert_allclose(np.array(second.origin), (1.5 + 1, 2 + 2, 10 + 3))
 
 
 def test_a_users_spacing_and_origin_move_all_levels(tmp_path):
     ome_written(tmp_path, pyramid(voxels("uint8", (16, 16, 16)), 2), "0.4")
     first, second = levels_of(tmp_path, spacing=(3, 4, 10), origin=(1, 1, 1))
     assert (first.spacing, first.origin) == ((3, 4, 10), (1, 1, 1))
-    np.testing.assert_allclose(second.spacing, (6, 8, 20))
-    np.testing.assert_allclose(second.origin, (2.5, 3, 6))
+    np.testing.assert_allclose(np.array(second.spacing), (6, 8, 20))
+    np.testing.assert_allclose(np.array(second.origin), (2.5, 3, 6))
 
 
 @pytest.mark.parametrize("version", ["0.4", "0.5"])
