@@ -80,6 +80,98 @@ TABLE = "test_transfer2d.py::test_the_table_is_bilinear_and_constant_beyond_its_
 RANGES = "test_transfer2d.py::test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block"
 
 MUTATIONS = [
+    # sources of bricks
+    Mutation(
+        "files: the gap between rows is not stepped over",
+        "bricks/files.py",
+        "between = row_stride if whole_rows else row * size",
+        "between = row * size",
+        ("bricks/test_sources.py::test_raw_files_are_read_in_rows_and_in_planes[uint8-16384-4194304]",),
+    ),
+    Mutation(
+        "files: a change after opening is not noticed",
+        "bricks/files.py",
+        "return status.st_size, status.st_ino, status.st_dev, time",
+        "return (0,)",
+        ("bricks/test_sources.py::test_a_file_that_is_cut_or_changed_after_opening_is_an_error[False]",),
+    ),
+    Mutation(
+        "files: a writable memory map is taken for a file that does not change",
+        "bricks/files.py",
+        'writable=root.mode != "r"',
+        "writable=False",
+        ("bricks/test_sources.py::test_what_is_written_to_a_memory_map_is_read",),
+    ),
+    Mutation(
+        "files: a view of a memory map starts where the map does",
+        "bricks/files.py",
+        'array.__array_interface__["data"][0] - root.__array_interface__["data"][0]',
+        "0",
+        ("bricks/test_sources.py::test_views_of_memory_maps_are_read_from_the_file",),
+    ),
+    Mutation(
+        "sources: NaN in a brick is not noticed",
+        "bricks/dtypes.py",
+        "if not fine:",
+        "if False:",
+        ("bricks/test_sources.py::test_a_voxel_that_is_not_finite_is_refused_with_its_place[nan-float32]",),
+    ),
+    Mutation(
+        "zarr: missing chunks are filled silently",
+        "bricks/zarr.py",
+        '"fill_missing_data_reads": fill',
+        '"fill_missing_data_reads": True',
+        ("bricks/test_zarr.py::test_a_missing_chunk_is_an_error_unless_it_means_fill[3, sharded]",),
+    ),
+    Mutation(
+        "OME-Zarr: translations of a level are not scaled by those of all levels",
+        "bricks/ome_zarr.py",
+        "(scale * values, offset * values)",
+        "(scale * values, offset)",
+        ("bricks/test_zarr.py::test_transformations_of_all_levels_come_after_their_own",),
+    ),
+    Mutation(
+        "summary: slabs overlap by one voxel less",
+        "bricks/streaming.py",
+        "last = min(length, BLOCK * blocks + 1 + extra)",
+        "last = min(length, BLOCK * blocks + extra)",
+        ("bricks/test_summary.py::test_blocks_equal_those_of_the_volume_in_memory[uint8-(23, 18, 33)]",),
+    ),
+    Mutation(
+        "summary: slopes of slabs without a margin",
+        "bricks/streaming.py",
+        "extra = BLOCK if margin else 0",
+        "extra = 0",
+        ("bricks/test_summary.py::test_slopes_and_windows_equal_those_of_the_volume_in_memory[raw]",),
+    ),
+    Mutation(
+        "summary: a node on the face between two blocks belongs to one of them",
+        "bricks/summary.py",
+        "max(begin, (last - 1) // self.cell)",
+        "max(begin, (last - 2) // self.cell)",
+        ("bricks/test_summary.py::test_range_of_a_box_holds_its_voxels_and_no_more_than_its_blocks[4]",),
+    ),
+    Mutation(
+        "summary: a file of other data is used",
+        "bricks/summary_files.py",
+        '"data": fingerprint}',
+        '"data": {}}',
+        ("bricks/test_summary.py::test_changed_data_get_a_new_summary",),
+    ),
+    Mutation(
+        "detail: blocks outside the view count",
+        "bricks/detail.py",
+        "visible = visible & (_greatest(normal, edges) + offset >= 0)",
+        "pass",
+        ("bricks/test_detail.py::test_blocks_beside_the_view_do_not_count",),
+    ),
+    Mutation(
+        "detail: what a coarse level adds does not count",
+        "bricks/detail.py",
+        "_unmatched(transfer, *coarse, *fine)",
+        "0",
+        ("bricks/test_detail.py::test_values_that_a_level_adds_count",),
+    ),
     # shading by gradients
     Mutation(
         "slopes: of two nodes at the border, over two cells",

@@ -115,12 +115,12 @@ def range_error(
     So an error of 0 means that everything is there within a block of its place: a thin vessel that averaging
     has dimmed counts, a surface that has moved by less than a block does not. It is no bound of the
     difference of two images. Ranges of blocks that only overlap a block count as its own, which forgives
-    displacements of up to a block. 1 if the transfer function tells nothing about its variation (such as one
-    that reads the gradient).
+    displacements of up to a block. 1 for a transfer function that reads the gradient, of which ranges of
+    values tell nothing, and where it tells nothing of its variation.
     """
     fine, coarse = ((levels[k], summaries[k]) for k in (0, level))
-    if level == 0:
-        return 0.0
+    if level == 0 or transfer.reads_gradient:
+        return float(level > 0)
     e = max(_unmatched(transfer, *fine, *coarse), _unmatched(transfer, *coarse, *fine))
     thickness = summaries[0].cell * max(_known(levels[0].spacing))
     return float(-np.expm1(-e * thickness))

@@ -46,8 +46,12 @@ def converted(voxels: np.ndarray, box: Box, what: str) -> np.ndarray:
             )
     with np.errstate(over="ignore"):  # overflow to infinity is rejected below
         voxels = np.ascontiguousarray(voxels, dtype)
-    # the extremes are NaN or infinite if any voxel is; unlike a mask, they take no memory
-    if dtype.kind not in "iu" and not np.isfinite(np.float64(voxels.min()) + np.float64(voxels.max())):
+    if dtype.kind in "iu":
+        return voxels
+    with np.errstate(invalid="ignore"):
+        # the extremes are NaN or infinite if any voxel is; unlike a mask, they take no memory
+        fine = np.isfinite(np.float64(voxels.min())) and np.isfinite(np.float64(voxels.max()))
+    if not fine:
         wrong = ~(abs(voxels) < np.inf)
         first = np.unravel_index(np.argmax(wrong), voxels.shape)
         place = tuple(int(i) + start for i, start in zip(first, box[0], strict=True))

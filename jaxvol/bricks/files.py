@@ -117,7 +117,7 @@ class FileSource(VoxelSource):
         run = (rows - 1) * row_stride + row * size if whole_rows else rows * row * size
         between = row_stride if whole_rows else row * size
         together = max(1, min(count, AT_ONCE // run))
-        buffer = np.empty((together, run), np.uint8)
+        buffer = memoryview(bytearray(together * run))
         voxels = np.empty(np.subtract(high, low), self._type.newbyteorder("="))
         ordered = voxels.transpose(order)
         with self._opened() as file:
@@ -125,14 +125,16 @@ class FileSource(VoxelSource):
                 planes = min(together, count - begin)
                 for plane in range(planes):
                     at = self._start + (first + begin + plane) * plane_stride + b * row_stride + c * size
+                    part = buffer[plane * run : (plane + 1) * run]
                     if whole_rows:
-                        self._fill(file, at, memoryview(buffer[plane]))
+                        self._fill(file, at, part)
                         continue
                     for number in range(rows):
-                        part = buffer[plane, number * between : (number + 1) * between]
-                        self._fill(file, at + number * row_stride, memoryview(part))
+                        self._fill(
+                            file, at + number * row_stride, part[number * between : (number + 1) * between]
+                        )
                 ordered[begin : begin + planes] = np.ndarray(
-                    (planes, rows, row), self._type, memoryview(buffer), 0, (run, between, size)
+                    (planes, rows, row), self._type, buffer, 0, (run, between, size)
                 )
         return voxels
 

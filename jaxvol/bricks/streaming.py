@@ -111,7 +111,7 @@ def _axis(source: VoxelSource) -> int:
 def _extent(source: VoxelSource, axis: int, memory: int, margin: bool) -> list[int]:
     """Voxels of a slab along each axis: multiples of BLOCK, and of chunks where memory allows."""
     steps = [-(-c // BLOCK) * BLOCK for c in source.chunks]
-    wide = 2 * BLOCK if margin else 1
+    wide = 3 * BLOCK if margin else BLOCK  # what a slab has of its neighbours
 
     def cost(extent: list[int]) -> int:
         x, y, z = (min(e + wide, n) for e, n in zip(extent, source.shape, strict=True))

@@ -9,6 +9,7 @@ import json
 import os
 import tempfile
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,11 +97,15 @@ def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> 
     arrays = {
         name: part if part.dtype.kind in "iuf" else part.view(np.uint16) for name, part in ranges.items()
     }
+    arrays["about"] = told
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, part = tempfile.mkstemp(prefix=f"{path.name}.", suffix=".part", dir=path.parent)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            np.savez(file, about=told, **arrays)
+            with zipfile.ZipFile(file, "w") as archive:
+                for name, array in arrays.items():
+                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                        np.lib.format.write_array(member, array, allow_pickle=False)
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
