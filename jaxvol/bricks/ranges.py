@@ -18,6 +18,7 @@ from .._util.vec3 import Scalar, Vec3
 from ..engine.batch import CellRange
 from ..engine.rays import vmap_rays
 from ..march import RUN, March
+from ..reference import Progress
 from ..space import Ray, Straight, slab_interval
 from .grid import BrickGrid
 
@@ -100,26 +101,32 @@ def of_curved(
     grid: BrickGrid,
     march: March,
     rays: Ray,
-    alive: Bool[Array, "*rays"],
+    at: Progress,
     reached: Int[Array, "*rays"],
     turn: Turn,
     beyond: int,
 ) -> Found:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other. `reached`: to
-    which each has come. `beyond`: steps before and behind its cells that `low` and `high` are to hold,
-    too."""
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other. `at`: where the
+    march has come to; `reached`: to which cell of each ray its bricks have been found. `beyond`: steps before
+    and behind its cells that `low` and `high` are to hold, too."""
+    alive = ~at.finished
+    # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
+    # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
+    offsets = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
+    if march.quadrature != "left":
+        offsets = [offset + half for offset in offsets for half in (0, 0.5)]
 
-    def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "cells *rays"], Scalar]:
-        depth = index.astype(rays.length.dtype) * march.step
-        each = jax.vmap(vmap_rays(lambda ray, s: (ray.path(s), ~ray.in_gap(s))), in_axes=(None, 0))
-        coordinate, inside = each(rays, depth)
-        return coordinate, inside & (depth < rays.length), depth
+    def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
+        depth = jnp.stack([(offset + index.astype(offset.dtype)) * march.step for offset in offsets])
+        one = vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))
+        return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
 
-    def bricks(
-        index: Int[Array, "cells *rays"],
-    ) -> tuple[Int[Array, "cells *rays"], Bool[Array, "cells *rays"]]:
-        coordinate, inside, depth = points(index)
-        return jnp.where(inside, grid.brick_of(coordinate), grid.number), depth < rays.length
+    def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
+        coordinate, inside = points(index)
+        return jnp.where(inside, grid.brick_of(coordinate), grid.number)
+
+    def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
+        return index.astype(rays.length.dtype) * march.step < rays.length + march.step
 
     number = jnp.arange(CHUNK)[:, None, None]
 
@@ -129,11 +136,11 @@ def of_curved(
 
         def more(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             index, last, going = state
-            at, inside = bricks(index[None] + number)
-            passed = jnp.cumprod((allowed[at] & inside).astype(jnp.int32), axis=0) > 0
-            last = jnp.maximum(
-                last, jnp.max(jnp.where(passed & ~turn.empty[at] & going, index + number + 1, 0), axis=0)
-            )
+            at = bricks(index[None] + number)
+            stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
+            passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
+            seen = passed & jnp.any(~turn.empty[at], axis=0) & going
+            last = jnp.maximum(last, jnp.max(jnp.where(seen, index + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
             return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
 
@@ -142,18 +149,21 @@ def of_curved(
         return index, last
 
     first, _ = while_in(turn.over, reached, alive)
-    here, inside = bricks(first[None])
-    mine = alive & (here[0] == turn.brick) & inside[0]
+    here = jnp.any(bricks(first[None])[:, 0] == turn.brick, axis=0)
+    # where its points lie in several bricks, the first one to have its turn takes the cell
+    mine = alive & here & ahead(first)
     _, until = while_in(turn.through, first, mine)
+    until = jnp.maximum(until, first + 1)
     cells = CellRange(jnp.where(mine, first, 0), jnp.where(mine, until, 0))
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         index, low, high = state
-        coordinate, inside, _ = points(index[None] + number)
-        inside &= mine & (index[None] + number <= until + beyond) & (index[None] + number >= 0)
+        index_ = index[None] + number
+        coordinate, inside = points(index_)
+        inside &= mine & (index_ <= until + beyond) & (index_ >= 0)
         point = jnp.stack(coordinate)
-        low = jnp.minimum(low, jnp.min(jnp.where(inside, point, jnp.inf), axis=(1, 2, 3)))
-        high = jnp.maximum(high, jnp.max(jnp.where(inside, point, -jnp.inf), axis=(1, 2, 3)))
+        low = jnp.minimum(low, jnp.min(jnp.where(inside, point, jnp.inf), axis=(1, 2, 3, 4)))
+        high = jnp.maximum(high, jnp.max(jnp.where(inside, point, -jnp.inf), axis=(1, 2, 3, 4)))
         return index + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)

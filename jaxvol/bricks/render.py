@@ -183,7 +183,7 @@ def _image(scene: Scene, job: _Job) -> Rendering:
         return after, pixels
 
     underway = _set_out(marched, options)
-    state = stream.through(underway.rays, (underway, None), lambda state: state[0].alive, march_brick)
+    state = stream.through(underway.rays, (underway, None), lambda state: state[0].at, march_brick)
     underway, pixels = state
     if naive:  # rays go back, and have no end
         underway = Underway(underway.rays, with_fields(underway.at, finished=underway.at.index >= 0))
@@ -237,7 +237,7 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _
         return _pull_part(here, perturbed, options_, acceleration, pulled, cells)
 
     pulled = _start_pull(scene, perturbed, options, rendering, whole)
-    pulled = stream.through(pulled.underway.rays, pulled, lambda state: state.underway.alive, pull_brick)
+    pulled = stream.through(pulled.underway.rays, pulled, lambda state: state.underway.at, pull_brick)
     found = _end_pull(scene, perturbed, options, pulled, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 

@@ -17,6 +17,7 @@ from ..engine.image import RenderOptions
 from ..engine.scene import Scene
 from ..march import March
 from ..occupancy import BLOCK, Blocks, widened as with_slack
+from ..reference import Progress
 from ..rendering import BrickReport
 from ..space import Ray, Space
 from ..transforms import ToroidalMap
@@ -109,11 +110,11 @@ class Stream:
         self,
         rays: Ray,
         state: State,
-        alive: Callable[[State], Bool[Array, "*rays"]],
+        where: Callable[[State], Progress],
         march: Callable[[Volume, CellRange, State], State],
     ) -> State:
         """The state after `march(part, cells, state)` of all bricks."""
-        living = [alive(state)]
+        living = [where(state)]
         turns = self._turns(rays, living)
         load = next(turns, None)
         while load is not None:
@@ -123,7 +124,7 @@ class Stream:
             following = next(turns, None)
             state = march(part, cells, state)
             del part, cells
-            living[0] = alive(state)
+            living[0] = where(state)
             if self.progress is not None:
                 self.progress(len(self.loads), int(self.visible.sum()))
             load = following
@@ -147,7 +148,7 @@ class Stream:
         part = Volume(load.voxels.result(), volume.spacing, volume.origin)
         return part_of(part, jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
-    def _turns(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
+    def _turns(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:
         """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the
         newest answer."""
         if self.method == "naive":
@@ -158,7 +159,7 @@ class Stream:
                 if not self.visible[brick]:
                     continue
                 turn = self._turn(brick, {brick})
-                cells, any_ = _cells_of_straight(self.grid, self.scene.march, rays, living[0], turn)
+                cells, any_ = _cells_of_straight(self.grid, self.scene.march, rays, living[0].finished, turn)
                 if any_:
                     yield self._load(brick, cells, *self._around(brick))
             return
@@ -176,9 +177,9 @@ class Stream:
                 if found is not None:
                     going, reached = True, found.reached
                     yield self._load(brick, widened(found.cells), *self._box(found))
-            going &= self.method == "reload" or bool(jnp.any(living[0]))
+            going &= self.method == "reload" or not bool(jnp.all(living[0].finished))
 
-    def _alone(self, rays: Ray, living: list[Bool[Array, "*rays"]]) -> Iterator[Load]:
+    def _alone(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:
         """Each brick with all its cells of each ray, whatever other bricks the ray meets between them."""
         nowhere = np.append(np.ones(self.grid.number, bool), True)
         for brick in self.order:
@@ -206,10 +207,10 @@ class Stream:
             jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(through_), jnp.asarray(empty)
         )
 
-    def _found(self, brick: int, through: set[int], rays: Ray, alive: Array, reached: Array) -> Found | None:
+    def _found(self, brick: int, through: set[int], rays: Ray, at: Progress, reached: Array) -> Found | None:
         beyond = self.margin.steps
         found = _cells_of_curved(
-            self.grid, beyond, self.scene.march, rays, alive, reached, self._turn(brick, through)
+            self.grid, beyond, self.scene.march, rays, at, reached, self._turn(brick, through)
         )
         return found if bool(found.any) else None
 
@@ -263,18 +264,18 @@ def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
 
 
 def _straight(
-    grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn
+    grid: BrickGrid, march: March, rays: Ray, finished: Bool[Array, "*rays"], turn: Turn
 ) -> tuple[CellRange, Bool[Array, ""]]:
-    cells = of_straight(grid, march, rays, alive, turn)
+    cells = of_straight(grid, march, rays, ~finished, turn)
     return cells, jnp.any(cells.until > cells.first)
 
 
 def _curved(
-    grid: BrickGrid, beyond: int, march: March, rays: Ray, alive: Array, reached: Array, turn: Turn
+    grid: BrickGrid, beyond: int, march: March, rays: Ray, at: Progress, reached: Array, turn: Turn
 ) -> Found:
     """By beams of rays, as many as are looked at at a time."""
     shape = rays.length.shape
-    by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), (rays, alive, reached))
+    by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), (rays, at, reached))
     found = jax.lax.map(lambda each: of_curved(grid, march, *each, turn, beyond), by_beam, batch_size=BEAMS)
     cells, at = jax.tree.map(lambda leaf: leaf.reshape(shape), (found.cells, found.reached))
     return Found(cells, at, jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any))
