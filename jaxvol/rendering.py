@@ -1,6 +1,6 @@
 """What does a render return?"""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import finite, is_traced
 from ._util.trees import PyTree
+
+
+T = TypeVar("T")
 
 
 class BrickReport(NamedTuple):
@@ -100,7 +103,7 @@ class Rendering(eqx.Module):
     def bricks(self) -> BrickReport:
         return self._detail("bricks", self.details.bricks, "render it by render_bricks, and ")
 
-    def _detail(self, name: str, value: Array | None, more: str = "") -> Array:
+    def _detail(self, name: str, value: T | None, more: str = "") -> T:
         if value is None:
             how = f'{more}pass outputs="all" to compute it'
             raise AttributeError(f"{name} is not part of this rendering: {how}.")

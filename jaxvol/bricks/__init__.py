@@ -1,8 +1,8 @@
 """Volumes that need not fit into memory, on disk or in the memory of the host.
 
 `jaxvol.render_bricks` renders them, brick by brick. Here is what it uses: sources, from which boxes of voxels
-are read (`source_of`, `levels_of`); their summaries, which tell what is empty (`summary_of`); levels of detail
-(`level_for`); and the overlap of bricks with curved faces (`overlap_of`).
+are read (`source_of`, `levels_of`); their summaries, which tell what is empty (`summary_of`); levels of
+detail (`level_for`); and the overlap of bricks with curved faces (`overlap_of`).
 """
 
 from .detail import level_for as level_for, range_error as range_error

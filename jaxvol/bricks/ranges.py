@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Vec3
 from ..engine.batch import CellRange
 from ..engine.rays import vmap_rays
 from ..march import RUN, March
@@ -117,7 +117,7 @@ def of_curved(
         offsets = [offset + half for offset in offsets for half in (0, 0.5)]
 
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
-        depth = jnp.stack([(offset + index.astype(offset.dtype)) * march.step for offset in offsets])
+        depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
         one = vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))
         return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
 
@@ -126,7 +126,9 @@ def of_curved(
         return jnp.where(inside, grid.brick_of(coordinate), grid.number)
 
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
-        return index.astype(rays.length.dtype) * march.step < rays.length + march.step
+        return jax.vmap(
+            lambda index: index.astype(rays.length.dtype) * march.step < rays.length + march.step
+        )(index)
 
     number = jnp.arange(CHUNK)[:, None, None]
 
@@ -139,8 +141,8 @@ def of_curved(
             at = bricks(index[None] + number)
             stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
             passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
-            seen = passed & jnp.any(~turn.empty[at], axis=0) & going
-            last = jnp.maximum(last, jnp.max(jnp.where(seen, index + number + 1, 0), axis=0))
+            seen = passed & jnp.any(~turn.empty[at], axis=0) & going[None]
+            last = jnp.maximum(last, jnp.max(jnp.where(seen, index[None] + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
             return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
 
@@ -151,7 +153,7 @@ def of_curved(
     first, _ = while_in(turn.over, reached, alive)
     here = jnp.any(bricks(first[None])[:, 0] == turn.brick, axis=0)
     # where its points lie in several bricks, the first one to have its turn takes the cell
-    mine = alive & here & ahead(first)
+    mine = alive & here & ahead(first[None])[0]
     _, until = while_in(turn.through, first, mine)
     until = jnp.maximum(until, first + 1)
     cells = CellRange(jnp.where(mine, first, 0), jnp.where(mine, until, 0))
@@ -160,10 +162,10 @@ def of_curved(
         index, low, high = state
         index_ = index[None] + number
         coordinate, inside = points(index_)
-        inside &= mine & (index_ <= until + beyond) & (index_ >= 0)
+        inside &= (mine[None] & (index_ <= (until + beyond)[None]) & (index_ >= 0))[None]
         point = jnp.stack(coordinate)
-        low = jnp.minimum(low, jnp.min(jnp.where(inside, point, jnp.inf), axis=(1, 2, 3, 4)))
-        high = jnp.maximum(high, jnp.max(jnp.where(inside, point, -jnp.inf), axis=(1, 2, 3, 4)))
+        low = jnp.minimum(low, jnp.min(jnp.where(inside[None], point, jnp.inf), axis=(1, 2, 3, 4)))
+        high = jnp.maximum(high, jnp.max(jnp.where(inside[None], point, -jnp.inf), axis=(1, 2, 3, 4)))
         return index + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)

@@ -10,7 +10,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from ..march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
@@ -33,11 +33,6 @@ class Underway(eqx.Module):
 
     rays: Ray
     at: Progress
-
-    @property
-    def alive(self) -> Array:
-        """Which rays may still see more."""
-        return ~self.at.finished
 
 
 def set_out(scene: Scene, options: RenderOptions) -> Underway:
@@ -73,21 +68,27 @@ def march_part(
         beams = Beams(rays, tiles.beam_count, tiles.box(scene.source, rays, number), range_)
         start = at
         if anew:
-            seen = stopped(pipeline, at.composite) | (range_.until <= range_.first)
+            seen = opaque(pipeline, at) | (range_.until <= range_.first)
             start = with_fields(at, index=range_.first, finished=seen)
         after, _ = march_rays(
             pipeline, index, beams, options.tiling, options.outputs, resumed=start, exact=anew
         )
         # where marched anew, a ray may go back
-        over = stopped(pipeline, after.composite) if anew else at.finished | ended(pipeline, rays, after)
+        over = opaque(pipeline, after) if anew else at.finished | ended(pipeline, rays, after)
         return Underway(rays, with_fields(after, finished=over))
 
     return jax.lax.map(one, (jnp.arange(tiles.number), underway, ranges))
 
 
-def ended(pipeline: Pipeline, rays: Ray, at: Progress) -> Array:
+def ended(pipeline: Pipeline, rays: Ray, at: Progress) -> Bool[Array, "groups rays"]:
     """Which rays need no other cell, wherever it lies."""
-    return (front(pipeline.march, at) >= rays.length) | stopped(pipeline, at.composite)
+    past = vmap_rays(lambda ray, at: front(pipeline.march, at) >= ray.length)(rays, at)
+    return past | opaque(pipeline, at)
+
+
+def opaque(pipeline: Pipeline, at: Progress) -> Bool[Array, "groups rays"]:
+    """Which rays are stopped by what lies in front."""
+    return vmap_rays(partial(stopped, pipeline))(at.composite)
 
 
 def resolve_part(
