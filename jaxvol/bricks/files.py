@@ -33,8 +33,6 @@ AT_ONCE = 2**22
 
 AGAIN = "Open it again."
 
-MOST_VOXELS = 2**48
-
 SAMPLES, SAMPLE = 64, 2**12
 """Pieces of a file that its fingerprint reads, and bytes of each."""
 
@@ -176,7 +174,7 @@ def raw(
             f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: "
             f"gunzip {path}."
         )
-    (nx, ny, nz), stored, fields = raw_header(path, Header(shape, dtype), MOST_VOXELS)
+    (nx, ny, nz), stored, fields = raw_header(path, Header(shape, dtype), 48)
     check_size(path, file_size(path), nx * ny * nz * stored.itemsize)
     spacing, origin = (
         triple(name, fields.get(name)) if given is None else given

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .._util.files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, read_all
+from .._util.files import Header, as_array, check_size, decoding, file_size, read_all
 
 
 JSON_KEYS = {"size": "shape", "type": "dtype", "spacing": "spacing", "origin": "origin"}
@@ -24,7 +24,7 @@ RAW_DTYPE = re.compile(r"(u?int8|u?int16|float16|float32|float64)(le|be)?", re.I
 def read_raw(path: Path, header: Header) -> dict[str, Any]:
     """Reader for `.raw` and `.raw.gz`, x fastest."""
     size = file_size(path)
-    shape, dtype, fields = raw_header(path, header, MOST_VOXELS)
+    shape, dtype, fields = raw_header(path, header, 31)  # Volume's own limit
     expected = math.prod(shape) * dtype.itemsize
     if path.name.lower().endswith(".gz"):
         # the size in gzip's trailer is unverified and modulo 2**32: only decompressing tells
@@ -38,9 +38,9 @@ def read_raw(path: Path, header: Header) -> dict[str, Any]:
 
 
 def raw_header(
-    path: Path, header: Header, most: int
+    path: Path, header: Header, bits: int
 ) -> tuple[tuple[int, int, int], np.dtype, dict[str, Any]]:
-    """Shape (nx, ny, nz) with at most `most` voxels, stored type, and spacing and origin where they are
+    """Shape (nx, ny, nz) with less than 2**`bits` voxels, stored type, and spacing and origin where they are
     known, of a raw file: as given by the caller, else by a JSON file beside it, else by its name."""
     given = {name: value for name, value in header._asdict().items() if value is not None}
     fields = _name_header(path) | _json_header(path) | given
@@ -50,7 +50,7 @@ def raw_header(
             f'dtype="uint8"), or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
             '{"size": [nx, ny, nz], "type": "uint8"}.'
         )
-    return _raw_shape(path, fields.pop("shape"), most), _raw_dtype(path, fields.pop("dtype")), fields
+    return _raw_shape(path, fields.pop("shape"), bits), _raw_dtype(path, fields.pop("dtype")), fields
 
 
 def _name_header(path: Path) -> dict[str, Any]:
@@ -75,15 +75,15 @@ def _json_header(path: Path) -> dict[str, Any]:
     return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
 
 
-def _raw_shape(path: Path, shape: Any, most: int) -> tuple[int, int, int]:
+def _raw_shape(path: Path, shape: Any, bits: int) -> tuple[int, int, int]:
     try:
         sizes = tuple(map(operator.index, shape))
     except TypeError:
         sizes = ()
-    if len(sizes) != 3 or min(sizes) < 1 or math.prod(sizes) > most:
+    if len(sizes) != 3 or min(sizes) < 1 or math.prod(sizes) >= 2**bits:
         raise ValueError(
-            f"shape must be three positive integers (nx, ny, nz) with a product of at most {most}; "
-            f"got {shape!r} for {path}."
+            "shape must be three positive integers (nx, ny, nz) with a product less than "
+            f"2**{bits}; got {shape!r} for {path}."
         )
     nx, ny, nz = sizes
     return nx, ny, nz
