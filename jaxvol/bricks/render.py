@@ -16,7 +16,7 @@ from ..arguments import check_arguments
 from ..camera import Camera
 from ..compositing import Compositing
 from ..engine.acceleration import VolumeAcceleration
-from ..engine.batch import CellRange, with_fields
+from ..engine.batch import CellRange
 from ..engine.driver import Asked
 from ..engine.gradients import of_all_outputs, of_perturbed
 from ..engine.image import RenderOptions
@@ -185,8 +185,6 @@ def _image(scene: Scene, job: _Job) -> Rendering:
     underway = _set_out(marched, options)
     state = stream.through(underway.rays, (underway, None), lambda state: state[0].at, march_brick)
     underway, pixels = state
-    if naive:  # rays go back, and have no end
-        underway = Underway(underway.rays, with_fields(underway.at, finished=underway.at.index >= 0))
     rendering = _arrive(marched, options, underway)
     if not mode.resolves:
         return rendering

@@ -122,4 +122,8 @@ def _assembled(scene: Scene, march: March, tiles: RayTiles, underway: Underway) 
 
 def arrive(scene: Scene, options: RenderOptions, underway: Underway) -> Rendering:
     """The image of rays that have passed all parts."""
+    at = underway.at
+    # nothing lies behind the last part, whether or not a ray went on to its end
+    over = at.finished | (at.index < scene.march.most_samples)
+    underway = Underway(underway.rays, with_fields(at, finished=over))
     return _assembled(scene, scene.march, RayTiles.of(scene.source, options.tiling), underway)
