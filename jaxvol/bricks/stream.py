@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool
 
 from .._util.vec3 import apart
 from .._util.xla import compiled
+from ..camera import Camera
 from ..engine.batch import CellRange
 from ..engine.image import RenderOptions
 from ..engine.scene import Scene
@@ -100,6 +101,7 @@ class Stream:
             x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
         stored = stored_of(grid, margin, probe)
+        assert isinstance(marched.source, Camera)
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
         return cls(
             *(source, marched, options, grid, margin, order, visible, straight, stored),
@@ -259,7 +261,8 @@ def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
     corners = [grid.cells(brick) for brick in range(grid.number)]
     ranges = np.array([summary.range_of(low, [end + 1 for end in high]) for low, high in corners])
     low, high = (jnp.asarray(end.reshape(grid.counts), jnp.float32) for end in ranges.T)
-    blocks = Blocks(*with_slack(low, high), None)
+    low, high = with_slack(low, high)
+    blocks = Blocks(low, high, None)
     return np.asarray(scene.compositing.occupied(scene.transfer, blocks)).reshape(-1)
 
 
@@ -276,9 +279,14 @@ def _curved(
     """By beams of rays, as many as are looked at at a time."""
     shape = rays.length.shape
     by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), (rays, at, reached))
-    found = jax.lax.map(lambda each: of_curved(grid, march, *each, turn, beyond), by_beam, batch_size=BEAMS)
-    cells, at = jax.tree.map(lambda leaf: leaf.reshape(shape), (found.cells, found.reached))
-    return Found(cells, at, jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any))
+
+    def some(each: tuple[Ray, Progress, Array]) -> Found:
+        rays, at, reached = each
+        return of_curved(grid, march, rays, at, reached, turn, beyond)
+
+    found = jax.lax.map(some, by_beam, batch_size=BEAMS)
+    cells, reached = jax.tree.map(lambda leaf: leaf.reshape(shape), (found.cells, found.reached))
+    return Found(cells, reached, jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any))
 
 
 _cells_of_straight = compiled(_straight)

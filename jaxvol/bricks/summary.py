@@ -93,7 +93,8 @@ class Summary:
         if not self.has(WINDOWS):
             raise ValueError("this summary has no windows; ask for them: summary_of(source, windows=True).")
         found = self._of_box(low, high, WINDOWS)
-        return Windows(*(jnp.asarray(found[name]) for name in WINDOWS))
+        low_, high_, bend = (jnp.asarray(found[name]) for name in WINDOWS)
+        return Windows(low_, high_, bend)
 
     def _of_box(
         self, low: Corner | None, high: Corner | None, kinds: dict[str, Any]

@@ -53,7 +53,8 @@ def start_pull(
         return underway, given, replay.carry, replay.sums
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    return Pulled(*jax.lax.map(one, (jnp.arange(image.tiles.number), *parts)), sums)
+    underway, given, carry, of_rays = jax.lax.map(one, (jnp.arange(image.tiles.number), *parts))
+    return Pulled(underway, given, carry, of_rays, sums)
 
 
 def pull_part(
@@ -81,8 +82,8 @@ def pull_part(
 
     numbers = jnp.arange(image.tiles.number)
     every = numbers, pulled.underway, pulled.given, pulled.carry, pulled.of_rays, ranges
-    sums, rays = jax.lax.scan(one, pulled.sums, every)
-    return Pulled(*rays, sums)
+    sums, (underway, given, carry, of_rays) = jax.lax.scan(one, pulled.sums, every)
+    return Pulled(underway, given, carry, of_rays, sums)
 
 
 def end_pull(
