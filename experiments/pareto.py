@@ -7,10 +7,10 @@ ratio to the base, times the base's median time over the whole scene. Errors are
 white against a converged image, whose own error is estimated (`pareto_reference`).
 
 What is finished is kept in the folder `pareto/` of the output, and is not measured again by the same command
-unless commit, sources or options differ; Ctrl-C loses one method of one scene. `--scene` measures some scenes
-anew and keeps what the record says of the others, which tells for each scene from which commit it is. `--point`
-renders one point of one scene again, times it and saves its picture beside its error. The record is `pareto.json`, the chart
-`pareto.png`, the page `pareto.html` (see `pareto_page`).
+unless commit, sources or options differ; Ctrl-C loses one method of one scene. `--scene` measures some
+scenes anew and keeps what the record says of the others, with the commit that they are of. `--point` renders
+one point of one scene again, times it and saves its picture beside its error. The record is `pareto.json`,
+the chart `pareto.png`, the page `pareto.html` (see `pareto_page`).
 
 Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
 distance to our image, up to 3 / 255, is that and not an error.

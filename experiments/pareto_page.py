@@ -1,7 +1,8 @@
 """Writes the page of a `pareto` record: one HTML file without network, with the picture behind each point.
 
-It is made from the record and the small pictures beside it alone; nothing is measured. Of scenes whose pictures
-are not there, those of the page that is replaced are taken. `pareto_page.html` is the page without its data.
+It is made from the record and the small pictures beside it alone; nothing is measured. Where pictures of a
+scene are not there, those of the page that is replaced are taken. `pareto_page.html` is the page without its
+data.
 """
 
 import base64
@@ -37,7 +38,10 @@ def write(path: Path, pictures: Path, page: Path) -> Path:
         "summary": result["summary"],
         "peers": result["peers"],
         "repetitions": result["repetitions"],
-        "scenes": [scene(name, each, pictures / slug(name), earlier.get(name, {})) for name, each in result["scenes"].items()],
+        "scenes": [
+            scene(name, each, pictures / slug(name), earlier.get(name, {}))
+            for name, each in result["scenes"].items()
+        ],
     }
     # "</script>" in a string would end the script
     text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
