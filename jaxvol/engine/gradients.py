@@ -69,11 +69,13 @@ class _Sums(NamedTuple):
 class _Image(NamedTuple):
     """What the tiles of an image share.
 
-    `pipeline`: without lighting, since samples are shaded by `shader`.
+    `pipeline`: without lighting, since samples are pulled back through `shader`. `lit`: what rays are marched
+    through: with lighting if that is inline, so that invisible samples have their light, too.
     """
 
     scene: Scene
     pipeline: Pipeline
+    lit: Pipeline
     fetch: Fetch
     empty_space: EmptySpaceIndex | None
     shader: Shader | None
@@ -103,7 +105,7 @@ class _Image(NamedTuple):
             *(sums.total, self.shader, self.tiling),
         )
         beams = Beams(rays, self.tiles.beam_count, self.tiles.box(source, rays, number), range_)
-        _, (_, of_rays, total) = march_rays(self.pipeline, self.empty_space, beams, self.tiling, None, replay)
+        _, (_, of_rays, total) = march_rays(self.lit, self.empty_space, beams, self.tiling, None, replay)
         if not total.geometric:
             return _Sums(total, sums.source)
         if cotangent.details.depth is not None:
@@ -138,7 +140,11 @@ def _vjp_by_tiles(
     shader, pull_shader = None, None
     if lighting is not None:
         shader, pull_shader = _shader_of(scene, packed.volume, voxels=of_voxels)
-    image = _Image(*(scene, pipeline, packed.volume.fetch, index, shader, fault_of(scene), tiles, tiling))
+    lit = pipeline
+    if shader is not None and shader.shading.inline:
+        lit = pipeline._replace(classification=pipeline.classification._replace(light=shader))
+    fetch = packed.volume.fetch
+    image = _Image(*(scene, pipeline, lit, fetch, index, shader, fault_of(scene), tiles, tiling))
     of_transfer = any(jax.tree.leaves(perturbed.transfer))
     sums = _Sums(
         Total.zeros(scene, shader, transfer=of_transfer, geometric=geometric, voxels=of_voxels),
