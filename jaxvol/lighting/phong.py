@@ -38,7 +38,8 @@ class Phong(Lighting):
     (`experiments/stability.py`, "normals in noise").
 
     Gradients of light, material, transfer function, camera and volume are those of this formula, also by an
-    extinction of 0: invisible samples are lit, too. They grow without bound as the volume's gradient falls to 0; where it is 0, and where a normal turns from one side to the other, they
+    extinction of 0, where samples are lit although they are invisible. They grow without bound as the
+    volume's gradient falls to 0; where it is 0, and where a normal turns from one side to the other, they
     miss a jump.
 
     **Arguments:**
