@@ -7,9 +7,10 @@ ratio to the base, times the base's median time over the whole scene. Errors are
 white against a converged image, whose own error is estimated (`pareto_reference`).
 
 What is finished is kept in the folder `pareto/` of the output, and is not measured again by the same command
-unless commit, sources or options differ; Ctrl-C loses one method of one scene. `--point` renders one point of
-one scene again, times it and saves its picture beside its error. The record is `pareto.json`, the chart
-`pareto.png`, the page `pareto.html` (see `pareto_page`).
+unless commit, sources or options differ; Ctrl-C loses one method of one scene. `--scene` measures some
+scenes anew and keeps what the record says of the others, with the commit that they are of. `--point` renders
+one point of one scene again, times it and saves its picture beside its error. The record is `pareto.json`,
+the chart `pareto.png`, the page `pareto.html` (see `pareto_page`).
 
 Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
 distance to our image, up to 3 / 255, is that and not an error.
@@ -28,7 +29,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common, pareto_chart, pareto_measure, pareto_page, pareto_points
+from . import common, pareto_chart, pareto_measure, pareto_page, pareto_points, record
 from .accuracy import DRJIT, VTK
 from .pareto_front import behind, front
 from .pareto_measure import Sizes, Store, slug
@@ -113,6 +114,20 @@ def summary(scenes: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def recorded(chosen: Namespace) -> dict[str, Any]:
+    """What the record at the output says of the scenes that are not chosen, with the commit and the command
+    that measured them; nothing if its sizes are others."""
+    path = chosen.output / "pareto.json"
+    if chosen.quick or not path.is_file():
+        return {}
+    found = record.read(path)
+    result, made = found["result"], {"commit": found["commit"], "command": found["command"]}
+    sizes = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
+    if any(result[name] != size for name, size in sizes.items()) or found["seed"] != chosen.seed:
+        return {}
+    return {n: {"measured": made, **scene} for n, scene in result["scenes"].items() if n not in chosen.scene}
+
+
 def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, str]) -> dict[str, Any]:
     """Renders and times a point, in turn with the base, and saves its picture; nothing else is changed."""
     row = ROWS[name]
@@ -171,7 +186,11 @@ def main(chosen: Namespace) -> common.Answer | None:
         kept = pareto_measure.scene(
             name, folder / slug(name), sizes, present, few if chosen.quick else dict, say
         )
-        scenes[name] = concluded(name, kept, repeated(chosen))
+        command = shlex.join(["python", "-m", "experiments.pareto", *chosen.argv])
+        measured = {"commit": record.commit(), "command": command}
+        scenes[name] = {"measured": measured, **concluded(name, kept, repeated(chosen))}
+    scenes |= recorded(chosen)
+    scenes = {name: scenes[name] for name in ROWS if name in scenes}
     result = {
         "repetitions": chosen.repetitions,
         "voxels along an axis of phantoms": chosen.resolution,

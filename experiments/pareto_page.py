@@ -1,7 +1,8 @@
 """Writes the page of a `pareto` record: one HTML file without network, with the picture behind each point.
 
-It is made from the record and the small pictures beside it alone; nothing is measured. `pareto_page.html` is
-the page without its data.
+It is made from the record and the small pictures beside it alone; nothing is measured. Where pictures of a
+scene are not there, those of the page that is replaced are taken. `pareto_page.html` is the page without its
+data.
 """
 
 import base64
@@ -27,7 +28,7 @@ def write(path: Path, pictures: Path, page: Path) -> Path:
 
     - `pictures`: the folder with a folder of pictures for each scene.
     """
-    found = record.read(path)
+    found, earlier = record.read(path), pictures_of(page)
     result = found.pop("result")
     data = {
         "about": found,
@@ -37,7 +38,10 @@ def write(path: Path, pictures: Path, page: Path) -> Path:
         "summary": result["summary"],
         "peers": result["peers"],
         "repetitions": result["repetitions"],
-        "scenes": [scene(name, each, pictures / slug(name)) for name, each in result["scenes"].items()],
+        "scenes": [
+            scene(name, each, pictures / slug(name), earlier.get(name, {}))
+            for name, each in result["scenes"].items()
+        ],
     }
     # "</script>" in a string would end the script
     text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
@@ -45,13 +49,23 @@ def write(path: Path, pictures: Path, page: Path) -> Path:
     return page
 
 
-def scene(name: str, found: dict[str, Any], pictures: Path) -> dict[str, Any]:
-    """What the page shows of a scene."""
+def pictures_of(page: Path) -> dict[str, dict[str, str | None]]:
+    """By scene, the pictures that a page holds: of each point, and of the reference under ""."""
+    before, after = TEMPLATE.read_text(encoding="utf-8").split(DATA)
+    text = page.read_text(encoding="utf-8") if page.is_file() else ""
+    if not (text.startswith(before) and text.endswith(after)):
+        return {}
+    scenes = json.loads(text[len(before) : len(text) - len(after)])["scenes"]
+    return {s["name"]: {"": s["image"], **{point["n"]: point["i"] for point in s["points"]}} for s in scenes}
+
+
+def scene(name: str, found: dict[str, Any], pictures: Path, earlier: dict[str, str | None]) -> dict[str, Any]:
+    """What the page shows of a scene. `earlier`: pictures to take where there are no newer ones."""
     points = [
         {
             "n": point,
             **{short: rounded(row[long]) for long, short in SHOWN.items()},
-            "i": embedded(pictures / f"{slug(point)}.webp"),
+            "i": embedded(pictures / f"{slug(point)}.webp") or earlier.get(point),
         }
         for point, row in found["points"].items()
     ]
@@ -66,7 +80,8 @@ def scene(name: str, found: dict[str, Any], pictures: Path) -> dict[str, Any]:
         "their points that it is not",
     )
     about = {key: found[key] for key in kept if key in found}
-    return {"name": name, **about, "image": embedded(pictures / "reference.webp"), "points": points}
+    image = embedded(pictures / "reference.webp") or earlier.get("")
+    return {"name": name, **about, "image": image, "points": points}
 
 
 def rounded(value: Any) -> Any:

@@ -34,8 +34,8 @@ EXPECTED: dict[str, tuple[tuple[type, ...], str, str]] = {
     ),
     "lighting": (
         (Lighting, NoneType),
-        "None or a Lighting, such as ScattererTemplates",
-        "Pass lights as jv.lighting.ScattererTemplates(materials, lights).",
+        "None or a Lighting",
+        "Pass jv.lighting.Phong(lights) or jv.lighting.ScattererTemplates(materials, lights).",
     ),
 }
 """For each argument name: its allowed types, their description, and how to make one."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from ._util.checks import Arrayable, described, finite_array, integer, number, require
+from ._util.checks import Arrayable, described, finite_array, flag, integer, number, require
 from ._util.vec3 import Scalar, Vec3, along, apart
 from .volume import Volume
 
@@ -102,7 +102,7 @@ class Camera(eqx.Module):
         view_up: Arrayable = (0.0, 0.0, 1.0),
         view_angle: Arrayable = 30.0,
         *,
-        parallel: bool = False,
+        parallel: bool | Any = False,
         size: tuple[int, int] | Any = (512, 512),
     ) -> "Camera":
         """A camera that sees the whole volume from the side that `direction` points to.
@@ -134,7 +134,8 @@ class Camera(eqx.Module):
         position, center, up, scale = _fitted_view(
             volume, direction, view_up, view_angle, min(1, width / height)
         )
-        return cls(position, center, up, view_angle, size=size, parallel_scale=scale if parallel else None)
+        scale = scale if flag("parallel", parallel) else None
+        return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """A camera that renders only this rectangle of the image: the same pixels, jitter included.

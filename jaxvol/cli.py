@@ -227,7 +227,9 @@ def _view_options() -> argparse.ArgumentParser:
     transfer = appearance.add_mutually_exclusive_group()
     transfer.add_argument("--preset", metavar="NAME", help=kinds)
     transfer.add_argument(
-        "--cmap", metavar="NAME", help="a matplotlib colormap, or a colour, over --clim (default: gray)"
+        "--cmap",
+        metavar="NAME",
+        help="a matplotlib colormap, or a colour, over --clim (default: gray; isosurfaces: white)",
     )
     transfer.add_argument(
         "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"
@@ -494,7 +496,8 @@ def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
     if options.preset:
         return preset(options.preset, options.clim, unit_distance)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
-    return colormap(options.cmap or "gray", clim, options.opacity or "linear", unit_distance)
+    cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    return colormap(cmap, clim, options.opacity or "linear", unit_distance)
 
 
 def _fit(options: argparse.Namespace) -> None:

@@ -49,14 +49,16 @@ def render(
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
     - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image,
-      without transforms that are part of the scene (a `ToroidalMap`).
+      without transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
+      `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render `found.volume` by
+      `found.march` with `found.lighting`.
     - `tolerance`: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
     - `compositing`: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or `"average"`,
       the projections of VTK (`Maximum` and its siblings take a `thickness`); an `Isosurface(value)`; or
       another `Weighting` or `Selection`. Where a `Selection` chooses a depth, no adjoint marches again: JAX
       differentiates what is computed there.
-    - `lighting`: how samples are shaded, such as `lighting.ScattererTemplates`. Without, colours are those of
-      the transfer function.
+    - `lighting`: how samples are shaded: `lighting.Phong(lights)`, or `lighting.ScattererTemplates(materials,
+      lights)`. Without, colours are those of the transfer function.
     - `outputs`: `"rgba"` computes the image and `exhausted` only, in some 5 % less time; `"all"` everything
       that a `Rendering` holds.
     - `adjoint`: how the image is differentiated. The image itself is the same.

@@ -301,6 +301,13 @@ MUTATIONS = [
         (f"{RANGES}[float32]",),
     ),
     Mutation(
+        "shading: invisible samples have no light under replay",
+        "engine/replay.py",
+        "if samples.light is None:",
+        "if samples.light is not None:",
+        ("lighting/test_invisible_samples.py::test_gradients_match_one_sided_differences[midpoint]",),
+    ),
+    Mutation(
         "shading: directions of samples have no cotangent under replay",
         "engine/shading_gradient.py",
         "place = of_sample.point, of_sample.direction",

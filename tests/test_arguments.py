@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight
+from jaxvol.lighting import ConstantLight, HeadLight, Material, Phong, ScattererTemplates
 
 
 VOLUME = jv.phantom("sphere", 8)
@@ -19,6 +19,7 @@ MARCH = jv.March(0.1)
 LIGHT = ConstantLight()
 RAY = [0.0, 0.0, -5.0], [0.0, 0.0, 1.0]
 RAYS = [RAY[0]], [RAY[1]]
+LIGHTINGS = r"Pass jv\.lighting\.Phong\(lights\) or jv\.lighting\.ScattererTemplates\(materials, lights\)"
 
 
 class Denser(jv.Volume):
@@ -63,7 +64,15 @@ BAD = {
     "a class": (lambda: jv.render(VOLUME, TRANSFER, CAMERA, jv.March), "got the class March"),
     "a light": (
         lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting=LIGHT),
-        "lighting must be None or a Lighting, .*; got a ConstantLight. Pass lights as",
+        r"lighting must be None or a Lighting; got a ConstantLight\. " + LIGHTINGS,
+    ),
+    "a lighting's name": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting="phong"),
+        "got 'phong'. " + LIGHTINGS,
+    ),
+    "lights": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting=(LIGHT, LIGHT)),
+        "got a tuple of length 2. " + LIGHTINGS,
     ),
     "rays' march": (lambda: jv.render_rays(VOLUME, TRANSFER, *RAYS, 0.1), r"march must be .*got 0\.1"),
     "rays' order": (
@@ -99,6 +108,42 @@ def test_wrong_argument_types_are_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+FLAGS: dict[str, Callable[[Any], Any]] = {
+    "antialias": lambda value: jv.path_trace(VOLUME, TRANSFER, CAMERA, LIGHT, paths=1, antialias=value),
+    "baked": lambda value: ScattererTemplates(Material(0.5, 0.1), LIGHT, baked=value).baked,
+    "blend": lambda value: ScattererTemplates(Material(0.5, 0.1), LIGHT, blend=value).blend,
+    "front_residual": lambda value: jv.Jitter(front_residual=value).front_residual,
+    "gradients": lambda value: jv.plan(VOLUME, TRANSFER, CAMERA, 0.9, gradients=value),
+    "inside_out": lambda value: jv.Clip((0, 1, 0, 1, 0, 1), inside_out=value).inside_out,
+    "labels": lambda value: jv.AlphaCorrection(value).labels,
+    "parallel": lambda value: jv.Camera.looking_at(VOLUME, parallel=value).parallel_scale,
+    "speckle": lambda value: jv.toroidal_phantom("shells", (8, 8, 8), speckle=value)[0].data,
+}
+"""What is made of an argument that is True or False."""
+
+
+@pytest.mark.parametrize("name", FLAGS)
+def test_a_flag_is_true_or_false(name):
+    for wrong in ("yes", 1.0):
+        with pytest.raises(ValueError, match=f"{name} must be .*got {wrong!r}"):
+            FLAGS[name](wrong)
+
+
+@pytest.mark.parametrize("name", sorted(FLAGS.keys() - {"antialias", "gradients"}))
+def test_a_flag_may_be_numpys(name):
+    for value in (False, True):
+        found, expected = FLAGS[name](np.bool_(value)), FLAGS[name](value)
+        assert type(found) is type(expected)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_very_long_number_is_shortened():
+    for digits in (400, 5000):
+        with pytest.raises(ValueError, match="ambient must be numbers") as fault:
+            Phong(HeadLight(), 10**digits)
+        assert len(str(fault.value)) < 200
 
 
 def test_rays_of_any_type_of_numbers_see_the_same():

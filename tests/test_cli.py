@@ -140,6 +140,17 @@ def test_an_isosurface_that_no_ray_meets_says_why(volume_file, tmp_path, capsys)
     )
 
 
+def test_an_isosurface_is_white_unless_a_look_is_asked_for(volume_file, tmp_path):
+    output = tmp_path / "x.npy"
+    words = ["--compositing", "isosurface", "--isovalue", "30", "--transparent", "-o", output]
+    for look, of_white in (([], (1, 1, 1)), (["--cmap", "red"], (1, 0, 0))):
+        assert render_file(volume_file, *words, *look) == 0
+        rgba = np.load(output)
+        seen = rgba[rgba[..., 3] > 0.5][:, :3]
+        assert seen[:, 0].mean() > 0.4
+        np.testing.assert_allclose(seen.mean(axis=0) > 0.4, of_white)
+
+
 def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_path):
     transfer = jv.write_transfer(tmp_path / "t.json", jv.preset("engine"))
     images = []

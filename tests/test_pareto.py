@@ -3,6 +3,8 @@
 import json
 import re
 import shlex
+import shutil
+from argparse import Namespace
 
 import jax
 import jax.numpy as jnp
@@ -308,3 +310,18 @@ def test_a_scene_whose_volume_is_missing_is_left_out(monkeypatch):
     monkeypatch.delenv("JAXVOL_DATA", raising=False)
     assert pareto.there(None)
     assert not pareto.there(pareto_scenes.ENGINE)
+
+
+def test_scenes_that_are_not_chosen_keep_what_was_recorded_and_their_pictures(page, tmp_path):
+    path, pictures = page.with_suffix(".json"), pareto_page.pictures_of(page)
+    assert all(pictures[PHANTOM][name] for name in (BASE, "VTK, step 1"))
+    found = record.read(path)
+    sizes = {"repetitions": 3, "resolution": 192, "seed": 0, "quick": False, "output": tmp_path}
+    found["result"]["voxels along an axis of phantoms"] = 192
+    path.write_text(json.dumps(found))
+    kept = pareto.recorded(Namespace(scene=[PHANTOM], **sizes))
+    assert list(kept) == [f"{PHANTOM}, lit"]
+    assert kept[f"{PHANTOM}, lit"]["measured"]["command"] == found["command"]
+    assert not pareto.recorded(Namespace(scene=[PHANTOM], **{**sizes, "repetitions": 5}))
+    shutil.rmtree(tmp_path / "pareto")
+    assert pareto_page.pictures_of(pareto_page.write(path, tmp_path / "pareto", page)) == pictures

@@ -44,8 +44,19 @@ def described(value: Any) -> str:
         library = "traced" if is_traced(value) else "JAX" if isinstance(value, jax.Array) else "NumPy"
         return f"a {library} array of shape {value.shape} and type {value.dtype}"
     if value is None or isinstance(value, bool | int | float | complex | str | os.PathLike | np.generic):
-        return repr(value)
+        return shortened(value)
+    if isinstance(value, list | tuple):
+        return f"a {type(value).__name__} of length {len(value)}"
     return f"a {type(value).__name__}"
+
+
+def shortened(value: Any) -> str:
+    """`repr(value)`, without its middle if it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python does not write integers of more than 4300 digits
+        return f"a {type(value).__name__} with a very long integer"
+    return text if len(text) <= 120 else f"{text[:50]} ... {text[-50:]}"
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
@@ -100,7 +111,7 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
         with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
             array = jnp.asarray(cast, dtype=float)
     except (TypeError, ValueError) as fault:
-        raise ValueError(f"{name} must be numbers of shape {shape_text}; got {value!r}.") from fault
+        raise ValueError(f"{name} must be numbers of shape {shape_text}; got {shortened(value)}.") from fault
     expected = tuple(n for n in shape if n is not ...)
     trailing = array.shape[len(array.shape) - len(expected) :] if ... in shape else array.shape
     if len(trailing) != len(expected) or any(
@@ -158,7 +169,7 @@ def integer(name: str, value: Any, least: int, most: int | None = None, *, other
     """`value` as an integer from `least` to `most`, inclusive; `otherwise`: an alternative that the message
     names."""
     try:
-        if isinstance(value, bool | np.bool_):
+        if is_flag(value):
             raise TypeError
         whole = operator.index(value)
     except TypeError:
@@ -167,6 +178,18 @@ def integer(name: str, value: Any, least: int, most: int | None = None, *, other
         expected = f"of at least {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f"{name} must be an integer {expected}{otherwise}; got {described(value)}.")
     return whole
+
+
+def is_flag(value: Any) -> bool:
+    """Whether a value is Python's or NumPy's True or False."""
+    return isinstance(value, bool | np.bool_)
+
+
+def flag(name: str, value: Any) -> bool:
+    """`value` as True or False."""
+    if not is_flag(value):
+        raise ValueError(f"{name} must be True or False; got {described(value)}.")
+    return bool(value)
 
 
 def power_of_two(name: str, value: Any, most: int) -> int:

@@ -78,12 +78,14 @@ class Sums(NamedTuple):
 class Pull(NamedTuple):
     """What the tiles of an image share.
 
-    `pipeline`: without lighting, since samples are shaded by `shader`. `pull_shader`: from its leaves to
-    volume, transfer function, march and lighting.
+    `pipeline`: without lighting, since samples are pulled back through `shader`. `lit`: what rays are marched
+    through: with lighting if that is inline, so that invisible samples have their light, too. `pull_shader`:
+    from the shader's leaves to volume, transfer function, march and lighting.
     """
 
     scene: Scene
     pipeline: Pipeline
+    lit: Pipeline
     fetch: Fetch
     empty_space: EmptySpaceIndex | None
     shader: Shader | None
@@ -103,8 +105,12 @@ class Pull(NamedTuple):
         shader, pull_shader = None, None
         if scene.lighting is not None:
             shader, pull_shader = _shader_of(scene, packed.volume, voxels=_of_voxels(scene, perturbed))
+        lit = pipeline
+        if shader is not None and shader.shading.inline:
+            lit = pipeline._replace(classification=pipeline.classification._replace(light=shader))
         tiles, fetch = RayTiles.of(scene.source, tiling), packed.volume.fetch
-        return cls(scene, pipeline, fetch, index, shader, pull_shader, fault_of(scene), tiles, tiling)
+        faulty = fault_of(scene)
+        return cls(scene, pipeline, lit, fetch, index, shader, pull_shader, faulty, tiles, tiling)
 
     def zeros(self, perturbed: Any) -> Sums:
         """Sums of no tile yet, for what is perturbed."""
@@ -184,9 +190,7 @@ def _vjp_by_tiles(
         rays, pull = image.rays(number)
         replay = image.replay(rays, Cotangents.of(rays, rendering, cotangent), sums.total)
         beams = image.beams(rays, number, range_)
-        _, (_, of_rays, total) = march_rays(
-            image.pipeline, image.empty_space, beams, image.tiling, None, replay
-        )
+        _, (_, of_rays, total) = march_rays(image.lit, image.empty_space, beams, image.tiling, None, replay)
         return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))

@@ -56,11 +56,18 @@ def light_terms(
     return in_memory(live, partial(all_, term), begins)
 
 
-def lit_color(shader: Shader, pipeline: Pipeline, ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
-    """The shaded colour of a sample, from its colour and its term."""
+def lit_colors(
+    shader: Shader, pipeline: Pipeline, ray: Ray, cells: list[Cell], colors: list[Vec3], terms: list[PyTree]
+) -> list[Vec3]:
+    """The shaded colours of all samples of cells, arrays (cells, rays), from their colours and terms."""
     shading, around = shader
-    sample = _sample(pipeline, ray, cell)._replace(color=color)
-    return shading.color(sample, shading.about(around, sample), term)
+
+    def one(ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
+        sample = _sample(pipeline, ray, cell)._replace(color=color)
+        return shading.color(sample, shading.about(around, sample), term)
+
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
+    return [each(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
 
 
 def _sample(pipeline: Pipeline, ray: Ray, cell: Cell) -> Sample:

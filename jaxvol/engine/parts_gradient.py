@@ -73,7 +73,7 @@ def pull_part(
         replay = image.replay(underway.rays, given, sums.total)
         replay.carry, replay.sums = carry, of_rays
         after, (carry, of_rays, total) = march_rays(
-            *(image.pipeline, image.empty_space, image.beams(underway.rays, number, range_), image.tiling),
+            *(image.lit, image.empty_space, image.beams(underway.rays, number, range_), image.tiling),
             *(None, replay, underway.at),
         )
         over = underway.at.finished | ended(image.pipeline, underway.rays, after)

@@ -37,6 +37,7 @@ from ..rendering import Rendering
 from ..space import Ray
 from ..transfer import Transfer, classification_of
 from ..volume import Volume, with_fetch, with_voxels, without_voxels
+from .inline_shading import lit_colors
 from .scene import Scene
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
@@ -162,7 +163,11 @@ class Replay(SampleVisitor):
                 *(self.tiling.chunk, sums),
             )
             total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.shader)
-            colors, of_color = [part.color for part in shaded], [part.of_color for part in shaded]
+            of_color = [part.of_color for part in shaded]
+            if samples.light is None:
+                colors = [part.color for part in shaded]
+            else:  # also of invisible samples, which are worth something: they would become visible
+                colors = lit_colors(self.shader, self.pipeline, ray, samples.cells, colors, samples.light)
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [

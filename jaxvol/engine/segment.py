@@ -25,7 +25,7 @@ from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..selection import Selection
 from ..space import Ray
 from ..transfer import Classification, Measured
-from .inline_shading import inline_shader, light_terms, lit_color
+from .inline_shading import inline_shader, light_terms, lit_colors
 from .tiling import Tiling
 from .visible_samples import shaded_colors
 
@@ -111,9 +111,8 @@ def march_segment(
         colors = _colors(pipeline, at, every.measured)
     elif (shader := inline_shader(pipeline)) is not None:
         assert every.light is not None
-        lit = vmap_cells(partial(lit_color, shader, pipeline), (False, True, True, True))
         parts = every.cells, _colors(pipeline, at, every.measured), every.light
-        colors = [lit(ray, *piece) for piece in zip(*parts, strict=True)]
+        colors = lit_colors(shader, pipeline, ray, *parts)
     else:
         colors = shaded_colors(
             pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity

@@ -37,7 +37,8 @@ class Phong(Lighting):
     Only the angle matters, not whether there is a surface: a nearly homogeneous region is shaded by its noise
     (`experiments/stability.py`, "normals in noise").
 
-    Gradients of light, material, camera and volume are those of this formula. They grow without bound as the
+    Gradients of light, material, transfer function, camera and volume are those of this formula, also by an
+    extinction of 0, where samples are lit although they are invisible. They grow without bound as the
     volume's gradient falls to 0; where it is 0, and where a normal turns from one side to the other, they
     miss a jump.
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import integer, is_traced, number
+from .._util.checks import flag, integer, is_flag, is_traced, number
 from .._util.memo import memoized
 from ..march import March, Transform
 from ..transfer import Transfer
@@ -83,8 +83,8 @@ class ScattererTemplates(Lighting):
     - `templates`: number per material. `choice`: which of them a sample uses (the paper does not say):
       `"pixel"`: one for each pixel, chosen at random. `"material"`: the first one, for all samples of the
       material. It has no noise, takes less time, and is as lopsided everywhere as that one template is.
-      `blend`: use all of them for every sample, instead. This has less noise than one for each pixel, and
-      takes as much longer as there are templates.
+      `blend`: use all of them for every sample, instead, whatever `choice` says. This has less noise than one
+      for each pixel, and takes as much longer as there are templates.
     - `photons`: keep this many of each template's brightest photons, scaled to the energy of all. By default
       all.
     - `occlusion`: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
@@ -144,13 +144,13 @@ class ScattererTemplates(Lighting):
         *,
         templates: int = 8,
         choice: Choice | Any = "pixel",
-        blend: bool = False,
+        blend: bool | Any = False,
         photons: int | None = None,
         occlusion: Occlusion | Any = "soft",
         reach: Sequence[float] = (2.0, 4.0),
         cutoff: float | None = None,
         seed: int = 0,
-        baked: int | bool = False,
+        baked: int | bool | Any = False,
         packets: int = 4,
         threshold: float = 0.01,
         threshold_on: ThresholdOn | Any = "photon",
@@ -160,7 +160,7 @@ class ScattererTemplates(Lighting):
         given: ScattererTemplate | Any | None = None,
     ):
         self.materials, self.lights = materials_of(materials), lights_of(lights)
-        self.templates, self.blend = integer("templates", templates, 1), bool(blend)
+        self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         for name, given_, allowed in (("occlusion", occlusion, Occlusion), ("choice", choice, Choice)):
             if given_ not in get_args(allowed):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(allowed))}; got {given_!r}.")
@@ -182,7 +182,7 @@ class ScattererTemplates(Lighting):
             self.critical_angle = number("critical_angle", critical_angle, above=0, below=90.001)
         self.threshold = Threshold.checked(packets, threshold, threshold_on, energy)
         # True: 64 nodes, fine enough for light that scatters over several voxels
-        self.baked = 64 if baked is True else 0 if baked is False else integer("baked", baked, 2)
+        self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
         self.given = given
         if not isinstance(given, ScattererTemplate | None):
             raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32
 
-from .._util.checks import Arrayable, all_finite, described, integer, is_traced, number
+from .._util.checks import Arrayable, all_finite, described, flag, integer, is_traced, number
 from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
@@ -71,7 +71,7 @@ def path_trace(
     materials: Material | tuple[Material, ...] | None = None,
     anisotropy: Arrayable = 0.0,
     max_scatterings: int | Any = None,
-    antialias: bool = False,
+    antialias: bool | Any = False,
     onto: PathTraced | Any = None,
     lanes: int | Any = None,
 ) -> PathTraced:
@@ -136,7 +136,7 @@ def path_trace(
         limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
-    options = _TraceOptions(paths, integer("lanes", lanes, 1), bool(antialias))
+    options = _TraceOptions(paths, integer("lanes", lanes, 1), flag("antialias", antialias))
     options.require_room(camera)
     seed = _seed(key)
     first = 0

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from .._util.checks import integer
+from .._util.checks import flag, integer
 from ..transforms.toroidal_map import ToroidalMap
 from ..volume import Volume
 from .canvas import SLAB, smooth_min
@@ -31,7 +31,7 @@ def toroidal_phantom(
     shape: tuple[int, int, int] | Any = (64, 96, 160),
     *,
     probe: ToroidalMap | Any | None = None,
-    speckle: bool = True,
+    speckle: bool | Any = True,
     seed: int | Any = 0,
 ) -> tuple[Volume, ToroidalMap]:
     """A synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the world.
@@ -60,14 +60,15 @@ tissue 60; cysts 4; targets 130, 160, 190 |
     **Returns:** a uint8 volume, whose own spacing has no meaning, and the probe.
 
     **Raises:** `ValueError` for an unknown name, a shape that is not three integers of at least 8, a probe
-    that is not a `ToroidalMap`, and a seed that is not a non-negative integer.
+    that is not a `ToroidalMap`, a `speckle` that is not true or false, and a seed that is not a
+    non-negative integer.
     """
     if name not in SCENES:
         raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")
     if not isinstance(shape, tuple | list) or len(shape) != 3:
         raise ValueError(f"shape must be three numbers of nodes, along (β, σ, γ); got {shape!r}.")
     n_beta, n_sigma, n_gamma = (integer("shape", n, 8) for n in shape)
-    rng = np.random.default_rng(integer("seed", seed, 0))
+    rng, speckle = np.random.default_rng(integer("seed", seed, 0)), flag("speckle", speckle)
     if probe is None:
         probe = ToroidalMap(20.0, 30.0, _about(35), _about(40), (0.0, 100.0))
     if not isinstance(probe, ToroidalMap):

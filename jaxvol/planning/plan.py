@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from .._util.checks import described, integer, is_traced
+from .._util.checks import described, flag, integer, is_traced
 from ..arguments import check_arguments
 from ..camera import Camera
 from ..compositing import Compositing, Over
@@ -177,8 +177,7 @@ def plan(
     begun = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
-    if not isinstance(gradients, bool):
-        raise ValueError(f"gradients must be True or False; got {described(gradients)}.")
+    gradients = flag("gradients", gradients)
     setting = Setting(volume, transfer, compositing_of(compositing))
     tolerance, given = _checked(tolerance, transforms, (setting, camera, lighting))
     space = March(1.0, given).locate(volume)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from .._util.checks import flag
 from .._util.vec3 import Scalar
 from ..march import Cell, Transform
 from ..space import Ray
@@ -55,7 +56,8 @@ class AlphaCorrection(Transform):
     Where it fails, and where not: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
 
-    **Raises:** `ValueError` when a volume without labels is rendered with `labels=True`.
+    **Raises:** `ValueError` for `labels` that are not true or false, and when a volume without labels is
+    rendered with `labels=True`.
 
     Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit. The cuts at faces
     of labels and gaps are not in the paper, which names the noise of jitter at the faces of a segmentation
@@ -65,7 +67,10 @@ class AlphaCorrection(Transform):
     joins: ClassVar[bool] = True
     ends_at_exit: ClassVar[bool] = True
 
-    labels: bool = eqx.field(static=True, default=False)
+    labels: bool = eqx.field(static=True)
+
+    def __init__(self, labels: bool | Any = False):
+        self.labels = flag("labels", labels)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         back = cell.front + cell.width

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._util.checks import Arrayable, described, finite_array, require
+from .._util.checks import Arrayable, described, finite_array, flag, require
 from .._util.vec3 import Scalar, Vec3, apart, dot
 from ..march import Transform
 from ..occupancy import Occupancy
@@ -74,9 +74,7 @@ class Clip(Transform):
         self.origins, self.normals = _planes(planes)
         if box is None and not len(self.origins):
             raise ValueError("Clip must be given a box, planes, or both; got neither.")
-        if not isinstance(inside_out, bool):
-            raise ValueError(f"inside_out must be True or False; got {described(inside_out)}.")
-        self.inside_out = inside_out
+        self.inside_out = flag("inside_out", inside_out)
 
     def clip(self, space: Space) -> Space:
         sides = [] if self.box is None else _faces(self.box)
@@ -231,13 +229,21 @@ def _box(box: Arrayable) -> Float[Array, "6"]:
     )
 
 
+def _is_sequence(value: Any) -> bool:
+    """Whether a value has a length and entries in order."""
+    return isinstance(value, Sequence) or (isinstance(value, np.ndarray | jax.Array) and value.ndim > 0)
+
+
 def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes 3"]]:
     """Origins and normals."""
-    pairs = list(planes) if isinstance(planes, Sequence | np.ndarray | jax.Array) else [planes]
+    if not _is_sequence(planes):
+        raise ValueError(f"planes must be a list of pairs (origin, normal); got {described(planes)}.")
     origins, normals = [], []
-    for i, pair in enumerate(pairs):
-        if not isinstance(pair, Sequence | np.ndarray | jax.Array) or len(pair) != 2:
-            raise ValueError(f"planes[{i}] must be a pair (origin, normal); got {described(pair)}.")
+    for i, pair in enumerate(planes):
+        if not _is_sequence(pair) or len(pair) != 2:
+            bare = len(planes) == 2 and all(_is_sequence(part) and len(part) == 3 for part in planes)
+            remedy = " For a single plane, pass [(origin, normal)]." if bare else ""
+            raise ValueError(f"planes[{i}] must be a pair (origin, normal); got {described(pair)}.{remedy}")
         origins.append(finite_array(f"the origin of planes[{i}]", pair[0], (3,)))
         normals.append(
             require(
@@ -246,6 +252,6 @@ def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes
                 f"the normal of planes[{i}] must not be 0; got {{got}}.",
             )
         )
-    if not pairs:
+    if not origins:
         return jnp.zeros((0, 3)), jnp.zeros((0, 3))
     return jnp.stack(origins), jnp.stack(normals)

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
+from .._util.checks import flag
 from .._util.noise import blue_tile, hashed_uniforms, seed_word
 from .._util.vec3 import Scalar
 from ..march import Cell, Transform
@@ -70,7 +71,7 @@ class Jitter(Transform):
 
     Where it fails, and where not: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
 
-    **Raises:** `ValueError` for an invalid seed or pattern.
+    **Raises:** `ValueError` for an invalid seed, pattern or `front_residual`.
 
     Source: jittered sampling as in Kye 2013, section 2.2.
     """
@@ -81,10 +82,10 @@ class Jitter(Transform):
     front_residual: bool = eqx.field(static=True)
 
     def __init__(
-        self, seed: int | Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool = False
+        self, seed: int | Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool | Any = False
     ):
         self.noise = Noise(seed, pattern, stream=0)
-        self.front_residual = front_residual
+        self.front_residual = flag("front_residual", front_residual)
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
         offset = self.noise(ray.pixel, steps.dtype)

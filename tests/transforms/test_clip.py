@@ -519,9 +519,23 @@ BAD = {
     ),
     "NaN": (((0, 1, 0, 1, 0, np.nan),), "box must be finite"),
     "infinite": (((0, 1, 0, 1, 0, np.inf),), "box must be finite"),
-    "a bare plane": ((None, ((0, 0, 0), (0, 0, 1))), r"planes\[0\] must be a pair \(origin, normal\); got"),
+    "a bare plane": (
+        (None, ((0, 0, 0), (0, 0, 1))),
+        r"planes\[0\] must be a pair \(origin, normal\); got a tuple of length 3\. "
+        r"For a single plane, pass \[\(origin, normal\)\]\.",
+    ),
+    "a bare plane in arrays": (
+        (None, (np.zeros(3), np.ones(3))),
+        r"got a NumPy array of shape \(3,\) .*For a single plane, pass",
+    ),
+    "coefficients": (
+        (None, [(1, 0, 0, 5)]),
+        r"planes\[0\] must be a pair \(origin, normal\); got a tuple of length 4\.$",
+    ),
+    "None": ((None, None), r"planes must be a list of pairs \(origin, normal\); got None\.$"),
+    "a generator": ((None, (pair for pair in ())), r"planes must be a list of pairs .* got a generator\.$"),
     "a name": ((None, "x"), r"planes\[0\] must be a pair"),
-    "a number": ((None, 3.0), r"planes\[0\] must be a pair .* got 3.0"),
+    "a number": ((None, 3.0), r"planes must be a list of pairs .* got 3.0"),
     "no normal": ((None, [((0, 0, 0), (0, 0, 0))]), r"the normal of planes\[0\] must not be 0"),
     "a flat normal": ((None, [((0, 0, 0), (0, 1))]), r"the normal of planes\[0\] must have shape \(3,\)"),
     "NaN in a plane": (
@@ -536,8 +550,3 @@ def test_bad_input_is_named(case):
     arguments, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         jv.Clip(*arguments)
-
-
-def test_a_flag_must_be_one():
-    with pytest.raises(ValueError, match="inside_out must be True or False; got 1"):
-        jv.Clip(UNIT, inside_out=1)
