@@ -18,7 +18,7 @@ from ..scenes import in_float64, slow, to_float64
 
 
 SIZE = (4, 3)
-STEP = 1e-4
+STEP = 2e-5
 PROBE = jv.ToroidalMap(20.0, 30.0, (0.9, 2.3), (0.8, 2.4), (0.0, 60.0))
 ALIGNED, JITTER = jv.AlphaCorrection(), jv.Jitter(3)
 
