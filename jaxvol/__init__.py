@@ -54,6 +54,7 @@ from .projections import Average as Average, Maximum as Maximum, Minimum as Mini
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .rendering import Rendering as Rendering
+from .scan_conversion import scan_convert as scan_convert
 from .selection import FirstVisible as FirstVisible, Selection as Selection
 from .transfer import TransferFunction as TransferFunction
 from .transfer2d import TransferFunction2D as TransferFunction2D
