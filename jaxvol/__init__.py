@@ -22,6 +22,7 @@ from .fitting import (
     ImageResidual as ImageResidual,
     Pose as Pose,
     Positive as Positive,
+    ProbeGeometry as ProbeGeometry,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
     choose as choose,
