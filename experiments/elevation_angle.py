@@ -37,16 +37,17 @@ def bow(echo: np.ndarray, window: tuple[int, int]) -> np.ndarray:
     middle = slice(beams // 2 - beams // 16, beams // 2 + beams // 16)
     profile = gaussian_filter1d(gaussian_filter(echo, (1, 0, 0))[:, middle].mean(axis=1), 1)
     first, last = window
-    reference = profile[planes // 2, first:last] - profile[planes // 2, first:last].mean()
+    reference = np.asarray(profile[planes // 2, first:last])
+    reference = reference - reference.mean()
     shifts = np.arange(-MOST, MOST + 1)
-    found = []
+    found: list[float] = []
     for plane in profile:
         moved = np.array([plane[first + s : last + s] for s in shifts])
         moved = moved - moved.mean(axis=1, keepdims=True)
         score = moved @ reference / np.linalg.norm(moved, axis=1)
         at = int(np.clip(np.argmax(score), 1, len(shifts) - 2))
-        before, here, after = score[at - 1 : at + 2]
-        found.append(shifts[at] + (before - after) / 2 / (before - 2 * here + after))
+        before, here, after = (float(score[at + side]) for side in (-1, 0, 1))
+        found.append(int(shifts[at]) + (before - after) / 2 / (before - 2 * here + after))
     return np.array(found)
 
 

@@ -110,11 +110,12 @@ def moved(probe: jv.ToroidalMap, signs: np.ndarray) -> jv.ToroidalMap:
 
 def found_from(scene: Scene, targets: list[Any], start: jv.ToroidalMap) -> tuple[jv.Fit, int]:
     """The last fit of those from coarse to fine, and the number of steps of all."""
-    steps = 0
+    fits: list[jv.Fit] = []
     for blur in BLURS:
-        fit = jv.fit(jv.ImageResidual(scene, targets, blur=blur), start, max_steps=STEPS, rtol=1e-5)
-        start, steps = fit.parameters, steps + len(fit.losses)
-    return fit, steps
+        residual = jv.ImageResidual(scene, targets, blur=blur)
+        fits.append(jv.fit(residual, start, max_steps=STEPS, rtol=1e-5))
+        start = fits[-1].parameters
+    return fits[-1], sum(len(fit.losses) for fit in fits)
 
 
 def recovered(
