@@ -37,7 +37,7 @@ def bow(echo: np.ndarray, window: tuple[int, int]) -> np.ndarray:
     middle = slice(beams // 2 - beams // 16, beams // 2 + beams // 16)
     profile = gaussian_filter1d(gaussian_filter(echo, (1, 0, 0))[:, middle].mean(axis=1), 1)
     first, last = window
-    reference = np.asarray(profile[planes // 2, first:last])
+    reference = np.array(profile[planes // 2])[first:last]
     reference = reference - reference.mean()
     shifts = np.arange(-MOST, MOST + 1)
     found: list[float] = []
