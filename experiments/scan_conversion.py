@@ -6,8 +6,8 @@ the converged image of the volume as acquired. Beside the error of a frame at st
 that of converged frames, which resampling alone brings; and the time of a frame, the time of the conversion,
 and the size of the grid. 8-bit voxels stay 8-bit; one grid is measured in float32, too.
 
-The scan `us_aplio_convex` is read from the folder that JAXVOL_DATA names; without one, only phantoms are
-measured.
+The scan `us_aplio_convex` is read from the folder that JAXVOL_DATA names; without one, only the phantom of
+wires is measured.
 """
 
 import time
@@ -137,8 +137,6 @@ def main(chosen: Namespace) -> common.Answer:
     spacings = SPACINGS
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.repetitions, spacings = 24, 24, 1, (4.0, 2.0)
-    elif folder is None:
-        names = [name for name in chosen.only if name != SCAN]
     scenes = {}
     for name in names:
         scenes[name] = measure(
