@@ -35,10 +35,10 @@ def bow(echo: np.ndarray, window: tuple[int, int]) -> np.ndarray:
     the correlation along the beams, which are averaged over the middle of the fan."""
     planes, beams, _ = echo.shape
     middle = slice(beams // 2 - beams // 16, beams // 2 + beams // 16)
-    profile = gaussian_filter1d(gaussian_filter(echo, (1, 0, 0))[:, middle].mean(axis=1), 1)
+    smooth = np.asarray(gaussian_filter(echo, (1, 0, 0)))[:, middle].mean(axis=1)
+    profile = np.asarray(gaussian_filter1d(smooth, 1))
     first, last = window
-    reference = np.array(profile[planes // 2])[first:last]
-    reference = reference - reference.mean()
+    reference = profile[planes // 2, first:last] - profile[planes // 2, first:last].mean()
     shifts = np.arange(-MOST, MOST + 1)
     found: list[float] = []
     for plane in profile:
