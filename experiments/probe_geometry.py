@@ -53,8 +53,9 @@ CONCLUSION = (
     "with each echo, as reverberation between two surfaces would whose distance falls off to both sides. A "
     "shell with its centre off the motor axis explains the bow under either reading, and the two windows "
     "prefer different ones; only a plane under the reading as half an angle is ruled out (it leaves more "
-    "than twice as much). Planes would be about as far apart at the probe's face as beams under the reading as "
-    "half an angle, and half as far under the other, which proves nothing. What would settle it: one image of an "
+    "than twice as much). Planes would be about as far apart at the probe's face as beams under the reading "
+    "as half an angle, and half as far under the other, which proves nothing. What would settle it: "
+    "an image of an "
     "object of known size and place across the sweep, or the manufacturer's field of view of the probe."
 )
 
