@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import described
+from .._util.checks import described, require
 from ..transforms import ToroidalMap
 from .bijections import MARGIN, Bijection, Positive
 
@@ -47,7 +47,8 @@ class ProbeGeometry(Bijection):
 
     - `start`: sets the typical lengths, and the first depth.
 
-    **Raises:** `ValueError` for what is not a `ToroidalMap`, and for one that begins at another depth.
+    **Raises:** `ValueError` for what is not a `ToroidalMap`, for one that begins at another depth, and for
+    one with samples behind the motor axis.
     """
 
     whole: bool = eqx.field(static=True, default=True, init=False)
@@ -63,11 +64,13 @@ class ProbeGeometry(Bijection):
         near, axis, span = (self._length.forward(free[name]) for name in ("near", "axis", "span"))
         beta, sigma = (_range_of(free[name]) for name in ("beta", "sigma"))
         first = start.gamma_range[0]
-        return eqx.tree_at(
+        gamma = jnp.stack([first, first + span])
+        about_axis = eqx.tree_at(
             lambda probe: (probe.a, probe.b, probe.beta_range, probe.sigma_range, probe.gamma_range),
             self.start,
-            (axis - near * _least_sine(sigma), near - first, beta, sigma, jnp.stack([first, first + span])),
+            (jnp.zeros_like(near), near - first, beta, sigma, gamma),
         )
+        return eqx.tree_at(lambda probe: probe.a, about_axis, axis - about_axis.nearest_to_axis)
 
     def inverse(self, value: ToroidalMap | Any, name: str = "value") -> dict[str, Any]:
         if not isinstance(value, ToroidalMap):
@@ -78,8 +81,14 @@ class ProbeGeometry(Bijection):
                 f"{float(self.start.gamma_range[0])}; got {float(value.gamma_range[0])}. Add the difference "
                 "to b."
             )
-        near = value.b + value.gamma_range[0]
-        axis = jnp.maximum(value.a + near * _least_sine(value.sigma_range), 0)  # below 0 by rounding at most
+        nearest = require(
+            value.nearest_to_axis,
+            lambda axis, size: axis >= -1e-6 * size,
+            f"{name} must not have samples behind the motor axis to be fitted: its outermost beams begin at "
+            "{got} from it. Raise a, or narrow sigma_range.",
+            self._size,
+        )
+        near, axis = value.b + value.gamma_range[0], jnp.maximum(nearest, 0)
         lengths = {"near": near, "axis": axis, "span": value.gamma_range[1] - value.gamma_range[0]}
         free = {part: self._length.inverse(length, f"{name}, {part}") for part, length in lengths.items()}
         return free | {"beta": _ratios(value.beta_range), "sigma": _ratios(value.sigma_range)}
@@ -94,12 +103,6 @@ class ProbeGeometry(Bijection):
     @property
     def _length(self) -> Positive:
         return Positive(self._size)
-
-
-def _least_sine(sigma_range: Float[Array, "2"]) -> Float[Array, ""]:
-    """Of the outermost beams, the one that begins nearest to the motor axis: how near, in parts of its
-    distance from the apex. Angles in [0, π]."""
-    return jnp.min(jnp.sin(sigma_range))
 
 
 def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:

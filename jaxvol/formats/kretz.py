@@ -108,6 +108,12 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
             probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (shape[2] - 1) * step))
         except ValueError as fault:
             raise ValueError(f"path: {path} describes no probe: {fault}") from fault
+        nearest = float(probe.nearest_to_axis)
+        if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
+            raise ValueError(
+                f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the "
+                f"motor axis (b = {first * step:.4g} mm, a = {apex * step:.4g} mm), where no sample is shown."
+            )
         stream.seek(items[VOXELS].offset)
         content = stream.read(math.prod(shape))
     return as_array(content, shape, np.dtype("u1"), "C"), probe

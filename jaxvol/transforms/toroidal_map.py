@@ -16,10 +16,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._util.checks import Arrayable, finite_array, is_traced, number, require
+from .._util.checks import Arrayable, finite_array, number, require
 from .._util.vec3 import Scalar, Vec3, along, apart
 from ..march import Transform
 from ..occupancy import BLOCK, Occupancy, Sums
@@ -45,8 +44,9 @@ class ToroidalMap(Transform):
     **Arguments:**
 
     - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
-      behind the axis, as in probes whose array turns about a near axis. No sample may lie behind the axis,
-      where ρ would be negative: the world has such a point at another β.
+      behind the axis, as in probes whose array turns about a near axis. Samples that then lie behind the
+      axis, where ρ would be negative (`nearest_to_axis`), are not shown: the world has such points at
+      another β.
     - `b`: distance from the apex to depth γ = 0, world length.
     - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
       [0, π], increasing.
@@ -61,8 +61,7 @@ class ToroidalMap(Transform):
     Where it fails, and where not: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".
 
-    **Raises:** `ValueError` for ranges that do not increase or lie outside their limits, and for an `a` so
-    negative that samples lie behind the motor axis.
+    **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
 
     Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), which print `atan`; `atan2` is the same where
     z > 0 and R > 0, and elsewhere gives angles outside every sector. The paper has two misprints: (2.4) has
@@ -83,6 +82,7 @@ class ToroidalMap(Transform):
         sigma_range: Arrayable,
         gamma_range: Arrayable,
     ):
+        self.a = number("a", a)
         self.b = number("b", b)
         self.beta_range = _angles("beta_range", beta_range)
         self.sigma_range = _angles("sigma_range", sigma_range)
@@ -91,13 +91,6 @@ class ToroidalMap(Transform):
             lambda gamma, b: b + gamma[0] > 0,
             "gamma_range must begin beyond the apex, b + gamma_range[0] > 0; got {got}.",
             self.b,
-        )
-        self.a = require(
-            number("a", a),
-            _before_axis,
-            "a must not be so negative that samples lie behind the motor axis: a + (b + gamma_range[0]) "
-            "sin(sigma) must be at least 0 at both ends of sigma_range; got a = {got}.",
-            *(self.b + self.gamma_range[0], self.sigma_range),
         )
 
     def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
@@ -138,6 +131,13 @@ class ToroidalMap(Transform):
         """Center of the bounds."""
         low, high = self.corners
         return (low + high) / 2
+
+    @property
+    def nearest_to_axis(self) -> Float[Array, ""]:
+        """Distance from the motor axis at which the outermost beams begin: ρ of the sample nearest to the
+        axis; negative if it lies behind the axis, world length."""
+        depth = self.b + self.gamma_range[0]
+        return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
 
     def locate(self, space: Space, volume: Volume) -> Space:
         return _Sector(self, volume.shape)
@@ -246,13 +246,6 @@ def _atan2(a: Scalar, b: Scalar) -> Scalar:
     # not merely nonzero: the derivative divides by a² + b², which must not underflow
     away = jnp.maximum(jnp.abs(a), jnp.abs(b)) > float(jnp.finfo(a.dtype).tiny) ** 0.25
     return jnp.where(away, jnp.arctan2(jnp.where(away, a, 0), jnp.where(away, b, 1)), 0)
-
-
-def _before_axis(a: Any, depth: Any, sigma: Any) -> Any:
-    """Whether the sample nearest to the motor axis, of a fan's outermost beams, lies before it, to within
-    rounding."""
-    module = jnp if is_traced(a, depth, sigma) else np
-    return a + depth * module.sin(sigma) >= -1e-6 * (abs(a) + depth)
 
 
 def _range(name: str, value: Arrayable) -> Float[Array, "2"]:

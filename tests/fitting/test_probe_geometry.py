@@ -145,6 +145,10 @@ BAD = {
         lambda: jv.ProbeGeometry(jv.ToroidalMap(*PROBES["b below 0"])).inverse(3.0, "probe"),
         "probe must be a ToroidalMap; got 3.0",
     ),
+    "samples behind the axis": (
+        lambda: jv.fit(lambda probe: probe.a, jv.ToroidalMap(-26.0, 30.0, (1, 2), (1, 2), (0, 60))),
+        r"parameters must not have samples behind the motor axis to be fitted: .* -0\.7",
+    ),
     "another first depth": (
         lambda: jv.ProbeGeometry(jv.ToroidalMap(*PROBES["b below 0"])).inverse(
             jv.ToroidalMap(*PROBES["apex on the axis"]), "probe"

@@ -815,7 +815,6 @@ BAD = {
     "infinite": ({"gamma_range": (0, float("inf"))}, "gamma_range must be finite"),
     "no angle": ({"sigma_range": (1.5, 1.5)}, "sigma_range must be .* first < last"),
     "over pi": ({"beta_range": (0.1, 3.3)}, r"beta_range must lie in \[0, π\]"),
-    "behind the axis": ({"a": -26.0}, r"a must not be so negative .* motor axis.*got a = -26\.0"),
     "a first depth behind the apex": ({"b": -5.0}, "gamma_range must begin beyond the apex"),
     "not a number": ({"b": (1, 2)}, r"b must have shape \(\)"),
     "three ends": ({"beta_range": (1, 1.5, 2)}, r"beta_range must have shape \(2,\)"),
@@ -829,14 +828,21 @@ def test_bad_probes_are_named(case):
         jv.ToroidalMap(**{**GOOD, **changes})
 
 
-def test_negative_a_and_b_are_right_where_samples_lie_before_apex_and_axis():
-    """a = -25.2 is about the least: the outermost beams, at 30 from the apex, begin at sin 1 of that."""
-    jv.ToroidalMap(**{**GOOD, "a": -25.2})
+def test_b_may_be_negative_where_depth_begins_beyond_the_apex():
     one = jv.ToroidalMap(**{**GOOD, "b": -5.0, "gamma_range": (35, 95)})
     other = jv.ToroidalMap(**{**GOOD, "b": 30.0, "gamma_range": (0, 60)})
     np.testing.assert_allclose(one.bounds, other.bounds, rtol=1e-6)
-    with pytest.raises(RuntimeError, match="a must not be so negative"):
-        jax.block_until_ready(jax.jit(lambda a: jv.ToroidalMap(**{**GOOD, "a": a}).a)(-26.0))
+
+
+@pytest.mark.parametrize("name", PROBES)
+@pytest.mark.parametrize("lower", [0.0, 60.0])
+def test_the_sample_nearest_to_the_axis_is_that_of_the_formula(name, lower):
+    """ρ = a + (b + γ) cos(σ - π/2), least of all samples; negative if the axis lies beyond."""
+    a, b, beta, sigma, gamma = PROBES[name]
+    _, angle, depth = np.moveaxis(nodes(PROBES[name], (2, 40, 40)), -1, 0)
+    least = np.min(a - lower + (b + depth) * np.cos(angle - HALF))
+    probe = jv.ToroidalMap(a - lower, b, beta, sigma, gamma)
+    np.testing.assert_allclose(probe.nearest_to_axis, least, atol=1e-4)
 
 
 def test_bad_points_are_named():
