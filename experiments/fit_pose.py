@@ -12,11 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 import jaxvol as jv
 
@@ -31,33 +29,16 @@ SIGMAS = {"from coarse to fine": (1 / 16, 1 / 48, 0.0), "as they are": (0.0,)}
 """Standard deviations of the blurs in the stages of a fit, as a part of the image's height."""
 
 
-class Difference(eqx.Module):
-    """The blurred difference between the image from a camera and the target."""
-
-    scene: tuple[jv.Volume, jv.TransferFunction, jv.March]
-    target: Array
-    kernel: Array
-
-    def __call__(self, camera: jv.Camera) -> Array:
-        volume, transfer, march = self.scene
-        image = jv.render(volume, transfer, camera, march, adjoint="forward").image()
-        rows = jnp.tensordot(self.kernel, image - self.target, axes=(1, 0))
-        return jnp.tensordot(self.kernel, rows, axes=(1, 1)) / np.sqrt(image.size)
-
-
-def blur(size: int, sigma: float) -> Array:
-    """Matrix that blurs a column of `size` pixels by a Gaussian; the identity for a sigma of 0."""
-    away = np.subtract.outer(np.arange(size), np.arange(size)) / max(sigma * size, 1e-3)
-    weights = np.exp(-(away**2) / 2)
-    return jnp.asarray(weights / weights.sum(axis=1, keepdims=True), jnp.float32)
-
-
 def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, list[dict[str, Any]]]:
     """How far from the truth each start ends, for each sequence of blurs."""
     volume, transfer, march = fit_transfer.head(None, resolution)
     truth = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.3)
     pose = jv.Pose(truth)
     target = jv.render(volume, transfer, truth, march).image()
+
+    def scene(camera: jv.Camera, _: jv.Camera) -> Any:
+        return volume, transfer, camera, march
+
     rows = {}
     for name, sigmas in SIGMAS.items():
         rng = np.random.default_rng(seed)
@@ -68,7 +49,7 @@ def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, lis
             camera, losses, found = pose.forward(jax.tree.map(jnp.float32, off)), [], None
             begun = time.perf_counter()
             for sigma in sigmas:
-                residual = Difference((volume, transfer, march), target, blur(size, sigma))
+                residual = jv.ImageResidual(scene, [(truth, target)], blur=sigma)
                 found = jv.fit(residual, camera, max_steps=STEPS)
                 camera = found.parameters
                 losses += found.losses.tolist()

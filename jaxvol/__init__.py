@@ -23,6 +23,7 @@ from .fitting import (
     ImageResidual as ImageResidual,
     Pose as Pose,
     Positive as Positive,
+    ProbeGeometry as ProbeGeometry,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
     choose as choose,
@@ -35,7 +36,7 @@ from .fitting import (
     refined as refined,
     write_transfer as write_transfer,
 )
-from .formats import load as load
+from .formats import load as load, load_ultrasound as load_ultrasound
 from .isosurface import Isosurface as Isosurface
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .lighting import (
@@ -55,6 +56,7 @@ from .projections import Average as Average, Maximum as Maximum, Minimum as Mini
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .rendering import Rendering as Rendering
+from .scan_conversion import scan_convert as scan_convert
 from .selection import FirstVisible as FirstVisible, Selection as Selection
 from .transfer import TransferFunction as TransferFunction
 from .transfer2d import TransferFunction2D as TransferFunction2D

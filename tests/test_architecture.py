@@ -31,6 +31,7 @@ ORDER = [
     "beams",
     "march",
     "transforms",
+    "scan_conversion",
     "lighting",
     "compositing",
     "selection",

@@ -21,5 +21,6 @@ from .files import (
     read_views as read_views,
     write_transfer as write_transfer,
 )
+from .probe_geometry import ProbeGeometry as ProbeGeometry
 from .residuals import ImageResidual as ImageResidual
 from .starts import flat_grey as flat_grey

@@ -16,8 +16,10 @@ from ..lighting import Material
 from ..march import March
 from ..transfer import TransferFunction
 from ..transfer2d import TransferFunction2D
+from ..transforms import ToroidalMap
 from ..volume import Volume
 from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInterval
+from .probe_geometry import ProbeGeometry
 
 
 Where = Callable[[Any], Any]
@@ -146,6 +148,7 @@ _DEFAULTS: dict[type, Callable[[Any], PyTree]] = {
     TransferFunction2D: _of_transfer,
     LabelTransferFunction: _of_labels,
     Camera: Pose,
+    ToroidalMap: ProbeGeometry,
     Volume: _of_volume,
     March: _fixed,
     Material: _of_material,

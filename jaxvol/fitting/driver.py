@@ -115,10 +115,11 @@ def fit(
         - any least-squares solver or minimiser of Optimistix, or a transformation of Optax; `rtol` and
           `atol` are then the solver's own where it has them.
     - `constraints`: a tree like the parameters, or a prefix of one, with a bijection at each leaf: None for
-      the default, `Fixed()`, `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`. The defaults
-      are, for a transfer function, positive extinction, colours in [0, 1] and fixed values; for a camera, its
-      pose; for a volume, unconstrained data if they are float; for a material, a positive mean free path,
-      and all else fixed; for a march, all fixed; any other float array is unconstrained.
+      the default, `Fixed()`, `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`,
+      `ProbeGeometry(probe)`. The defaults are, for a transfer function, positive extinction, colours in
+      [0, 1] and fixed values; for a camera, its pose; for a `ToroidalMap`, its geometry; for a volume,
+      unconstrained data if they are float; for a material, a positive mean free path, and all else fixed;
+      for a march, all fixed; any other float array is unconstrained.
     - `where`: the free parts, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
       example `lambda transfer: transfer.extinction`, or a tuple of parts.
     - `rtol`, `atol`: a fit has converged when neither the free variables nor the residual change by more

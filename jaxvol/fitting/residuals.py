@@ -22,7 +22,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from .._util.checks import Arrayable, described, finite, finite_array
+from .._util.checks import Arrayable, described, finite, finite_array, require
 from .._util.trees import PyTree
 from ..camera import Camera, rows_of
 from ..compositing import Compositing
@@ -125,6 +125,10 @@ class ImageResidual(Residual):
       `background`, or (height, width, 4), as `Rendering.rgba`.
     - `background`: linear RGB behind the volume, for three-channel images.
     - `compositing`: as in `render`.
+    - `blur`: compare blurred images: standard deviation of a Gaussian, in parts of the image's height. From
+      coarse to fine, such as 1/16, 1/48 and None, each fit from where the last one ended, a fit finds a
+      geometry whose start is off by more than the size of features, which a derivative cannot see. Whole
+      images are then differentiated at once. Pixels beyond the border do not count.
 
     The residual is divided by the square root of the number of its entries, so that the loss, half the
     sum of squares, is half the mean squared error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
@@ -132,13 +136,15 @@ class ImageResidual(Residual):
     A Jacobian that is too large is computed in tiles of whole image rows.
 
     **Raises:** `ValueError` for no views, an image that differs in size from its camera or holds integers,
-    NaN or infinite pixels, and a scene that returns something else.
+    NaN or infinite pixels, a negative `blur`, and a scene that returns something else; and when it is fitted,
+    for blurred images that `max_jacobian` leaves no room for.
     """
 
     scene: SceneFunction
     groups: list[_Group]
     background: Float[Array, "3"]
     compositing: Compositing[Any]
+    blur: Float[Array, ""] | None
 
     def __init__(
         self,
@@ -147,12 +153,14 @@ class ImageResidual(Residual):
         background: Arrayable = (1.0, 1.0, 1.0),
         *,
         compositing: Mode | Compositing[Any] | Any = "over",
+        blur: Arrayable | None = None,
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
         self.scene = cast(SceneFunction, scene)
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
+        self.blur = None if blur is None else _not_negative("blur", blur)
         by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
         for number, view in enumerate(_pairs(views)):
             camera, image = _view(number, *view)
@@ -182,6 +190,11 @@ class ImageResidual(Residual):
                 f"{width * channels}. Raise max_jacobian, or fit fewer parameters."
             )
         pieces = math.ceil(height / min(height, most // (width * channels)))
+        if pieces > 1 and self.blur is not None:
+            raise ValueError(
+                f"max_jacobian leaves room for {most} entries of the residual, and blurred images are not "
+                f"split: one has {height * width * channels}. Raise max_jacobian, or leave out blur."
+            )
         rows = math.ceil(height / pieces)
         weight = 1 / math.sqrt(self.count())
 
@@ -202,7 +215,12 @@ class ImageResidual(Residual):
             reference = group.images[view, jnp.minimum(row, height - 1)]
             # the last piece may reach past the image
             inside = (row < height)[:, None, None]
-            return jnp.where(inside, (rendered - reference) * weight, 0).reshape(-1)
+            difference = jnp.where(inside, (rendered - reference) * weight, 0)
+            if self.blur is not None:
+                for axis, n in enumerate((height, width)):
+                    kernel = _blurring(n, self.blur * height)
+                    difference = jnp.moveaxis(jnp.tensordot(kernel, difference, axes=(1, axis)), 0, axis)
+            return difference.reshape(-1)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return Tiles(residual, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
@@ -232,6 +250,19 @@ class ImageResidual(Residual):
                 f"scene must return a camera of its view's size {of_view.size}; got {result[2].size}."
             )
         return (*result, None) if len(result) == 4 else result
+
+
+def _not_negative(name: str, value: Arrayable) -> Float[Array, ""]:
+    message = f"{name} must not be negative; got {{got}}."
+    return require(finite_array(name, value, ()), lambda sigma: sigma >= 0, message)
+
+
+def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
+    """Matrix that blurs a line of `n` pixels by a Gaussian, `sigma` in pixels; the identity for 0. Weights of
+    the pixels that exist sum to 1."""
+    at = jnp.arange(n, dtype=sigma.dtype)
+    away = (at[:, None] - at[None, :]) / jnp.maximum(sigma, 1e-3)
+    return jax.nn.softmax(-(away**2) / 2, axis=1)
 
 
 def _pairs(views: Any) -> list[tuple[Any, Any]]:

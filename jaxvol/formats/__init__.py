@@ -3,6 +3,8 @@
 A registry maps endings to readers, and `register` adds to it. A reader returns the arguments of `Volume`
 that the file holds; the caller's own arguments to `load` override them.
 
+`load_ultrasound` reads files of ultrasound as acquired, which hold a probe beside the voxels.
+
 Files are data: nothing is unpickled, and the content of a file is checked against its header before
 memory is allocated for it. (`medical` says for which files that is left to SimpleITK.)
 """
@@ -15,7 +17,9 @@ from typing import Any, TypeAlias
 from .._util.checks import Arrayable
 from .._util.files import Header
 from .._util.npy import read_npy, read_npz
+from ..transforms import ToroidalMap
 from ..volume import Volume
+from .kretz import read_kretz, refuse_kretz
 from .medical import read_medical
 from .raw import read_raw
 
@@ -28,6 +32,7 @@ READERS: dict[str, Reader] = {
     ".npy": read_npy,
     ".npz": read_npz,
     **dict.fromkeys((".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), read_medical),
+    ".vol": refuse_kretz,
 }
 
 
@@ -70,13 +75,10 @@ def load(
 
     **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or
     shorter than its header says, or without a header; for an image that is oblique, not 3-D or not scalar;
-    and for anything that `Volume` rejects. `ImportError` for a format that needs SimpleITK if it is missing.
+    for `.vol` files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for
+    a format that needs SimpleITK if it is missing.
     """
-    path = Path(path)
-    if not path.exists():
-        raise ValueError(
-            f"path: there is no file {path} (working directory {Path.cwd()}). Check the spelling."
-        )
+    path = _existing(path)
     ending = max((e for e in READERS if path.name.lower().endswith(e)), key=len, default=None)
     if ending is None:
         fault = "is a directory" if path.is_dir() else "has an unknown ending"
@@ -89,6 +91,46 @@ def load(
         return Volume(**arguments)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from fault
+
+
+def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:
+    """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world.
+
+    | ending | what |
+    |---|---|
+    | `.vol` | Kretz files of GE Voluson scanners, `KRETZFILE 1.0`, uncompressed; 8-bit voxels |
+
+    Read are the volume and its geometry, and nothing of the patient or the settings; of a Doppler scan, the
+    B-mode volume. Angles are taken as they stand in the file, with the middle beam at π/2; those of planes
+    and beams must be evenly spaced to 0.01 of a step, by which a voxel may be misplaced. The first sample of
+    a beam has depth γ = 0.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Returns:** the volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render
+    them with `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
+
+    **Raises:** `ValueError` for a file that is missing, empty, corrupt, cut short, compressed, of another
+    kind, or lacks an item; for angles that are not evenly spaced; and for what `ToroidalMap` and `Volume`
+    reject. Sizes are compared with the file's before memory is taken.
+
+    The format is not published. The reader is tested on files written by its tests, after the readers of
+    SlicerHeart and plooney/kretz, and not on a scanner's own.
+    """
+    path = _existing(path)
+    data, probe = read_kretz(path)
+    return Volume(data), probe
+
+
+def _existing(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    if not path.exists():
+        raise ValueError(
+            f"path: there is no file {path} (working directory {Path.cwd()}). Check the spelling."
+        )
+    return path
 
 
 def register(ending: str, reader: Reader) -> None:

@@ -42,6 +42,8 @@ def toroidal_phantom(
 before | 220, falling by 15 % each; 8 between |
     | `spheres` | rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
 tissue 60; cysts 4; targets 130, 160, 190 |
+    | `wires` | the spheres, and between them wires 3 mm thick, along x, along y and obliquely in depth | as \
+spheres; wires 255 |
     | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
 90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
 
@@ -135,6 +137,13 @@ def _spheres(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     return echo
 
 
+def _wires(x: Block, y: Block, z: Block, gamma: Block) -> Block:
+    echo = _spheres(x, y, z, gamma)
+    for wire in WIRES:
+        _paint(echo, 255, wire.distance(x, y, z))
+    return echo
+
+
 def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     # origin at the navel; x from crown to rump, y from right to left, z from back to front
     at = x, y, 100 - z
@@ -158,6 +167,13 @@ def _joined(shapes: Iterable[Shape], at: tuple[Block, Block, Block], blend: floa
     """Distance to the union of shapes, with rounded seams."""
     return reduce(lambda a, b: smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
 
+
+WIRES = [
+    capsule((-60, 0, 110), (60, 0, 110), 1.5),
+    capsule((0, -55, 75), (0, 55, 75), 1.5),
+    capsule((-25, -15, 65), (25, 15, 130), 1.5),
+    capsule((25, -15, 65), (-25, 15, 130), 1.5),
+]
 
 # parts of the fetus; of paired ones, that at y > 0
 SHOULDER, ELBOW, WRIST, FINGERS = (-11, 13, 0), (3, 20, 7), (-10, 13, 17), (-16, 11, 20)
@@ -188,4 +204,4 @@ SPINE = [ball((x, 0, -10 - 0.004 * (30 - abs(x - 4)) * x), 1.8) for x in range(-
 CORD = tube([(13, 0, 12), (11, -9, 20), (18, -19, 21), (29, -25, 15), (36, -27, 4), (38, -27, -10)], 2.2)
 
 
-SCENES: dict[str, Scene] = {"shells": _shells, "spheres": _spheres, "fetus": _fetus}
+SCENES: dict[str, Scene] = {"shells": _shells, "spheres": _spheres, "wires": _wires, "fetus": _fetus}

@@ -44,7 +44,9 @@ class ToroidalMap(Transform):
     **Arguments:**
 
     - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
-      behind the axis, as in probes whose array turns about a near axis.
+      behind the axis, as in probes whose array turns about a near axis. Samples that then lie behind the
+      axis, where ρ would be negative (`nearest_to_axis`), are not shown: the world has such points at
+      another β.
     - `b`: distance from the apex to depth γ = 0, world length.
     - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
       [0, π], increasing.
@@ -129,6 +131,13 @@ class ToroidalMap(Transform):
         """Center of the bounds."""
         low, high = self.corners
         return (low + high) / 2
+
+    @property
+    def nearest_to_axis(self) -> Float[Array, ""]:
+        """Distance from the motor axis at which the outermost beams begin: ρ of the sample nearest to the
+        axis; negative if it lies behind the axis, world length."""
+        depth = self.b + self.gamma_range[0]
+        return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
 
     def locate(self, space: Space, volume: Volume) -> Space:
         return _Sector(self, volume.shape)

@@ -729,7 +729,7 @@ def test_image_gradients_in_the_probe_match_central_differences(adjoint, positio
 # ---- phantoms, a real scan, bad input ----
 
 
-@pytest.mark.parametrize("name", ["shells", "spheres", "fetus"])
+@pytest.mark.parametrize("name", ["shells", "spheres", "wires", "fetus"])
 def test_a_phantom_is_one_scene_at_every_shape(name):
     fine, probe = toroidal_phantom(name, (17, 21, 33), speckle=False)
     coarse, _ = toroidal_phantom(name, (9, 11, 17), speckle=False)
@@ -759,6 +759,12 @@ def test_phantoms_hold_what_their_table_says():
     np.testing.assert_allclose(
         echo_at("spheres", [*centers, (0, 0, 60)]), [4, 4, 4, 130, 160, 190, 60], atol=1
     )
+    # wires, and tissue beside them
+    found = echo_at(
+        "wires", [(30, 0, 110), (0, -40, 75), (0, 0, 97.5), (30, 6, 110), (30, 0, 116)], (129, 161, 257)
+    )
+    assert np.all(found[:3] > 200)
+    np.testing.assert_allclose(found[3:], 60, atol=1)
     # amniotic fluid above the belly, uterus, belly, brain, skull (some of it between nodes)
     seen = echo_at("fetus", [(5, 0, 76), (0, 0, 140), (13, 0, 97), (-36, 0, 98), (-45.5, 0, 98)])
     np.testing.assert_allclose(seen[:4], [4, 30, 70, 40], atol=1)
@@ -807,6 +813,9 @@ BAD = {
     "through the apex": ({"b": 5.0, "gamma_range": (-5, 60)}, "gamma_range must begin beyond the apex"),
     "NaN": ({"a": float("nan")}, "a must be finite"),
     "infinite": ({"gamma_range": (0, float("inf"))}, "gamma_range must be finite"),
+    "no angle": ({"sigma_range": (1.5, 1.5)}, "sigma_range must be .* first < last"),
+    "over pi": ({"beta_range": (0.1, 3.3)}, r"beta_range must lie in \[0, π\]"),
+    "a first depth behind the apex": ({"b": -5.0}, "gamma_range must begin beyond the apex"),
     "not a number": ({"b": (1, 2)}, r"b must have shape \(\)"),
     "three ends": ({"beta_range": (1, 1.5, 2)}, r"beta_range must have shape \(2,\)"),
 }
@@ -817,6 +826,23 @@ def test_bad_probes_are_named(case):
     changes, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         jv.ToroidalMap(**{**GOOD, **changes})
+
+
+def test_b_may_be_negative_where_depth_begins_beyond_the_apex():
+    one = jv.ToroidalMap(**{**GOOD, "b": -5.0, "gamma_range": (35, 95)})
+    other = jv.ToroidalMap(**{**GOOD, "b": 30.0, "gamma_range": (0, 60)})
+    np.testing.assert_allclose(one.bounds, other.bounds, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", PROBES)
+@pytest.mark.parametrize("lower", [0.0, 60.0])
+def test_the_sample_nearest_to_the_axis_is_that_of_the_formula(name, lower):
+    """ρ = a + (b + γ) cos(σ - π/2), least of all samples; negative if the axis lies beyond."""
+    a, b, beta, sigma, gamma = PROBES[name]
+    _, angle, depth = np.moveaxis(nodes(PROBES[name], (2, 40, 40)), -1, 0)
+    least = np.min(a - lower + (b + depth) * np.cos(angle - HALF))
+    probe = jv.ToroidalMap(a - lower, b, beta, sigma, gamma)
+    np.testing.assert_allclose(probe.nearest_to_axis, least, atol=1e-4)
 
 
 def test_bad_points_are_named():
@@ -830,7 +856,7 @@ def test_bad_points_are_named():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("skull",), "name must be one of shells, spheres, fetus; got 'skull'"),
+        (("skull",), "name must be one of shells, spheres, wires, fetus; got 'skull'"),
         (("fetus", 64), "shape must be three numbers of nodes"),
         (("fetus", (64, 64)), "shape must be three numbers of nodes"),
         (("fetus", (64, 4, 64)), "shape must be an integer of at least 8; got 4"),

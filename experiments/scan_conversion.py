@@ -1,0 +1,162 @@
+"""What error does scan conversion bring, by the spacing of its grid, and what does it cost?
+
+Ultrasound as acquired is rendered under its `ToroidalMap`, without resampling, and after `scan_convert` onto
+Cartesian grids of different spacing, in distances between the samples of a beam. Every image is compared with
+the converged image of the volume as acquired. Beside the error of a frame at steps of one such distance is
+that of converged frames, which resampling alone brings; and the time of a frame, the time of the conversion,
+and the size of the grid. 8-bit voxels stay 8-bit; one grid is measured in float32, too.
+
+The scan `us_aplio_convex` is read from the folder that JAXVOL_DATA names; without one, only the phantom of
+wires is measured.
+"""
+
+import time
+from argparse import Namespace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.metrics import rmse
+
+from . import common, probe_geometry, timing
+from .common import plt
+
+
+SPACINGS = (8.0, 4.0, 2.0, 1.0)
+"""In distances between the samples of a beam."""
+DIRECT = "as acquired"
+FLOAT = 2.0
+"""The spacing at which a grid of float32 is measured, too: what rounding to 8 bits adds."""
+FINER = 4
+"""How many times finer the step of the frames is that show what resampling alone brings."""
+BODY = [(50, (0.1, 0.04, 0.03), 0.0), (90, (0.8, 0.5, 0.35), 0.1), (170, (1.0, 0.9, 0.8), 0.5)]
+
+
+class Scene(NamedTuple):
+    volume: jv.Volume
+    probe: jv.ToroidalMap
+    transfer: jv.TransferFunction
+    camera: jv.Camera
+
+    @property
+    def sample(self) -> float:
+        """Distance between the samples of a beam, mm."""
+        first, last = self.probe.gamma_range
+        return float(last - first) / (self.volume.shape[2] - 1)
+
+
+def phantom(name: str, folder: Path | None, size: int, resolution: int) -> Scene:
+    volume, probe = jv.toroidal_phantom(name, (resolution // 3, resolution // 2, resolution))
+    camera = jv.Camera((60, -150, -110), (0, 0, 95), (1, 0, 0), 30.0, size=(size, size))
+    points = BODY if name == "fetus" else probe_geometry.TISSUE
+    return Scene(volume, probe, jv.TransferFunction.from_points(points), camera)
+
+
+def scan(folder: Path | None, size: int, resolution: int) -> Scene:
+    assert folder is not None
+    data = np.asarray(jv.load(folder / probe_geometry.SCAN).data)
+    volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
+    probe = probe_geometry.real_probe(probe_geometry.elevation_angle.ELEVATION / 2)
+    camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
+    return Scene(volume, probe, jv.colormap("gray", (60, 200), (0.0, 0.5)), camera)
+
+
+PHANTOM = "wires phantom"
+SCENES = {
+    PHANTOM: partial(phantom, "wires"),
+    "fetus phantom": partial(phantom, "fetus"),
+    "us_aplio_convex": scan,
+}
+
+
+def measure(scene: Scene, spacings: tuple[float, ...], repetitions: int) -> dict[str, dict[str, Any]]:
+    """Errors, times and sizes: as acquired, and by the spacing of the grid."""
+    grids, rows = {DIRECT: scene.volume}, {DIRECT: {"spacing": None, "convert seconds": 0.0}}
+    for spacing in spacings:
+        for dtype in (None, "float32") if spacing == FLOAT else (None,):
+            name = f"{spacing:g}" + (f", {dtype}" if dtype else "")
+            convert = partial(jv.scan_convert, scene.volume, scene.probe, spacing * scene.sample, dtype=dtype)
+            jax.block_until_ready(convert().data)  # compiles it
+            begin = time.perf_counter()
+            grids[name] = jax.block_until_ready(convert())
+            rows[name] = {"spacing": spacing, "convert seconds": round(time.perf_counter() - begin, 4)}
+
+    def frame(name: str, finer: int = 1) -> jv.Rendering:
+        located = (scene.probe,) if name == DIRECT else ()
+        march = jv.March(scene.sample / finer, (*located, jv.AlphaCorrection()), "midpoint")
+        return jv.render(grids[name], scene.transfer, scene.camera, march, outputs="rgba")
+
+    truth = frame(DIRECT, common.FINER).rgba
+    seconds = timing.interleaved({name: partial(frame, name) for name in grids}, repetitions)
+    for name, row in rows.items():
+        row |= common.row(seconds[name], seconds[DIRECT], rmse(frame(name).rgba, truth))
+        row["rmse, converged"] = rmse(frame(name, FINER).rgba, truth)
+        row["MiB"] = round(grids[name].data.nbytes / 2**20, 3)
+        row["shape"] = grids[name].shape
+    return rows
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    """Error and time of frames against the spacing; as acquired, which has none, as lines."""
+    panels = {"rmse, converged": "RMSE by resampling alone", "rmse": "RMSE of a frame"}
+    panels |= {"seconds": "seconds for a frame (dotted: and to convert)", "MiB": "size of the voxels, MiB"}
+    figure, axes = plt.subplots(1, len(panels), figsize=(13, 3.4), layout="constrained")
+    for number, (scene, rows) in enumerate(result["scenes"].items()):
+        mine = [row for name, row in rows.items() if row["spacing"] and "," not in name]
+        at = [row["spacing"] for row in mine]
+        for panel, key in zip(axes, panels, strict=True):
+            panel.plot(at, [row[key] for row in mine], f"C{number}o-", label=scene)
+            panel.axhline(rows[DIRECT][key], color=f"C{number}", linestyle="--", linewidth=1)
+            if key == "seconds":
+                panel.plot(at, [row[key] + row["convert seconds"] for row in mine], f"C{number}:")
+    for panel, label in zip(axes, panels.values(), strict=True):
+        panel.set_xscale("log", base=2)
+        panel.set_yscale("log")
+        panel.set_xlabel("spacing / distance between samples", fontsize=8)
+        panel.set_title(label, fontsize=9)
+    figure.suptitle("scan-converted (solid), as acquired (dashed)", fontsize=9)
+    axes[0].legend(fontsize=7)
+    common.save(figure, path)
+
+
+@common.experiment(
+    "scan_conversion",
+    "What error does scan conversion bring against rendering as acquired, and what does it cost?",
+    __doc__,
+    repetitions=7,
+    size=128,
+    resolution=160,
+    only=common.some_of(SCENES, "SCENE"),
+)
+def main(chosen: Namespace) -> common.Answer:
+    folder, names = common.available(chosen, PHANTOM)
+    spacings = SPACINGS
+    if chosen.quick:
+        chosen.size, chosen.resolution, chosen.repetitions, spacings = 24, 24, 1, (4.0, 2.0)
+    scenes = {}
+    for name in names:
+        scenes[name] = measure(
+            SCENES[name](folder, chosen.size, chosen.resolution), spacings, chosen.repetitions
+        )
+        for grid, row in scenes[name].items():
+            print(
+                f"{name:16} {grid:14} RMSE {row['rmse']:.5f}, converged {row['rmse, converged']:.5f}"
+                f"  {1e3 * row['seconds']:7.1f} ms  to convert {1e3 * row['convert seconds']:7.1f} ms"
+                f"  {row['MiB']:8.2f} MiB",
+                flush=True,
+            )
+    result = {
+        "image": [chosen.size] * 2,
+        "repetitions": chosen.repetitions,
+        "spacings": spacings,
+        "scenes": scenes,
+    }
+    return result, partial(draw, result)
+
+
+if __name__ == "__main__":
+    main()
