@@ -137,7 +137,7 @@ def _unmatched(
         index = (edge - _known(other.origin)[axis]) / _known(other.spacing)[axis]
         first, last = np.floor(index[0] + 1e-5), np.ceil(index[1] - 1e-5)
         ends = np.clip([first, last], 0, other.shape[axis] - 1).astype(int)
-        touched = [others.touched(a, b, other.shape[axis]) for a, b in ends.T]
+        touched = [others.touched(a, b, other.shape[axis]) for a, b in ends.T.tolist()]
         low, high = (
             over_intervals(low, axis, touched, np.minimum),
             over_intervals(high, axis, touched, np.maximum),

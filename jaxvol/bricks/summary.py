@@ -61,7 +61,7 @@ class Summary:
         touched = tuple(
             slice(first, last + 1)
             for first, last in (
-                self.touched(a, b - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
+                self.touched(int(a), int(b) - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
             )
         )
         return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
