@@ -1350,7 +1350,7 @@ BAD = {
     "materials": (lambda: ScattererTemplates((), SUN), "materials must hold at least one Material"),
     "lighting": (
         lambda: jv.render(nodes({}), TRANSFER, around(nodes({})), jv.March(0.1), lighting=3),
-        "lighting must be None or a Lighting, such as ScattererTemplates; got 3",
+        "lighting must be None or a Lighting; got 3",
     ),
     "deferred": (lambda: Deferred(3), "lighting must be a Lighting, such as ScattererTemplates; got 3"),
     "labels": (

@@ -79,7 +79,8 @@ def test_the_variation_bounds_every_change_of_extinction_and_emission(seed, poin
     values = np.sort(random.random(points)).astype(np.float32)
     transfer = jv.TransferFunction(values, random.random((points, 3)), random.random(points) * 5)
     low, high = np.sort(random.uniform(-0.2, 1.2, (2, 30)), axis=0)
-    windows = Windows(*(jnp.asarray(a, jnp.float32).reshape(30, 1, 1) for a in (low, high, 0 * low)))
+    least, most, bend = (jnp.asarray(a, jnp.float32).reshape(30, 1, 1) for a in (low, high, 0 * low))
+    windows = Windows(least, most, bend)
     found = transfer.variation(windows)
     for bound, turns, colored, _, a, b in zip(*(np.ravel(part) for part in found), low, high, strict=True):
         at = np.linspace(a, b, 2001)
