@@ -102,8 +102,8 @@ class Job(NamedTuple):
 def march_batch(
     job: Job, rows: Int[Array, " batch"], state: State, keep: Int[Array, ""]
 ) -> tuple[State, Bool[Array, " batch"]]:
-    """Marches the groups in these rows while more than `keep` of them are alive, and tells which still are.
-    A row past the last one stands for no group."""
+    """Marches the groups in these rows by `Tiling.turns` segments, or else while more than `keep` of them are
+    alive, and tells which still are. A row past the last one stands for no group."""
     tiling, beams, visitor = job.tiling, job.beams, job.visitor
     size, group = rows.size, tiling.group
     known = jnp.minimum(rows, beams.groups - 1)
@@ -152,13 +152,24 @@ def march_batch(
     # segments in which a ray may shift, or run out of samples, cost a tenth more: so as few as possible
     limited = job.pipeline.march.max_samples is not None or job.exact
     marched: State = here, (mine, more, total)
-    if job.pipeline.march.may_shift or limited:
+
+    def turn(_: Int[Array, ""], state: State) -> State:
+        here, visited = state
+        # one that is out of samples, but not finished, must not take more
+        over = ~job.alive(here)
+        state = with_fields(here, finished=over), visited
+        after, visited = advance(state, regular=not (job.pipeline.march.may_shift or limited))
+        return with_fields(after, finished=jnp.where(over, here.finished, after.finished)), visited
+
+    if tiling.turns:
+        marched = jax.lax.fori_loop(0, tiling.turns, turn, marched)
+    elif job.pipeline.march.may_shift or limited:
         marched = jax.lax.while_loop(
             lambda state: enough(state[0]) & (limited | jnp.any(job.shifts(state[0]))),
             partial(advance, regular=False),
             marched,
         )
-    if not limited:
+    if not (tiling.turns or limited):
         marched = jax.lax.while_loop(lambda state: enough(state[0]), partial(advance, regular=True), marched)
     here, (mine, more, total) = marched
     visited = jax.tree.map(scatter, carry, mine), jax.tree.map(scatter_add, sums, more), total

@@ -94,7 +94,7 @@ def _marched(job: Job, state: State) -> State:
     def round_(state: tuple[State, Bool[Array, " groups"]]) -> tuple[State, Bool[Array, " groups"]]:
         rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
         # only full batches, as long as there are any: what remains joins those of the next round
-        batches = jnp.maximum(count // size, 1)
+        batches = 1 if job.tiling.turns else jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, enough, 0)
 
         def one(i: Int[Array, ""], state: tuple[State, Array]) -> tuple[State, Array]:
