@@ -32,7 +32,9 @@ def on_gpu() -> bool:
     return platform() in ("gpu", "cuda", "rocm")
 
 
-def while_loop(cond: Callable[[State], Bool[Array, ""]], body: Callable[[State], State], start: State) -> State:
+def while_loop(
+    cond: Callable[[State], Bool[Array, ""]], body: Callable[[State], State], start: State
+) -> State:
     """`jax.lax.while_loop`. On a GPU, it looks at the condition once in `TURNS`; surplus turns change
     nothing."""
 

@@ -57,4 +57,4 @@ class Tiling(NamedTuple):
         return GPU if on_gpu() else Tiling()
 
 
-GPU = Tiling(cells=8, batch=2**14, turns=32, tile=2**14, searched=2**16, chunk=0)
+GPU = Tiling(batch=2**13, turns=16, tile=2**14, searched=2**16, chunk=0)
