@@ -23,7 +23,7 @@ TURNS = 16
 def platform() -> str:
     """The platform of a program that is traced now: that of `jax.default_device`, or else of JAX's default
     backend. Arrays that were put on another device make it as right, but not as fast."""
-    device = jax.config.jax_default_device
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return jax.default_backend() if device is None else getattr(device, "platform", str(device))
 
 

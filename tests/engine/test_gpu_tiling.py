@@ -51,10 +51,10 @@ def toroidal() -> Scene:
     transfer = jv.TransferFunction.from_points([(20, (1, 0.7, 0.5), 0.0), (200, (1, 1, 1), 0.5)], 5.0)
     transforms = probe, jv.Jitter(2), jv.AlphaCorrection(), jv.SpaceLeaping()
     march = jv.March(2.0, transforms)
-    low, high = (np.asarray(corner) for corner in march.locate(volume).corners)
-    camera = jv.Camera(
-        low + (0.4, -1.5, 0.3) * (high - low), (low + high) / 2, (0, 0, 1), 40.0, size=(45, 38)
-    )
+    space = march.locate(volume)
+    center = np.array([float(m) for m in space.middle])
+    position = center + 1.5 * float(space.diagonal) * np.array([0.5, -0.7, 0.5])
+    camera = jv.Camera(position, center, (0, 0, 1), 30.0, size=(45, 38))
     return Scene(volume, transfer, camera, march)
 
 
@@ -107,7 +107,7 @@ def test_images_and_gradients_are_those_of_the_tiling_for_cpus(name):
     assert_same(other, image)
     assert any(np.any(leaf != 0) for leaf in jax.tree.leaves(expected))
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.linalg.norm(b) + 1e-9)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * float(np.linalg.norm(b)) + 1e-9)
 
 
 def assert_same(found: jv.Rendering, expected: jv.Rendering) -> None:
@@ -131,7 +131,7 @@ def test_gradients_of_voxels_are_those_of_the_tiling_for_cpus():
 
     expected, found = gradient(Tiling()), gradient(SMALL)
     assert np.linalg.norm(expected) > 0
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.linalg.norm(expected))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * float(np.linalg.norm(expected)))
 
 
 def test_rays_that_are_out_of_samples_rest_in_surplus_turns():
