@@ -84,17 +84,25 @@ def _while(params: Any, given: list[Any], count: RoundTrips) -> tuple[list[Any],
     of_cond, of_body = params["cond_nconsts"], params["body_nconsts"]
     cond, body = given[:of_cond], given[of_cond : of_cond + of_body]
 
-    def look(state: Any) -> Any:
-        carry, _ = state
+    def goes_on(carry: Any) -> Any:  # for each element, where a batch of loops was made one
         return _called(params["cond_jaxpr"], [*cond, *carry], count)[0][0]
+
+    def look(state: Any) -> Any:
+        return jnp.any(goes_on(state[0]))
 
     def turn(state: Any) -> Any:
         carry, count = state
-        count = count._replace(looks=count.looks + 1)
-        return _called(params["body_jaxpr"], [*body, *carry], count)
+        found, count = _called(params["body_jaxpr"], [*body, *carry], count._replace(looks=count.looks + 1))
+        goes = goes_on(carry)
+        return [_where(goes, new, old) for new, old in zip(found, carry, strict=True)], count
 
     after, count = jax.lax.while_loop(look, turn, (given[of_cond + of_body :], count))
     return after, count._replace(looks=count.looks + 1)  # the look that ends it
+
+
+def _where(goes: Any, new: Any, old: Any) -> Any:
+    """`new`, where a loop goes on; its further axes are not those of the batch."""
+    return jnp.where(goes.reshape(goes.shape + (1,) * (new.ndim - goes.ndim)), new, old)
 
 
 def _cond(params: Any, given: list[Any], count: RoundTrips) -> tuple[list[Any], RoundTrips]:
