@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._util.platform import on_gpu
 from ._util.sharding import varying
 from ._util.vec3 import Scalar, Vec3, along
 from .occupancy import Index, Occupancy, Sums
@@ -121,9 +122,7 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
     length = jnp.maximum(multiple, 1) * stretch
     number = jnp.minimum(jnp.ceil(jnp.max(across) / length).astype(jnp.int32), STRETCHES)
 
-    def visit(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        at, next_one, table = state
-        at = at - 1
+    def occupied(at: Int[Array, ""]) -> Bool[Array, " beams"]:
         first = at.astype(length.dtype) * length
         low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
         shape, inside = occupancy.occupied.shape, first < across
@@ -138,8 +137,17 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
             )
             return x, y, z
 
-        occupied = inside & sums.any_between(cells(low), cells(high))
-        next_one = jnp.where(occupied, at, next_one)
+        return inside & sums.any_between(cells(low), cells(high))
+
+    if on_gpu():  # all at once: a loop would take longer to launch than to run
+        at = jnp.arange(STRETCHES, dtype=jnp.int32)
+        own = jnp.where(jax.vmap(occupied)(at), at[:, None], STRETCHES)
+        return Stretches(box.near, length, jax.lax.cummin(own, axis=0, reverse=True))
+
+    def visit(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        at, next_one, table = state
+        at = at - 1
+        next_one = jnp.where(occupied(at), at, next_one)
         return at, next_one, jax.lax.dynamic_update_slice_in_dim(table, next_one[None], at, 0)
 
     none = jnp.full(box.near.shape, STRETCHES, jnp.int32)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from ._util.memo import memoized
+from ._util.platform import while_loop
 from ._util.sharding import varying
 from ._util.vec3 import Vec3
 from ._util.xla import gather
@@ -174,7 +175,7 @@ class Occupancy(eqx.Module):
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
-        _, distance, _ = jax.lax.while_loop(go_on, grow, varying(start))
+        _, distance, _ = while_loop(go_on, grow, varying(start))
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:

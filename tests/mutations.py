@@ -72,6 +72,7 @@ DIFFERENCES = (
 NAN = "engine/test_faults.py::test_nan_and_infinity_reach_image_and_gradient[leaping]"
 VMAP = "engine/test_vmap.py::test_over_one_part[cameras-uint8]"
 PACKED = "transforms/test_space_leaping.py::test_packed_voxels_are_the_same_values"
+ON_GPUS = "engine/test_gpu_tiling.py"
 RENDERED = "test_agreement.py::test_render_agrees_with_the_independent_marcher"
 
 SLOPES = "lighting/test_phong.py::test_the_gradient_is_interpolated_between_central_differences"
@@ -1180,6 +1181,56 @@ MUTATIONS = [
         "return jax.lax.map(one, [leaf for leaf, moves in",
         "return jax.lax.map(one, [leaf[::-1] for leaf, moves in",
         (VMAP,),
+    ),
+    # programs for GPUs
+    Mutation(
+        "gpu: rays that are out of samples go on in surplus turns",
+        "engine/batch.py",
+        "over = ~job.alive(here)",
+        "over = here.finished",
+        (f"{ON_GPUS}::test_rays_that_are_out_of_samples_rest_in_surplus_turns",),
+    ),
+    Mutation(
+        "gpu: segments are taken whole although rays may still shift",
+        "engine/batch.py",
+        "regular=not may_end",
+        "regular=True",
+        (f"{ON_GPUS}::test_images_and_gradients_are_those_of_the_tiling_for_cpus[defaults]",),
+    ),
+    Mutation(
+        "gpu: a group that is alive after its turns is dropped",
+        "engine/wavefront.py",
+        'state[1].at[some].set(going, mode="drop")',
+        'state[1].at[some].set(going & (keep > 0), mode="drop")',
+        (f"{ON_GPUS}::test_images_and_gradients_are_those_of_the_tiling_for_cpus[defaults]",),
+    ),
+    Mutation(
+        "gpu: surplus turns of a loop change its state",
+        "_util/platform.py",
+        "partial(jnp.where, cond(state))",
+        "partial(jnp.where, True)",
+        ("_util/test_platform.py::test_surplus_turns_change_nothing",),
+    ),
+    Mutation(
+        "gpu: what is to lie in memory takes a branch",
+        "_util/xla.py",
+        "return jax.lax.optimization_barrier(f(*arguments))",
+        "return jax.lax.cond(live, f, f, *arguments)",
+        (f"{ON_GPUS}::test_a_program_for_cuda_has_no_branch",),
+    ),
+    Mutation(
+        "gpu: stretches of beams look back",
+        "beams.py",
+        "axis=0, reverse=True)",
+        "axis=0)",
+        ("test_beams.py::test_stretches_are_the_same_all_at_once",),
+    ),
+    Mutation(
+        "gpu: samples that are not chosen overwrite the first one",
+        "_util/compaction.py",
+        "jnp.arange(chosen.size, dtype=jnp.int32), chosen.size)",
+        "jnp.arange(chosen.size, dtype=jnp.int32), 0)",
+        ("_util/test_compaction.py::test_all_at_once_each_chosen_one_is_put_where_it_was_and_no_other",),
     ),
     # ultrasound as acquired
     Mutation(

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol._util import platform
 from jaxvol._util.vec3 import apart
-from jaxvol.beams import Box, stretches
+from jaxvol.beams import STRETCHES, Box, stretches
 from jaxvol.occupancy import Occupancy
+
+from .round_trips import counted
 
 
 VOLUME = jv.Volume(np.zeros((33, 41, 29), np.uint8), (0.1, 0.07, 0.12), (-1.0, 0.3, 2.0))
@@ -77,3 +80,20 @@ def test_stretches_called_empty_contain_nothing_along_any_ray(way):
 @jax.jit
 def known(occupancy, box):
     return stretches(occupancy, occupancy.sums(), box, jnp.float32(0.3))
+
+
+def test_stretches_are_the_same_all_at_once(monkeypatch):
+    occupied = np.random.default_rng(0).random(BLOCKS) < 0.005
+    occupancy = Occupancy(jnp.asarray(occupied), apart(VOLUME.origin), SIZES)
+    boxes = [Box.within(occupancy, *corners) for _, corners in beams((-0.6, 0.2, 0.1))]
+    box = jax.tree.map(lambda *leaves: jnp.stack(leaves), *boxes)
+    arguments = occupancy, occupancy.sums(), box, jnp.float32(0.05)
+    in_turn, (looks, _) = counted(stretches, *arguments)
+    monkeypatch.setattr(platform, "platform", lambda: "gpu")
+    at_once, trips = counted(stretches, *arguments)
+    assert looks > 20
+    assert trips.number == 0
+    last = STRETCHES
+    assert (in_turn.following < last).any()
+    assert (in_turn.following == last).any()
+    jax.tree.map(np.testing.assert_array_equal, in_turn, at_once)

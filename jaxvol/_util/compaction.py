@@ -21,7 +21,7 @@ class Chosen(NamedTuple):
     - `indices`: flat indices of the chosen entries, padded with indices past the end.
     - `number`: how many are chosen.
     - `columns`: of the arrays.
-    - `chunk`: entries processed at a time.
+    - `chunk`: entries processed at a time; all, chosen or not, if 0.
     """
 
     indices: Int[Array, " entries"]
@@ -34,10 +34,14 @@ class Chosen(NamedTuple):
         """The entries where these are true."""
         whole = jnp.concatenate(chosen)
         number = jnp.sum(whole, dtype=jnp.int32)
-        return cls(in_front(whole.reshape(-1), chunk), number, whole.shape[1], chunk)
+        flat = whole.reshape(-1)
+        indices = in_front(flat, chunk) if chunk > 0 else in_place(flat)
+        return cls(indices, number, whole.shape[1], chunk)
 
     def fold(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
         """Folds `one(indices, carry)` over the chunks of indices."""
+        if self.chunk == 0:
+            return one(self.indices, start)
 
         def body(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
             i, carry = state
@@ -87,6 +91,11 @@ def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, 
         .at[jnp.where(padded, rank.reshape(-1), last)]
         .set(jnp.arange(last, dtype=jnp.int32), mode="drop", unique_indices=True)
     )
+
+
+def in_place(chosen: Bool[Array, " entries"]) -> Int[Array, " entries"]:
+    """Indices of the chosen entries, where these are; past the end for all others."""
+    return jnp.where(chosen, jnp.arange(chosen.size, dtype=jnp.int32), chosen.size)
 
 
 def _popcount(words: UInt32[Array, "*words"]) -> Int[Array, "*words"]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .platform import on_gpu
 from .vec3 import Scalar, Vec3
 from .xla import gather
 
@@ -40,7 +41,7 @@ def points_below(
         how, side = "compare_all" if last < 2 * FEW else "scan_unrolled", "left" if strictly else "right"
         return jnp.searchsorted(values, value, side=side, method=how).astype(jnp.int32)
 
-    if last < FEW:
+    if last < FEW or on_gpu():  # there, a branch costs more
         return searched(value)
     first, step = values[0], (values[-1] - values[0]) / last
 

@@ -12,6 +12,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool
 
 from .checks import is_traced
+from .platform import on_gpu
 from .sharding import varying
 from .trees import PyTree
 
@@ -179,7 +180,12 @@ def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> 
     """`f(*arguments)`, computed once and stored in memory.
 
     XLA recomputes what it fuses for each use, fetches too, but the results of a branch lie in memory. `live`
-    must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN."""
+    must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN.
+
+    On a GPU, a branch would wait for the host; but there XLA fuses nothing across an `optimization_barrier`,
+    which on CPU it removes before it fuses."""
+    if on_gpu():
+        return jax.lax.optimization_barrier(f(*arguments))
     f = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
 
     def never(*arguments: Any) -> Any:

@@ -102,8 +102,8 @@ class Job(NamedTuple):
 def march_batch(
     job: Job, rows: Int[Array, " batch"], state: State, keep: Int[Array, ""]
 ) -> tuple[State, Bool[Array, " batch"]]:
-    """Marches the groups in these rows while more than `keep` of them are alive, and tells which still are.
-    A row past the last one stands for no group."""
+    """Marches the groups in these rows by `Tiling.turns` segments, or else while more than `keep` of them are
+    alive, and tells which still are. A row past the last one stands for no group."""
     tiling, beams, visitor = job.tiling, job.beams, job.visitor
     size, group = rows.size, tiling.group
     known = jnp.minimum(rows, beams.groups - 1)
@@ -149,17 +149,29 @@ def march_batch(
             more = jax.tree.map(jnp.add, more, found)
         return finished_after(range_, after), (mine, more, total)
 
+    def turn(_: Int[Array, ""], state: State) -> State:
+        here, visited = state
+        over = ~job.alive(here)  # those out of samples, too: they must not take more
+        after, visited = advance((with_fields(here, finished=over), visited), regular=not may_end)
+        return with_fields(after, finished=jnp.where(over, here.finished, after.finished)), visited
+
     # segments in which a ray may shift, or run out of samples, cost a tenth more: so as few as possible
     limited = job.pipeline.march.max_samples is not None or job.exact
+    may_end = limited or job.pipeline.march.may_shift
     marched: State = here, (mine, more, total)
-    if job.pipeline.march.may_shift or limited:
-        marched = jax.lax.while_loop(
-            lambda state: enough(state[0]) & (limited | jnp.any(job.shifts(state[0]))),
-            partial(advance, regular=False),
-            marched,
-        )
-    if not limited:
-        marched = jax.lax.while_loop(lambda state: enough(state[0]), partial(advance, regular=True), marched)
+    if tiling.turns:
+        marched = jax.lax.fori_loop(0, tiling.turns, turn, marched)
+    else:
+        if may_end:
+            marched = jax.lax.while_loop(
+                lambda state: enough(state[0]) & (limited | jnp.any(job.shifts(state[0]))),
+                partial(advance, regular=False),
+                marched,
+            )
+        if not limited:
+            marched = jax.lax.while_loop(
+                lambda state: enough(state[0]), partial(advance, regular=True), marched
+            )
     here, (mine, more, total) = marched
     visited = jax.tree.map(scatter, carry, mine), jax.tree.map(scatter_add, sums, more), total
     return (jax.tree.map(scatter, at, here), visited), groups(job.alive(here))

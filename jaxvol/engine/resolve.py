@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.compaction import in_front
+from .._util.compaction import in_front, in_place
 from .._util.trees import PyTree
 from .._util.vec3 import Scalar
 from ..reference import resolve
@@ -53,8 +53,8 @@ def resolve_image(
 def of_visible(
     some: Callable[..., Float[Array, "chunk numbers"]], size: int, found: Found, numbers: int = NUMBERS
 ) -> Float[Array, "*rays numbers"]:
-    """Pixels of so many numbers by `some(indices, *found)`, called for `size` visible pixels at a time.
-    Transparent pixels stay 0, at infinite depth."""
+    """Pixels of so many numbers by `some(indices, *found)`, called for `size` visible pixels at a time; or
+    once, for all pixels, if that is 0. Transparent pixels stay 0, at infinite depth."""
     shape = found[1].shape
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
@@ -63,7 +63,8 @@ def of_visible(
         return nothing.reshape(*shape, numbers)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
-    chosen, count = in_front(visible, size), jnp.sum(visible, dtype=jnp.int32)
+    chosen = in_front(visible, size) if size > 0 else in_place(visible)
+    count = jnp.sum(visible, dtype=jnp.int32)
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
@@ -76,5 +77,8 @@ def of_visible(
         none = jnp.zeros((size, numbers), nothing.dtype)
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
-    pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, numbers)
+    if size > 0:
+        pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, numbers)
+    else:
+        pixels = computed(chosen)
     return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)

@@ -3,9 +3,8 @@
 import math
 from typing import NamedTuple
 
-import jax
-
 from .._util.compaction import CHUNK
+from .._util.platform import on_gpu
 
 
 class Tiling(NamedTuple):
@@ -17,11 +16,13 @@ class Tiling(NamedTuple):
     - `batch`: groups marched at a time, as many as fit into the cache.
     - `min_alive`: share of a batch's groups that must be alive for it to go on; below it, batches are
       refilled.
+    - `turns`: if not 0, the segments by which a batch is marched before it is refilled, in place of
+      `min_alive`: a number that is known when the program is compiled.
     - `tile`: beams that are marched to their ends before the next ones are made: 262 144 rays.
     - `direct_tile`: the same where JAX differentiates the march itself, and so keeps all its states.
     - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
       many steps as the slowest ray among them.
-    - `chunk`: samples shaded at a time, a multiple of 128.
+    - `chunk`: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
     """
 
     cells: int = 8
@@ -29,6 +30,7 @@ class Tiling(NamedTuple):
     # Not 512: rows of 8192 floats would lie 32 KiB apart, so that all of them map to the same cache lines.
     batch: int = 520
     min_alive: float = 0.75
+    turns: int = 0
     tile: int = 4096
     direct_tile: int = 64
     searched: int = 16
@@ -51,9 +53,24 @@ class Tiling(NamedTuple):
 
     @classmethod
     def of_backend(cls) -> "Tiling":
-        """The sizes for JAX's default backend."""
-        return BY_BACKEND.get(jax.default_backend(), BY_BACKEND["cpu"])
+        """The sizes for programs that are traced now: `GPU` where they are for one, the defaults, which were
+        measured on CPUs, elsewhere."""
+        return GPU if on_gpu() else Tiling()
 
 
-BY_BACKEND = {"cpu": Tiling()}
-"""Sizes that were measured. Other backends take those of the CPU."""
+GPU = Tiling(batch=2**13, turns=16, tile=2**14, searched=2**16, chunk=0)
+"""For GPUs, where the host waits for the device at each branch, and at each turn of a loop of unknown length
+(see `platform`). So one loop of unknown length is left, each turn of which makes up one batch of the groups
+that are alive, and marches it by `turns` segments; and a batch of 131 072 rays has a million samples in
+flight. A tile is an image of up to 1024 × 1024 pixels.
+
+The engine and the bonsai, 512 × 512 pixels, steps of one voxel, with leaps and early termination: the host
+waits 3 times for an image, and 6 times with its gradient (`tests/engine/test_gpu_tiling.py` counts). In
+batches of 2¹² groups it would wait 5 times for the bonsai, and in batches of 2¹⁴ twice, for twice as many
+samples. Terms of shading are still counted at run time (`ScattererTemplates`): a wait for every four terms of
+each segment.
+
+Beside the image, a tile takes some 110 bytes a ray, and the batch 200 bytes each of its rays; a gradient by
+transfer function and camera some 1 KB a pixel (of programs compiled for CPU). It was run on CPUs only: no
+time on a GPU has been measured, and none of these numbers was chosen by one.
+"""

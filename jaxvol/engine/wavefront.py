@@ -3,6 +3,8 @@
 - Rays are compacted in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is
   marched segment by segment until too few of its groups are left (`Tiling.min_alive`); then batches are made
   up anew from the groups that are left. Idle lanes cost as much as working ones.
+- On a GPU, to find out how many are left costs more than some idle lanes: a batch, of as many rays as keep it
+  busy, is marched by a known number of segments (`Tiling.turns`), and made up anew after each.
 - A ray that may still shift (`Transform.shift`) must stop at its next transparent cell. As soon as a batch
   has no such rays left, it takes whole segments without that test.
 - Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments.
@@ -94,7 +96,7 @@ def _marched(job: Job, state: State) -> State:
     def round_(state: tuple[State, Bool[Array, " groups"]]) -> tuple[State, Bool[Array, " groups"]]:
         rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
         # only full batches, as long as there are any: what remains joins those of the next round
-        batches = jnp.maximum(count // size, 1)
+        batches = 1 if job.tiling.turns else jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, enough, 0)
 
         def one(i: Int[Array, ""], state: tuple[State, Array]) -> tuple[State, Array]:

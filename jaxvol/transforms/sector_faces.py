@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._util.platform import while_loop
 from .._util.vec3 import Scalar, Vec3, along
 from ..space import Gap, slab_interval
 
@@ -122,7 +123,7 @@ class SectorFaces(eqx.Module):
 
         to_faces = faces._at(origin, direction, begin)
         none = 0 * to_faces[0].distance
-        gone, to_faces, _ = jax.lax.while_loop(cond, body, (none, to_faces, none))
+        gone, to_faces, _ = while_loop(cond, body, (none, to_faces, none))
         return begin + sign * gone, ~goes_on(to_faces) & (gone <= reach)
 
     def _clear(self, point: Vec3, to_faces: list[ToFace], *, inside: bool) -> Scalar:

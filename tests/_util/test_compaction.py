@@ -34,3 +34,18 @@ def test_each_chosen_one_is_taken_once_and_put_where_it_was():
     for value, part, count in zip(values, chosen.split(whole, 2), chosen.split(visits, 2), strict=True):
         np.testing.assert_array_equal(part, np.where(value > 0.5, 2 * value, 0))
         np.testing.assert_array_equal(count, value > 0.5)
+
+
+def test_all_at_once_each_chosen_one_is_put_where_it_was_and_no_other():
+    values = jnp.asarray(np.random.default_rng(1).normal(size=(4, 900)), jnp.float32)
+    chosen = Chosen.of([values > 0.5], chunk=0)
+    np.testing.assert_array_equal(chosen.number, np.sum(values > 0.5))
+    calls = []
+
+    def one(indices, whole):
+        calls.append(indices.shape)
+        return chosen.put(whole, indices, 2 * chosen.take([values], indices))
+
+    (whole,) = chosen.split(chosen.fold(one, jnp.zeros(3600)), 1)
+    assert calls == [(3600,)]
+    np.testing.assert_array_equal(whole, np.where(values > 0.5, 2 * values, 0))
