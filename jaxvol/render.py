@@ -3,9 +3,12 @@ engine."""
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, require
@@ -41,6 +44,7 @@ def render(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     adjoint: Adjoint | Any = "replay",
+    devices: Sequence[jax.Device] | Mesh | Any | None = None,
 ) -> Rendering:
     """Renders an image of a volume.
 
@@ -104,7 +108,7 @@ def render(
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
     assert isinstance(march, March)
     scene = Scene(volume, transfer, camera, march, compositing_of(compositing), lighting)
-    return render_scene(scene, outputs, adjoint)
+    return render_scene(scene, outputs, adjoint, devices=devices)
 
 
 def render_rays(
@@ -119,6 +123,7 @@ def render_rays(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     adjoint: Adjoint | Any = "replay",
+    devices: Sequence[jax.Device] | Mesh | Any | None = None,
 ) -> Rendering:
     """Renders arbitrary rays. As `render`, except:
 
@@ -149,7 +154,7 @@ def render_rays(
     first = shard_number(origins, directions) * count
     source = OwnRays(origins, directions, _pixels(pixels, origins), first)
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
-    return render_scene(scene, outputs, adjoint)
+    return render_scene(scene, outputs, adjoint, devices=devices)
 
 
 def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:

@@ -194,8 +194,7 @@ def _vjp_by_tiles(
         return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    every = jnp.arange(image.tiles.number), ranges, *parts
-    sums, _ = jax.lax.scan(tile, varying(image.zeros(perturbed), parts), every)
+    sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), ranges, *parts)
     return cotangents_of(scene, *sums, image.pull_shader)
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.sharding import varying
@@ -82,10 +81,10 @@ def _over_tiles(
     else it returned, stacked."""
     fault = fault_of(scene)
 
-    def tile(number: Int[Array, ""]) -> tuple[Rendering, Any]:
-        return one(number, invalid(tiles.rays(scene.source, space, number), fault))
+    def tile(each: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
+        return one(each[0], invalid(tiles.rays(scene.source, space, each[0]), fault))
 
-    renderings, more = jax.lax.map(tile, jnp.arange(tiles.number))
+    renderings, more = tiles.map(tile)
     return jax.tree.map(tiles.assemble, renderings), more
 
 

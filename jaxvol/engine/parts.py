@@ -40,12 +40,12 @@ def set_out(scene: Scene, options: RenderOptions) -> Underway:
     tiles, fault = RayTiles.of(scene.source, options.tiling), fault_of(scene)
     space, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
 
-    def one(number: Int[Array, ""]) -> Underway:
-        rays = invalid(tiles.rays(scene.source, space, number), fault)
+    def one(each: tuple[Int[Array, ""]]) -> Underway:
+        rays = invalid(tiles.rays(scene.source, space, each[0]), fault)
         at = vmap_rays(lambda ray: begin(pipeline, ray, options.outputs))(rays)
         return Underway(rays, with_fields(at, finished=rays.length <= 0))
 
-    return jax.lax.map(one, jnp.arange(tiles.number))
+    return tiles.map(one)
 
 
 def march_part(
@@ -77,7 +77,7 @@ def march_part(
         over = opaque(pipeline, after) if anew else at.finished | ended(pipeline, rays, after)
         return Underway(rays, with_fields(after, finished=over))
 
-    return jax.lax.map(one, (jnp.arange(tiles.number), underway, ranges))
+    return tiles.map(one, underway, ranges)
 
 
 def ended(pipeline: Pipeline, rays: Ray, at: Progress) -> Bool[Array, "groups rays"]:

@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.trees import PyTree
@@ -53,7 +52,7 @@ def start_pull(
         return underway, given, replay.carry, replay.sums
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    underway, given, carry, of_rays = jax.lax.map(one, (jnp.arange(image.tiles.number), *parts))
+    underway, given, carry, of_rays = image.tiles.map(one, *parts)
     return Pulled(underway, given, carry, of_rays, sums)
 
 
@@ -80,9 +79,8 @@ def pull_part(
         underway = Underway(underway.rays, with_fields(after, finished=over))
         return sums._replace(total=total), (underway, given, carry, of_rays)
 
-    numbers = jnp.arange(image.tiles.number)
-    every = numbers, pulled.underway, pulled.given, pulled.carry, pulled.of_rays, ranges
-    sums, (underway, given, carry, of_rays) = jax.lax.scan(one, pulled.sums, every)
+    every = pulled.underway, pulled.given, pulled.carry, pulled.of_rays, ranges
+    sums, (underway, given, carry, of_rays) = image.tiles.scan(one, pulled.sums, *every)
     return Pulled(underway, given, carry, of_rays, sums)
 
 
@@ -103,5 +101,5 @@ def end_pull(
         return image.of_rays(sums, pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    sums, _ = jax.lax.scan(one, pulled.sums, (jnp.arange(image.tiles.number), pulled.of_rays, *parts))
+    sums, _ = image.tiles.scan(one, pulled.sums, pulled.of_rays, *parts)
     return cotangents_of(scene, *sums, image.pull_shader)

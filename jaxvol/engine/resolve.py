@@ -16,10 +16,12 @@ from .._util.vec3 import Scalar
 from ..reference import resolve
 from ..selection import Selection
 from ..space import Line
+from . import devices
 from .acceleration import VolumeAcceleration
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import lines_at
 from .scene import Scene
+from .tiling import Tiling
 
 
 NUMBERS = 5
@@ -46,16 +48,16 @@ def resolve_image(
     def some(indices: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk numbers"]:
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
-    resolved = of_visible(some, options.tiling.chunk, found, NUMBERS + 3 * with_normal)
+    resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal)
     return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
 
 
 def of_visible(
-    some: Callable[..., Float[Array, "chunk numbers"]], size: int, found: Found, numbers: int = NUMBERS
+    some: Callable[..., Float[Array, "chunk numbers"]], tiling: Tiling, found: Found, numbers: int = NUMBERS
 ) -> Float[Array, "*rays numbers"]:
-    """Pixels of so many numbers by `some(indices, *found)`, called for `size` visible pixels at a time.
+    """Pixels of so many numbers by `some(indices, *found)`, called for a chunk of visible pixels at a time.
     Transparent pixels stay 0, at infinite depth."""
-    shape = found[1].shape
+    shape, size, mesh = found[1].shape, tiling.chunk, tiling.devices
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
     nothing = jnp.zeros((visible.size, numbers), flat[0].dtype).at[:, 4].set(jnp.inf)
@@ -63,7 +65,7 @@ def of_visible(
         return nothing.reshape(*shape, numbers)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
-    chosen, count = in_front(visible, size), jnp.sum(visible, dtype=jnp.int32)
+    chosen, count = in_front(visible, size * devices.number_of(mesh)), jnp.sum(visible, dtype=jnp.int32)
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
@@ -76,5 +78,6 @@ def of_visible(
         none = jnp.zeros((size, numbers), nothing.dtype)
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
-    pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, numbers)
+    starts = devices.dealt(mesh, jnp.arange(0, chosen.size, size, dtype=jnp.int32))
+    pixels = devices.collected(mesh, devices.map_over(mesh, chunk, starts)).reshape(-1, numbers)
     return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)

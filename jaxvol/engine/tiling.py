@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from .._util.compaction import CHUNK
 
@@ -22,6 +23,7 @@ class Tiling(NamedTuple):
     - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
       many steps as the slowest ray among them.
     - `chunk`: samples shaded at a time, a multiple of 128.
+    - `devices`: to which beams are dealt out, a mesh of one axis; None where JAX decides.
     """
 
     cells: int = 8
@@ -33,6 +35,7 @@ class Tiling(NamedTuple):
     direct_tile: int = 64
     searched: int = 16
     chunk: int = CHUNK
+    devices: Mesh | None = None
 
     @property
     def side(self) -> int:
@@ -50,9 +53,10 @@ class Tiling(NamedTuple):
         return self.beam**2
 
     @classmethod
-    def of_backend(cls) -> "Tiling":
-        """The sizes for JAX's default backend."""
-        return BY_BACKEND.get(jax.default_backend(), BY_BACKEND["cpu"])
+    def of_backend(cls, devices: Mesh | None = None) -> "Tiling":
+        """The sizes for these devices, or JAX's default backend."""
+        platform = jax.default_backend() if devices is None else devices.devices.flat[0].platform
+        return BY_BACKEND.get(platform, BY_BACKEND["cpu"])._replace(devices=devices)
 
 
 BY_BACKEND = {"cpu": Tiling()}
