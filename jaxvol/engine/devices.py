@@ -7,9 +7,9 @@ the other. All have the whole scene; what they sum is summed over all of them.
 An array of such things is stored *dealt*: those of the first device, then those of the second, and so on.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -23,6 +23,9 @@ from .._util.memo import memoized
 from .._util.sharding import varies_over
 from .._util.trees import PyTree, added
 
+
+Devices: TypeAlias = Sequence[Any] | Mesh
+"""What a caller may pass for devices."""
 
 AXIS = "devices"
 """Name of the mesh axis."""
@@ -47,12 +50,13 @@ def mesh_of(devices: Any) -> Mesh | None:
             raise ValueError(f"devices must be {expected}; got a mesh of the axes {dict(devices.shape)}.")
         devices = devices.devices.tolist()
     listed = list(devices) if isinstance(devices, Iterable) and not isinstance(devices, str) else [devices]
-    wrong = [each for each in listed if not isinstance(each, jax.Device)]
-    if wrong or not isinstance(devices, Iterable):
-        raise ValueError(f"devices must be {expected}; got {described(wrong[0] if wrong else devices)}.")
-    if not listed or len(set(listed)) < len(listed) or len({each.platform for each in listed}) > 1:
-        raise ValueError(f"devices must be one or more different devices of one platform; got {listed}.")
-    return Mesh(np.asarray(listed), (AXIS,))
+    found: list[Any] = [each for each in listed if isinstance(each, jax.Device)]
+    if len(found) < len(listed) or not isinstance(devices, Iterable):
+        wrong = next((each for each in listed if not isinstance(each, jax.Device)), devices)
+        raise ValueError(f"devices must be {expected}; got {described(wrong)}.")
+    if not found or len(set(found)) < len(found) or len({each.platform for each in found}) > 1:
+        raise ValueError(f"devices must be one or more different devices of one platform; got {found}.")
+    return Mesh(np.asarray(found), (AXIS,))
 
 
 def number_of(mesh: Mesh | None) -> int:

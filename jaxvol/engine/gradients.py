@@ -195,7 +195,7 @@ def _vjp_by_tiles(
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
     sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), ranges, *parts)
-    return cotangents_of(scene, *sums, image.pull_shader)
+    return cotangents_of(scene, sums.total, sums.source, image.pull_shader)
 
 
 def cotangents_of(

@@ -5,13 +5,14 @@ each part marches those cells of it that lie there (`CellRange`), from where the
 is made of voxels, the packed copy, ranges of blocks and windows, is made of each part.
 """
 
-from functools import partial
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from .._util.trees import PyTree
 from ..march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
 from ..rendering import Rendering
@@ -55,10 +56,11 @@ def march_part(
     underway: Underway,
     ranges: CellRange,
     anew: bool = False,
+    exact: bool = False,
 ) -> Underway:
     """The rays behind these of their cells. `scene`: with a part of the volume, which holds what they meet
-    there, and in a segment more. `anew`: the cells are marched whatever was before them, also what lies
-    behind them; and none beside them."""
+    there, and in a segment more. `exact`: they take no cell behind these. `anew`: nor does it count whether
+    they have come to the first of these, or past it: all of them are marched."""
     tiles, packed = RayTiles.of(scene.source, options.tiling), acceleration.packed(scene)
     index = empty_space_of(packed, acceleration, options.tiling)
     _, pipeline = pipeline_of(packed, acceleration)
@@ -71,7 +73,7 @@ def march_part(
             seen = opaque(pipeline, at) | (range_.until <= range_.first)
             start = with_fields(at, index=range_.first, finished=seen)
         after, _ = march_rays(
-            pipeline, index, beams, options.tiling, options.outputs, resumed=start, exact=anew
+            pipeline, index, beams, options.tiling, options.outputs, resumed=start, exact=anew or exact
         )
         # where marched anew, a ray may go back
         over = opaque(pipeline, after) if anew else at.finished | ended(pipeline, rays, after)
@@ -118,6 +120,37 @@ def _assembled(scene: Scene, march: March, tiles: RayTiles, underway: Underway) 
     _, pipeline = pipeline_of(scene._replace(march=march, lighting=None), NOTHING)
     renderings = jax.vmap(vmap_rays(partial(end, pipeline)))(underway.rays, underway.at)
     return jax.tree.map(tiles.assemble, renderings)
+
+
+def joined(scene: Scene, options: RenderOptions, parts: Underway) -> Underway:
+    """Rays that have passed all parts of a volume, from several that were each marched through some of them,
+    front to back, and from a beginning of their own: along the first axis. What is behind does not show where
+    a ray was stopped in front."""
+    _, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
+    mode, most = scene.compositing, scene.march.most_samples
+
+    def over(front: Progress, back: Progress) -> Progress:
+        stops = opaque(pipeline, front)
+
+        def chosen(a: PyTree, b: PyTree) -> PyTree:
+            return jax.tree.map(lambda a, b: jnp.where(stops, a, b), a, b)
+
+        composite = chosen(front.composite, mode.joined(front.composite, back.composite))
+        stats = front.stats
+        if stats is not None and back.stats is not None:
+            whole = stats.samples + back.stats.samples, stats.aligned | back.stats.aligned
+            together = eqx.tree_at(lambda stats: (stats.samples, stats.aligned), stats, whole)
+            stats = chosen(stats, together)
+        finished = front.finished & (stops | back.finished)
+        after = with_fields(front, index=jnp.maximum(front.index, back.index), finished=finished)
+        return eqx.tree_at(
+            lambda at: (at.composite, at.stats), after, (composite, stats), is_leaf=lambda leaf: leaf is None
+        )
+
+    at = with_fields(parts.at, finished=parts.at.finished | (parts.at.index < most))
+    number = at.index.shape[0]
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(number)]
+    return Underway(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(over, each))
 
 
 def arrive(scene: Scene, options: RenderOptions, underway: Underway) -> Rendering:

@@ -102,4 +102,4 @@ def end_pull(
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
     sums, _ = image.tiles.scan(one, pulled.sums, pulled.of_rays, *parts)
-    return cotangents_of(scene, *sums, image.pull_shader)
+    return cotangents_of(scene, sums.total, sums.source, image.pull_shader)

@@ -67,20 +67,19 @@ class RayTiles(eqx.Module):
         """The tiles of a camera's pixels, or of given rays; small ones for `"direct"`."""
         side, most = tiling.beam, tiling.direct_tile if direct else tiling.tile
         shares = devices.number_of(tiling.devices)
+
+        def divided(beams: int) -> tuple[int, int]:
+            count = max(min(most, -(-beams // shares)), 1)
+            return -(-beams // (count * shares)) * shares, count
+
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // side), -(-height // side)
             # or a device would have the same columns in every row, and perhaps a narrow object alone
             across += shares > 1 and across % shares == 0
-            needed = across * down
-        else:
-            shape = source.origins.shape[:-1]
-            needed = -(-math.prod(shape) // tiling.rays_per_beam)
-        count = max(min(most, -(-needed // shares)), 1)
-        number = -(-needed // (count * shares)) * shares
-        if isinstance(source, Camera):
-            return _PixelTiles(number, count, tiling, source.size, across, down)
-        return _OwnRayTiles(number, count, tiling, shape)
+            return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
+        shape = source.origins.shape[:-1]
+        return _OwnRayTiles(*divided(-(-math.prod(shape) // tiling.rays_per_beam)), tiling, shape)
 
     def scan(
         self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
