@@ -74,7 +74,7 @@ def render(
       jitter included, and lie on all of these devices. So does the scene: a volume is copied to each once in
       its lifetime. By default JAX decides where the image is computed, on one device. In a program of several
       processes (`jax.distributed.initialize()`) pass `jax.devices()`, and make the same calls in all of them;
-      each has the whole image then (`experiments/several_processes.py`).
+      each has the whole image then (`examples/several_processes.py`).
 
     **Returns:** a `Rendering` with leading shape (height, width), in JAX's default float type. If a number on
     which all pixels depend is NaN or infinite (an entry of a transfer function whose fit diverged, say), all
