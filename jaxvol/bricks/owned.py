@@ -216,6 +216,6 @@ def _join(mesh: Mesh, scene: Scene, options: RenderOptions, share: Share) -> Ren
     def one(share: Share) -> Rendering:
         at = jax.lax.all_gather(share.underway.at, AXIS)
         rays = jax.tree.map(lambda leaf: leaf[None], share.underway.rays)
-        return arrive(scene, options, joined(scene, options, Underway(rays, at)))
+        return arrive(scene, options, joined(scene, Underway(rays, at)))
 
     return _on_each(mesh, one, share, whole=True)

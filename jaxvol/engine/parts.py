@@ -5,6 +5,7 @@ each part marches those cells of it that lie there (`CellRange`), from where the
 is made of voxels, the packed copy, ranges of blocks and windows, is made of each part.
 """
 
+from dataclasses import replace
 from functools import partial, reduce
 
 import equinox as eqx
@@ -12,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.trees import PyTree
 from ..march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
 from ..rendering import Rendering
@@ -122,35 +122,33 @@ def _assembled(scene: Scene, march: March, tiles: RayTiles, underway: Underway) 
     return jax.tree.map(tiles.assemble, renderings)
 
 
-def joined(scene: Scene, options: RenderOptions, parts: Underway) -> Underway:
+def joined(scene: Scene, parts: Underway) -> Underway:
     """Rays that have passed all parts of a volume, from several that were each marched through some of them,
-    front to back, and from a beginning of their own: along the first axis. What is behind does not show where
-    a ray was stopped in front."""
+    front to back, and from a beginning of their own: along the first axis. Where a ray was stopped in front,
+    it does not show what is behind."""
     _, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
-    mode, most = scene.compositing, scene.march.most_samples
 
-    def over(front: Progress, back: Progress) -> Progress:
-        stops = opaque(pipeline, front)
-
-        def chosen(a: PyTree, b: PyTree) -> PyTree:
-            return jax.tree.map(lambda a, b: jnp.where(stops, a, b), a, b)
-
-        composite = chosen(front.composite, mode.joined(front.composite, back.composite))
-        stats = front.stats
-        if stats is not None and back.stats is not None:
-            whole = stats.samples + back.stats.samples, stats.aligned | back.stats.aligned
-            together = eqx.tree_at(lambda stats: (stats.samples, stats.aligned), stats, whole)
-            stats = chosen(stats, together)
-        finished = front.finished & (stops | back.finished)
-        after = with_fields(front, index=jnp.maximum(front.index, back.index), finished=finished)
-        return eqx.tree_at(
-            lambda at: (at.composite, at.stats), after, (composite, stats), is_leaf=lambda leaf: leaf is None
+    def join(front: Progress, back: Progress) -> Progress:
+        both = replace(
+            front,
+            index=jnp.maximum(front.index, back.index),
+            composite=scene.compositing.joined(front.composite, back.composite),
+            finished=front.finished & back.finished,
         )
+        if front.stats is not None and back.stats is not None:
+            samples, aligned = (
+                front.stats.samples + back.stats.samples,
+                front.stats.aligned | back.stats.aligned,
+            )
+            both = replace(both, stats=replace(front.stats, samples=samples, aligned=aligned))
+        stops = stopped(pipeline, front.composite)
+        return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
 
-    at = with_fields(parts.at, finished=parts.at.finished | (parts.at.index < most))
-    number = at.index.shape[0]
-    each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(number)]
-    return Underway(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(over, each))
+    # a ray that met nothing here, or all that it may, is not held up here
+    over = parts.at.finished | (parts.at.index < scene.march.most_samples)
+    at = with_fields(parts.at, finished=over)
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(over.shape[0])]
+    return Underway(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(jax.vmap(vmap_rays(join)), each))
 
 
 def arrive(scene: Scene, options: RenderOptions, underway: Underway) -> Rendering:

@@ -1,5 +1,5 @@
-"""What `test_devices.py` runs in a process of eight devices. A case is a function of this file: it compares what
-several devices render with what one does."""
+"""What `test_devices.py` runs in a process of eight devices. A case is a function of this file: it compares
+what several devices render with what one does."""
 
 from collections.abc import Callable
 from functools import partial
@@ -133,8 +133,8 @@ def refused():
         march = jv.March(step.sum(), ())
         return jv.render(volume, thin(), camera, march, devices=mesh).rgba[:1]
 
-    for more in ({}, {"check_vma": False}):
-        inside = jax.shard_map(image, mesh=mesh, in_specs=P("rays"), out_specs=P("rays"), **more)
+    for checked in (True, False):
+        inside = jax.shard_map(image, mesh=mesh, in_specs=P("rays"), out_specs=P("rays"), check_vma=checked)
         with pytest.raises(ValueError, match=r"devices cannot be given inside jax\.shard_map"):
             jax.jit(inside)(jnp.full(8, 0.05))
     two = jax.make_mesh((2, 4), ("x", "y"))
@@ -290,6 +290,7 @@ def own_rays():
 def bricks():
     """Rays of all bricks dealt out, whatever the order; and bricks that are owned, from everywhere."""
     volume, every = blocks(), all_devices()
+    more: dict[str, Any]
     for name, camera in CAMERAS.items():
         for march, more in (
             (jv.March(0.05, MOVING[:3]), {}),
