@@ -1028,8 +1028,8 @@ MUTATIONS = [
     Mutation(
         "NaN: a NaN leaf gives a black image",
         "engine/image.py",
-        "return one(number, invalid(tiles.rays(scene.source, space, number), fault))",
-        "return one(number, tiles.rays(scene.source, space, number))",
+        "return one(each[0], invalid(tiles.rays(scene.source, space, each[0]), fault))",
+        "return one(each[0], tiles.rays(scene.source, space, each[0]))",
         (NAN,),
     ),
     Mutation(

@@ -47,7 +47,7 @@ def thin() -> jv.TransferFunction:
 
 
 def assert_same(found: jv.Rendering, expected: jv.Rendering, tolerance: float = 1e-6, fields=FIELDS) -> None:
-    assert float(expected.rgba[..., 3].max()) > 0.3
+    assert float(expected.rgba[..., 3].max()) > 0.1
     for name in fields:
         if getattr(expected.details, name, True) is None or not hasattr(expected, name):
             continue
@@ -119,7 +119,7 @@ def owned_bricks():
     found = jv.render_bricks(
         volume, thin(), camera, march, bricks=(2, 2, 2), devices=all_devices()[:4], own="bricks"
     )
-    assert found.bricks.loads == found.bricks.needed == 7
+    assert found.bricks.loads == found.bricks.needed == 8
     # leaps end at bricks, so that the number of samples may differ
     assert_same(found, one, 2e-5, ("rgba", "depth", "aligned", "exhausted"))
 
