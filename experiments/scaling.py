@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.engine.devices import mesh_of
+from jaxvol.engine import devices
 from jaxvol.engine.rays import RayTiles
 from jaxvol.engine.tiling import Tiling
 
@@ -67,23 +67,28 @@ def march(scene: Scene) -> jv.March:
     )
 
 
-def image(scene: Scene, devices: Any, outputs: Any = "rgba") -> jv.Rendering:
-    return jv.render(*scene[:3], march(scene), outputs=outputs, devices=devices)
+def image(scene: Scene, given: Any, outputs: Any = "rgba") -> jv.Rendering:
+    return jv.render(*scene[:3], march(scene), outputs=outputs, devices=given)
 
 
-def gradient(scene: Scene, devices: Any) -> Any:
+def gradient(scene: Scene, given: Any) -> Any:
     """An image's mean, and its gradient by the transfer function."""
 
     def loss(transfer: jv.TransferFunction) -> jax.Array:
-        return jnp.mean(image(scene._replace(transfer=transfer), devices).rgba)
+        return jnp.mean(image(scene._replace(transfer=transfer), given).rgba)
 
     return eqx.filter_value_and_grad(loss)(scene.transfer)
 
 
 def balance(scene: Scene, samples: jax.Array, number: int) -> float:
     """Mean over greatest number of an image's samples on so many devices."""
-    tiles = RayTiles.of(scene.camera, Tiling(devices=mesh_of(jax.devices()[:number])))
-    shares = np.asarray(tiles.disassemble(samples)).reshape(number, -1).sum(1)
+    mesh = devices.mesh_of(jax.devices()[:number])
+    tiles = RayTiles.of(scene.camera, Tiling(devices=mesh))
+
+    def own(samples: jax.Array, _: None) -> tuple[None, jax.Array]:
+        return None, jnp.sum(tiles.disassemble(samples))[None]
+
+    shares = np.asarray(devices.split(mesh, own, samples, None)[1])
     return round(float(shares.mean() / shares.max()), 4)
 
 

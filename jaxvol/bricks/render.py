@@ -20,7 +20,7 @@ from ..engine.acceleration import VolumeAcceleration
 from ..engine.batch import CellRange
 from ..engine.devices import Devices, check_not_sharded, mesh_of, number_of, on_all
 from ..engine.driver import Asked
-from ..engine.gradients import of_all_outputs, of_perturbed
+from ..engine.gradients import Sums, of_all_outputs, of_perturbed
 from ..engine.image import RenderOptions
 from ..engine.parts import NOTHING, Underway, arrive, march_part, resolve_part, set_out
 from ..engine.parts_gradient import Pulled, end_pull, pull_part, start_pull
@@ -269,13 +269,13 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         stream = replace(stream, visible=np.ones_like(stream.visible))
 
-    def pull_brick(part: Volume, cells: CellRange, pulled: Pulled) -> Pulled:
+    def pull_brick(part: Volume, cells: CellRange, state: tuple[Sums, Pulled]) -> tuple[Sums, Pulled]:
         here, options_, acceleration = _on(part, scene, options)
-        return _pull_part(here, perturbed, options_, acceleration, pulled, cells)
+        return _pull_part(here, perturbed, options_, acceleration, *state, cells)
 
-    pulled = _start_pull(scene, perturbed, options, rendering, whole)
-    pulled = stream.through(pulled.underway.rays, pulled, lambda state: state.underway.at, pull_brick)
-    found = _end_pull(scene, perturbed, options, pulled, rendering, whole)
+    state = _start_pull(scene, perturbed, options, rendering, whole)
+    state = stream.through(state[1].underway.rays, state, lambda state: state[1].underway.at, pull_brick)
+    found = _end_pull(scene, perturbed, options, *state, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 

@@ -299,19 +299,21 @@ def _curved(
     turn: Turn,
 ) -> Found:
     """By beams of rays, as many as are looked at at a time."""
-    tiles = rays.length.shape[0]
-    by_beam = jax.tree.map(lambda leaf: leaf.reshape(tiles, -1, 4, *leaf.shape[2:]), (rays, at, reached))
 
-    def some(each: tuple[Ray, Progress, Array]) -> Found:
-        rays, at, reached = each
-        return of_curved(grid, march, rays, at, reached, turn, beyond)
+    def program(whole: tuple[March, Turn], dealt: tuple[Ray, Progress, Array]) -> tuple[None, Found]:
+        march, turn = whole
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), dealt)
+        found = jax.lax.map(
+            lambda some: of_curved(grid, march, *some, turn, beyond), by_beam, batch_size=BEAMS
+        )
+        shape = dealt[0].length.shape
+        cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
+        reached = found.reached.reshape(shape)
+        return None, found._replace(cells=cells, reached=reached)
 
-    def tile(beams: tuple[Ray, Progress, Array]) -> Found:
-        return jax.lax.map(some, beams, batch_size=BEAMS)
-
-    found = devices.map_over(mesh, tile, by_beam)
-    cells, reached = jax.tree.map(lambda leaf: leaf.reshape(rays.length.shape), (found.cells, found.reached))
-    return Found(cells, reached, jnp.min(found.low, (0, 1)), jnp.max(found.high, (0, 1)), jnp.any(found.any))
+    _, found = devices.split(mesh, program, (march, turn), (rays, at, reached))
+    low, high = jnp.min(found.low, 0), jnp.max(found.high, 0)
+    return found._replace(low=low, high=high, any=jnp.any(found.any))
 
 
 _cells_of_straight = compiled(_straight)

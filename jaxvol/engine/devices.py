@@ -1,19 +1,18 @@
 """Which device does which part of the work?
 
-Things of about the same cost, beams of rays and chunks of pixels, are dealt out to devices in turn, so that
-each has its share of what is expensive wherever that lies in the image. Each device does its own one after
-the other. All have the whole scene; what they sum is summed over all of them.
-
-An array of such things is stored *dealt*: those of the first device, then those of the second, and so on.
+A program of the engine runs on all devices (`split`), each with the whole scene. There, things of about the
+same cost, beams of rays and chunks of pixels, are dealt out in turn, so that each device has its share of
+what is expensive wherever that lies in the image (`mine`). What they find is put together again
+(`collected`), or summed (`summed`). Without several devices, all of this changes nothing.
 """
 
+import inspect
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
-from typing import Any, TypeAlias
+from functools import cache, wraps
+from typing import Any, Literal, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
@@ -21,8 +20,11 @@ from jaxtyping import Array
 from .._util.checks import described, is_traced
 from .._util.memo import memoized
 from .._util.sharding import varies_over
-from .._util.trees import PyTree, added
+from .._util.trees import PyTree
 
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 Devices: TypeAlias = Sequence[Any] | Mesh
 """What a caller may pass for devices."""
@@ -64,45 +66,78 @@ def number_of(mesh: Mesh | None) -> int:
     return 1 if mesh is None else mesh.size
 
 
-def dealt(mesh: Mesh | None, things: Array) -> Array:
-    """Things in their order, along the first axis, as they are dealt out in turn; a multiple of the number of
-    devices."""
-    number = number_of(mesh)
-    turns = things.reshape(things.shape[0] // number, number, *things.shape[1:])
-    return jnp.swapaxes(turns, 0, 1).reshape(things.shape)
+def split(
+    mesh: Mesh | None, program: Callable[..., tuple[PyTree, PyTree]], whole: PyTree, dealt: PyTree
+) -> tuple[PyTree, PyTree]:
+    """What `program(whole, dealt)` returns on all devices.
+
+    - `whole`: what all devices have, not only arrays.
+    - `dealt`: arrays of which each device has a part along the first axis, and is given that.
+
+    The program returns the same two: first what is the same on all devices, then what is dealt."""
+    if mesh is None:
+        return program(whole, dealt)
+    arrays, rest = eqx.partition(whole, eqx.is_array)
+
+    def own(arrays: PyTree, dealt: PyTree) -> tuple[PyTree, PyTree]:
+        return program(eqx.combine(arrays, rest), dealt)
+
+    # Types are not checked: every loop, in a user's transform too, would have to start with arrays that vary.
+    specs = (WHOLE, DEALT)
+    shared = jax.shard_map(own, mesh=mesh, in_specs=specs, out_specs=specs, check_vma=False)
+    return jax.jit(shared)(arrays, dealt)
+
+
+def on_devices(
+    gives: Literal["whole", "dealt", "both"], *, dealt: tuple[str, ...] = ()
+) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator: a function of `options` runs by `split` on their devices. `gives`: what it returns, or both
+    in this order. `dealt`: the arguments that are."""
+
+    def made(function: Callable[P, T]) -> Callable[P, T]:
+        signature = inspect.signature(function)
+        called: Callable[..., T] = function
+
+        def program(whole: dict[str, Any], parts: dict[str, Any]) -> tuple[PyTree, PyTree]:
+            given: dict[str, Any] = whole | parts
+            result: Any = called(**given)
+            return {"whole": (result, None), "dealt": (None, result), "both": result}[gives]
+
+        @wraps(function)
+        def run(*args: P.args, **kwargs: P.kwargs) -> T:
+            given = signature.bind(*args, **kwargs).arguments
+            parts = {name: given.pop(name) for name in dealt}
+            result: Any = split(given["options"].tiling.devices, program, given, parts)
+            return {"whole": result[0], "dealt": result[1], "both": result}[gives]
+
+        return run
+
+    return made
+
+
+def index_of(mesh: Mesh | None) -> Array | int:
+    """Number of this device, inside `split`."""
+    return 0 if mesh is None else jax.lax.axis_index(AXIS)
+
+
+def mine(mesh: Mesh | None, things: Array) -> Array:
+    """This device's share of things, inside `split`; a multiple of the number of devices."""
+    if mesh is None:
+        return things
+    return things.reshape(things.shape[0] // mesh.size, mesh.size, *things.shape[1:])[:, index_of(mesh)]
 
 
 def collected(mesh: Mesh | None, things: Array) -> Array:
-    """The inverse of `dealt`, on all devices."""
+    """The inverse of `mine`, on all devices, inside `split`."""
     if mesh is None:
         return things
-    things = jax.lax.with_sharding_constraint(things, NamedSharding(mesh, WHOLE))
-    turns = things.reshape(mesh.size, things.shape[0] // mesh.size, *things.shape[1:])
-    return jnp.swapaxes(turns, 0, 1).reshape(things.shape)
+    turns = jax.lax.all_gather(things, AXIS, axis=1)
+    return turns.reshape(things.shape[0] * mesh.size, *things.shape[1:])
 
 
-def scan(
-    mesh: Mesh | None, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, dealt: PyTree
-) -> tuple[PyTree, PyTree]:
-    """`jax.lax.scan`, by each device over its own things. What `f` adds to `sums` is summed over devices; its
-    other results are dealt out as the things are. What `f` closes over, all devices have."""
-    if mesh is None:
-        return jax.lax.scan(f, sums, dealt)
-
-    def own(dealt: PyTree) -> tuple[PyTree, PyTree]:
-        found, results = jax.lax.scan(f, jax.tree.map(jnp.zeros_like, sums), dealt)
-        return jax.lax.psum(found, AXIS), results
-
-    # Types are not checked, which would ask every loop in a user's transform to start with arrays that vary.
-    # Under jit, since what it closes over may be differentiated.
-    dealt_out = jax.shard_map(own, mesh=mesh, in_specs=DEALT, out_specs=(WHOLE, DEALT), check_vma=False)
-    found, results = jax.jit(dealt_out)(dealt)
-    return added(sums, found), results
-
-
-def map_over(mesh: Mesh | None, f: Callable[[PyTree], PyTree], dealt: PyTree) -> PyTree:
-    """`jax.lax.map`, by each device over its own things."""
-    return scan(mesh, lambda none, thing: (none, f(thing)), None, dealt)[1]
+def summed(mesh: Mesh | None, tree: PyTree) -> PyTree:
+    """The sum of what each device has, inside `split`."""
+    return tree if mesh is None else jax.lax.psum(tree, AXIS)
 
 
 def on_all(mesh: Mesh | None, tree: PyTree) -> PyTree:

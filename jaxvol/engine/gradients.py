@@ -23,6 +23,7 @@ from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
+from .devices import on_devices
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
@@ -171,6 +172,7 @@ def _of_voxels(scene: Scene, perturbed: Any) -> bool:
     return eqx.is_inexact_array(scene.volume.data) and perturbed.volume.data
 
 
+@on_devices("whole", dealt=("ranges",))
 def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,

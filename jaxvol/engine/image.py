@@ -16,6 +16,7 @@ from ..rendering import Rendering
 from ..space import Ray, Space, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, VisibleRangeRecorder
+from .devices import on_devices
 from .rays import RayTiles, vmap_rays
 from .scene import Scene
 from .tiling import Tiling
@@ -29,6 +30,7 @@ class RenderOptions(eqx.Module):
     tiling: Tiling = eqx.field(static=True)
 
 
+@on_devices("both")
 def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, CellRange | None]:
@@ -48,6 +50,7 @@ def march_image(
     return _over_tiles(scene, space, tiles, marched)
 
 
+@on_devices("whole")
 def scan_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, length: int
 ) -> Rendering:

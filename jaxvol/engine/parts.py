@@ -19,9 +19,10 @@ from ..rendering import Rendering
 from ..space import Ray, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, with_fields
+from .devices import on_devices
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles, vmap_rays
-from .resolve import resolve_image
+from .resolve import resolve_pixels
 from .scene import Scene
 from .wavefront import march_rays
 
@@ -36,6 +37,7 @@ class Underway(eqx.Module):
     at: Progress
 
 
+@on_devices("dealt")
 def set_out(scene: Scene, options: RenderOptions) -> Underway:
     """All rays at their entries. Of the volume, no voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), fault_of(scene)
@@ -49,6 +51,7 @@ def set_out(scene: Scene, options: RenderOptions) -> Underway:
     return tiles.map(one)
 
 
+@on_devices("dealt", dealt=("underway", "ranges"))
 def march_part(
     scene: Scene,
     options: RenderOptions,
@@ -93,6 +96,7 @@ def opaque(pipeline: Pipeline, at: Progress) -> Bool[Array, "groups rays"]:
     return vmap_rays(partial(stopped, pipeline))(at.composite)
 
 
+@on_devices("whole", dealt=("before", "after"))
 def resolve_part(
     scene: Scene,
     options: RenderOptions,
@@ -112,7 +116,7 @@ def resolve_part(
     changed = tiles.assemble(changed)
     rgba = rendering.rgba * changed[..., None]
     found = rgba, rendering.depth, rendering.details.selected
-    resolved = resolve_image(scene, options, acceleration, found)
+    resolved = resolve_pixels(scene, options, acceleration, found)
     return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)
 
 
@@ -151,6 +155,7 @@ def joined(scene: Scene, parts: Underway) -> Underway:
     return Underway(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(jax.vmap(vmap_rays(join)), each))
 
 
+@on_devices("whole", dealt=("underway",))
 def arrive(scene: Scene, options: RenderOptions, underway: Underway) -> Rendering:
     """The image of rays that have passed all parts."""
     at = underway.at

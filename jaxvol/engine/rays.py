@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
-from .._util.trees import PyTree
+from .._util.trees import PyTree, added
 from .._util.xla import in_memory
 from ..beams import Box
 from ..camera import Camera
@@ -53,9 +53,10 @@ class OwnRays(eqx.Module):
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
-    - `number`: of tiles, on all devices. `beam_count`: of beams in each tile.
+    - `number`: of tiles, on each device. `beam_count`: of beams in each tile.
 
-    Arrays of tiles are stored dealt (`devices`): first those of the first device.
+    Where there are several devices, all but `of` is called inside `devices.split`, and is about the tiles of
+    this device.
     """
 
     number: int = eqx.field(static=True)
@@ -70,7 +71,7 @@ class RayTiles(eqx.Module):
 
         def divided(beams: int) -> tuple[int, int]:
             count = max(min(most, -(-beams // shares)), 1)
-            return -(-beams // (count * shares)) * shares, count
+            return -(-beams // (count * shares)), count
 
         if isinstance(source, Camera):
             width, height = source.size
@@ -84,31 +85,37 @@ class RayTiles(eqx.Module):
     def scan(
         self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
     ) -> tuple[PyTree, PyTree]:
-        """Folds `f(sums, (tile, *each))` over all tiles, and stacks what it returns beside."""
-        return devices.scan(self.tiling.devices, f, sums, (jnp.arange(self.number), *each))
+        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what it returns beside. What it adds to
+        `sums` is summed over all devices."""
+        mesh, every = self.tiling.devices, (jnp.arange(self.number), *each)
+        if mesh is None:
+            return jax.lax.scan(f, sums, every)
+        found, results = jax.lax.scan(f, jax.tree.map(jnp.zeros_like, sums), every)
+        return added(sums, devices.summed(mesh, found)), results
 
     def map(self, f: Callable[[PyTree], PyTree], *each: PyTree) -> PyTree:
-        """`f((tile, *each))` of all tiles, stacked."""
-        return devices.map_over(self.tiling.devices, f, (jnp.arange(self.number), *each))
+        """`f((tile, *each))` of the tiles, stacked."""
+        return jax.lax.map(f, (jnp.arange(self.number), *each))
 
     def beams(self, tile: Int[Array, ""]) -> Int[Array, " beams"]:
         """The numbers of a tile's beams."""
-        shares = devices.number_of(self.tiling.devices)
-        device, turn = jnp.divmod(tile, max(self.number // shares, 1))
-        return (turn * self.beam_count + jnp.arange(self.beam_count)) * shares + device
+        mesh = self.tiling.devices
+        turns = tile * self.beam_count + jnp.arange(self.beam_count)
+        return turns * devices.number_of(mesh) + devices.index_of(mesh)
 
     def of_beams(self, leaf: Array) -> Array:
-        """From (tiles, groups, rays in a group, *rest) to (beams, rays of a beam, *rest), in their order."""
+        """From (tiles, groups, rays in a group, *rest) of each device to (beams, rays of a beam, *rest) of
+        all, in their order."""
         beams = leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
         return devices.collected(self.tiling.devices, beams)
 
     def of_tiles(self, beams: Array) -> Array:
         """The inverse of `of_beams`; 0 for beams that are missing."""
-        missing, rest = self.number * self.beam_count - beams.shape[0], beams.shape[2:]
-        beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1))
+        mesh, rest, count = self.tiling.devices, beams.shape[2:], self.number * self.beam_count
+        missing = count * devices.number_of(mesh) - beams.shape[0]
+        beams = devices.mine(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
-        dealt = devices.dealt(self.tiling.devices, beams)
-        return dealt.reshape(self.number, groups, self.tiling.group, *rest)
+        return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
     @abstractmethod
     def rays(self, source: Any, space: Space, tile: Int[Array, ""]) -> Ray:
@@ -196,7 +203,8 @@ class _OwnRayTiles(RayTiles):
 
     def assemble(self, leaf: Array) -> Array:
         rest, size = leaf.shape[3:], self.tiling.rays_per_beam
-        rays = self.of_beams(leaf).reshape(self.number * self.beam_count * size, *rest)
+        beams = self.of_beams(leaf)
+        rays = beams.reshape(beams.shape[0] * size, *rest)
         return rays[: math.prod(self.shape)].reshape(*self.shape, *rest)
 
     def disassemble(self, leaf: Array) -> Array:

@@ -18,6 +18,7 @@ from ..selection import Selection
 from ..space import Line
 from . import devices
 from .acceleration import VolumeAcceleration
+from .devices import on_devices
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import lines_at
 from .scene import Scene
@@ -31,7 +32,7 @@ Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]
 """What a march found, of rays: `Rendering.rgba`, `Rendering.depth` and `Details.selected`."""
 
 
-def resolve_image(
+def resolve_pixels(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
     """Pixels, their depths, and their normals where these are asked for, from what the march found."""
@@ -50,6 +51,9 @@ def resolve_image(
 
     resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal)
     return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
+
+
+resolve_image = on_devices("whole")(resolve_pixels)
 
 
 def of_visible(
@@ -78,6 +82,6 @@ def of_visible(
         none = jnp.zeros((size, numbers), nothing.dtype)
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
-    starts = devices.dealt(mesh, jnp.arange(0, chosen.size, size, dtype=jnp.int32))
-    pixels = devices.collected(mesh, devices.map_over(mesh, chunk, starts)).reshape(-1, numbers)
+    starts = devices.mine(mesh, jnp.arange(0, chosen.size, size, dtype=jnp.int32))
+    pixels = devices.collected(mesh, jax.lax.map(chunk, starts)).reshape(-1, numbers)
     return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)
