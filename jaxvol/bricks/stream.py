@@ -303,9 +303,12 @@ def _curved(
     def program(whole: tuple[March, Turn], dealt: tuple[Ray, Progress, Array]) -> tuple[None, Found]:
         march, turn = whole
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), dealt)
-        found = jax.lax.map(
-            lambda some: of_curved(grid, march, *some, turn, beyond), by_beam, batch_size=BEAMS
-        )
+
+        def some(each: tuple[Ray, Progress, Array]) -> Found:
+            rays, at, reached = each
+            return of_curved(grid, march, rays, at, reached, turn, beyond)
+
+        found: Found = jax.lax.map(some, by_beam, batch_size=BEAMS)
         shape = dealt[0].length.shape
         cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
         reached = found.reached.reshape(shape)
