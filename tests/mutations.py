@@ -87,15 +87,15 @@ MUTATIONS = [
     Mutation(
         "devices: gradients are not summed over them",
         "engine/devices.py",
-        "jax.lax.psum(found, AXIS), results",
-        "found, results",
+        "jax.lax.psum(tree, AXIS)",
+        "tree",
         (SHARED,),
     ),
     Mutation(
         "devices: what they found is put together as if each had a stretch of the image",
         "engine/devices.py",
-        "turns = things.reshape(mesh.size, things.shape[0] // mesh.size, *things.shape[1:])",
-        "turns = things.reshape(things.shape[0] // mesh.size, mesh.size, *things.shape[1:])",
+        "turns = jax.lax.all_gather(things, AXIS, axis=1)",
+        "turns = jax.lax.all_gather(things, AXIS, axis=0)",
         (SHARED,),
     ),
     Mutation(
@@ -106,10 +106,10 @@ MUTATIONS = [
         (SHARED,),
     ),
     Mutation(
-        "devices: a tile's beams follow each other",
+        "devices: the beams of each follow each other",
         "engine/rays.py",
-        "(turn * self.beam_count + jnp.arange(self.beam_count)) * shares + device",
-        "tile * self.beam_count + jnp.arange(self.beam_count)",
+        "turns * devices.number_of(mesh) + devices.index_of(mesh)",
+        "turns + devices.index_of(mesh) * self.number * self.beam_count",
         (SHARED,),
     ),
     Mutation(
