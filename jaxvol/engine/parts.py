@@ -114,7 +114,7 @@ def resolve_part(
     for old, new in zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True):
         changed |= old != new
     changed = tiles.assemble(changed)
-    rgba = rendering.rgba * changed[..., None]
+    rgba = rendering.rgba * changed[..., None].astype(rendering.rgba.dtype)
     found = rgba, rendering.depth, rendering.details.selected
     resolved = resolve_pixels(scene, options, acceleration, found)
     return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)

@@ -305,8 +305,8 @@ def own_rays():
             assert_same(every, one)
 
 
-def bricks():
-    """Rays of all bricks dealt out, whatever the order; and bricks that are owned, from everywhere."""
+def owned_from_everywhere():
+    """Bricks that are owned, by more and by fewer devices than there are bricks; and rays that end early."""
     volume, every = blocks(), all_devices()
     more: dict[str, Any]
     for name, camera in CAMERAS.items():
@@ -330,6 +330,13 @@ def bricks():
     ).rgba
     assert 0 < float(jnp.abs(found - whole).max()) <= 0.1
 
+
+def bricks():
+    """Rays of all bricks dealt out: with cells that depend on what lies in front, with pixels computed after
+    the march, and a gradient."""
+    volume, every = blocks(), all_devices()
+    camera = around(volume, SIZE)
+    more: dict[str, Any]
     for march, more in (
         (jv.March(0.05, SHIFTED), {}),
         (jv.March(0.05, MOVING[:2]), {"compositing": jv.Isosurface(0.5)}),
@@ -347,7 +354,7 @@ def bricks():
 
 def curved_bricks():
     """A probe's rays are curved in its grid: rays are dealt out."""
-    volume, probe = jv.toroidal_phantom("spheres", 24)
+    volume, probe = jv.toroidal_phantom("spheres", (16, 16, 24), speckle=False)
     camera = around(volume, (33, 17))
     march = jv.March(0.5, (probe, jv.Jitter(3)))
     one = jv.render(volume, thin(), camera, march)

@@ -58,8 +58,8 @@ def test_devices_that_own_bricks_render_the_whole():
         ("modes",),
         ("adjoints",),
         ("transformations",),
-        ("bricks",),
-        ("curved_bricks",),
+        ("owned_from_everywhere",),
+        ("bricks", "curved_bricks"),
     ],
     ids=" and ".join,
 )
