@@ -88,6 +88,17 @@ class Compositing(eqx.Module, Generic[State]):
         """Whether what follows cannot change the pixel, so that the ray is finished."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
+    def joined(self, front: State, back: State) -> State:
+        """The state after the fragments of `front` and then those of `back`, where both were begun anew. By
+        default states do not tell, and `render_bricks` refuses to join them."""
+        raise NotImplementedError(f"{type(self).__name__} does not join the states of two parts of a ray.")
+
+    @property
+    @final
+    def joins(self) -> bool:
+        """Whether the states of two parts of a ray can be joined."""
+        return type(self).joined is not Compositing.joined and not self.resolves
+
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap
         over the others, except those that hold NaN. `transfer`: as `marched`."""
@@ -219,6 +230,10 @@ class Over(Weighting):
 
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
+
+    def joined(self, front: Composite, back: Composite) -> Composite:
+        """The operator is associative: what is behind has the transmittance in front as its weight."""
+        return jax.tree.map(lambda a, b: a + (1 - front.opacity) * b, front, back)
 
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:
         return transfer.variation(windows)

@@ -14,6 +14,7 @@ from .arguments import check_arguments
 from .camera import Camera
 from .compositing import Compositing
 from .engine.adjoints import Adjoint
+from .engine.devices import Devices
 from .engine.driver import Asked, render_scene
 from .engine.rays import OwnRays
 from .engine.scene import Scene
@@ -41,6 +42,7 @@ def render(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     adjoint: Adjoint | Any = "replay",
+    devices: Devices | Any | None = None,
 ) -> Rendering:
     """Renders an image of a volume.
 
@@ -67,6 +69,12 @@ def render(
         - `"forward"`: forward mode (`jax.jvp`, `jax.jacfwd`).
         - `"direct"`: both, and higher derivatives; JAX differentiates `render_ray_reference`. Memory grows
           with the number of samples.
+    - `devices`: a sequence of JAX's devices, or a `jax.sharding.Mesh` of one axis, to which the rays are
+      dealt out by `jax.shard_map`: beams of 8 x 8 pixels in turn. The image and its gradient are the same,
+      jitter included, and lie on all of these devices. So does the scene: a volume is copied to each once in
+      its lifetime. By default JAX decides where the image is computed, on one device. In a program of several
+      processes (`jax.distributed.initialize()`) pass `jax.devices()`, and make the same calls in all of them;
+      each has the whole image then (`examples/several_processes.py`).
 
     **Returns:** a `Rendering` with leading shape (height, width), in JAX's default float type. If a number on
     which all pixels depend is NaN or infinite (an entry of a transfer function whose fit diverged, say), all
@@ -83,9 +91,9 @@ def render(
     **Raises:** `ValueError`, naming the argument, for an argument of another kind (an array for a `Volume`, a
     camera in the march's place), for unknown outputs or an unknown adjoint, and for `"direct"` where the
     march or the spacing is traced and `march.max_samples` is not given. For `"auto"` where arrays are
-    traced, and for a tolerance without it. Under the wrong mode of
-    differentiation, naming the adjoint to pass (except `jax.jvp` of a `jax.jit` under `"replay"`, which is
-    JAX's `TypeError`).
+    traced, and for a tolerance without it. For `devices` that are none, and for any inside a `jax.shard_map`.
+    Under the wrong mode of differentiation, naming the adjoint to pass (except `jax.jvp` of a `jax.jit` under
+    `"replay"`, which is JAX's `TypeError`).
 
     Without `AlphaCorrection` an image jumps when a sample crosses the exit. The gradient with respect to the
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
@@ -104,7 +112,7 @@ def render(
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
     assert isinstance(march, March)
     scene = Scene(volume, transfer, camera, march, compositing_of(compositing), lighting)
-    return render_scene(scene, outputs, adjoint)
+    return render_scene(scene, outputs, adjoint, devices=devices)
 
 
 def render_rays(
@@ -119,6 +127,7 @@ def render_rays(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     adjoint: Adjoint | Any = "replay",
+    devices: Devices | Any | None = None,
 ) -> Rendering:
     """Renders arbitrary rays. As `render`, except:
 
@@ -127,7 +136,8 @@ def render_rays(
     - `pixels`: (*rays, 2) integers, (column, row), which key the random numbers of each ray. By default
       (index, 0), with the ray's index in the flattened array. Inside `jax.shard_map` over the first axis of
       the rays that is the index in the whole array. Under `check_vma=False`, JAX does not tell a shard that
-      it is one: give pixels there, or each shard draws the same numbers.
+      it is one: give pixels there, or each shard draws the same numbers. There is no need for any of this
+      with `devices`.
 
     **Returns:** as `render`, with leading shape `*rays`.
 
@@ -149,7 +159,7 @@ def render_rays(
     first = shard_number(origins, directions) * count
     source = OwnRays(origins, directions, _pixels(pixels, origins), first)
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
-    return render_scene(scene, outputs, adjoint)
+    return render_scene(scene, outputs, adjoint, devices=devices)
 
 
 def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:

@@ -80,7 +80,74 @@ SLOPES = "lighting/test_phong.py::test_the_gradient_is_interpolated_between_cent
 TABLE = "test_transfer2d.py::test_the_table_is_bilinear_and_constant_beyond_its_lines"
 RANGES = "test_transfer2d.py::test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block"
 
+SHARED = "engine/test_devices.py::test_work_is_balanced_and_images_and_gradients_are_those_of_one_device"
+OWNED = "engine/test_devices.py::test_devices_that_own_bricks_render_the_whole"
+
 MUTATIONS = [
+    # devices
+    Mutation(
+        "devices: gradients are not summed over them",
+        "engine/devices.py",
+        "jax.lax.psum(tree, AXIS)",
+        "tree",
+        (SHARED,),
+    ),
+    Mutation(
+        "devices: what they found is put together as if each had a stretch of the image",
+        "engine/devices.py",
+        "turns = jax.lax.all_gather(things, AXIS, axis=1)",
+        "turns = jax.lax.all_gather(things, AXIS, axis=0)",
+        (SHARED,),
+    ),
+    Mutation(
+        "devices: each has the same columns of an image in every row",
+        "engine/rays.py",
+        "across += shares > 1 and across % shares == 0",
+        "across += 0",
+        (SHARED,),
+    ),
+    Mutation(
+        "devices: the beams of each follow each other",
+        "engine/rays.py",
+        "turns * devices.number_of(mesh) + devices.index_of(mesh)",
+        "turns + devices.index_of(mesh) * self.number * self.beam_count",
+        (SHARED,),
+    ),
+    Mutation(
+        "devices: given inside of a shard_map, they deal out again",
+        "engine/devices.py",
+        "    if mesh is not None and (jax.sharding",
+        "    if False and (jax.sharding",
+        (SHARED,),
+    ),
+    Mutation(
+        "owned bricks: what is behind is not dimmed",
+        "compositing.py",
+        "a + (1 - front.opacity) * b",
+        "a + b",
+        (OWNED,),
+    ),
+    Mutation(
+        "owned bricks: cells between two devices are marched by both",
+        "bricks/owned.py",
+        "share.underway, cells, exact=True)",
+        "share.underway, cells)",
+        (OWNED,),
+    ),
+    Mutation(
+        "owned bricks: a device begins where its bricks might, rather than where those before it end",
+        "bricks/owned.py",
+        "first, until = jnp.maximum(cells.first, self.own.first), jnp",
+        "first, until = cells.first, jnp",
+        (OWNED,),
+    ),
+    Mutation(
+        "owned bricks: one device has all of them",
+        "bricks/owned.py",
+        "seen[-1] * i / number",
+        "seen[-1]",
+        ("engine/test_devices.py::test_devices_own_as_many_bricks_that_are_needed",),
+    ),
     # sources of bricks
     Mutation(
         "files: the gap between rows is not stepped over",
@@ -962,8 +1029,8 @@ MUTATIONS = [
     Mutation(
         "NaN: a NaN leaf gives a black image",
         "engine/image.py",
-        "return one(number, invalid(tiles.rays(scene.source, space, number), fault))",
-        "return one(number, tiles.rays(scene.source, space, number))",
+        "return one(each[0], invalid(tiles.rays(scene.source, space, each[0]), fault))",
+        "return one(each[0], tiles.rays(scene.source, space, each[0]))",
         (NAN,),
     ),
     Mutation(

@@ -77,24 +77,45 @@ def widened(cells: CellRange) -> CellRange:
 
 
 def of_straight(
-    grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], turn: Turn
+    grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], brick: Int[Array, ""]
 ) -> CellRange:
-    """The cells of straight rays in a brick; none of rays that miss it, or are not alive."""
+    """The cells of straight rays in a brick, and those whose samples may have been moved to there; none of
+    rays that miss it, or are not alive."""
+    near, far, hit = _within(grid, march, rays, brick)
+    first, until = jnp.ceil(near).astype(jnp.int32) - SLACK, jnp.floor(far).astype(jnp.int32) + 1 + SLACK
+    none, hit = jnp.zeros_like(first), alive & hit
+    return CellRange(jnp.where(hit, jnp.maximum(first, 0), none), jnp.where(hit, until, none))
+
+
+def behind_straight(
+    grid: BrickGrid, march: March, rays: Ray, order: Int[Array, " bricks"], number: Int[Array, ""]
+) -> Int[Array, "*rays"]:
+    """Of straight rays, the first cell that begins behind the first `number` bricks of an order in which each
+    ray meets them."""
+
+    def more(i: Int[Array, ""], index: Int[Array, "*rays"]) -> Int[Array, "*rays"]:
+        _, far, hit = _within(grid, march, rays, order[i])
+        return jnp.maximum(index, jnp.where(hit, jnp.ceil(far).astype(jnp.int32), 0))
+
+    return jax.lax.fori_loop(0, number, more, jnp.zeros(rays.length.shape, jnp.int32))
+
+
+def _within(
+    grid: BrickGrid, march: March, rays: Ray, brick: Int[Array, ""]
+) -> tuple[Float[Array, "*rays"], Float[Array, "*rays"], Bool[Array, "*rays"]]:
+    """Where straight rays enter and leave a brick, in steps from their entry, and which of them meet it."""
     path = rays.path
     assert isinstance(path, Straight)
-    index = jnp.unravel_index(turn.brick, grid.counts)
+    index = jnp.unravel_index(brick, grid.counts)
     low, high = [], []
     for i, size, count in zip(index, grid.size, grid.counts, strict=True):
         # what lies outside of the grid belongs to the bricks at its faces
         low.append(jnp.where(i == 0, -jnp.inf, (i * size).astype(rays.length.dtype)))
         high.append(jnp.where(i == count - 1, jnp.inf, ((i + 1) * size).astype(rays.length.dtype)))
     near, far = slab_interval(path.start, path.rate, (low[0], low[1], low[2]), (high[0], high[1], high[2]))
-    hit = alive & (near <= far) & (far >= 0) & (near < rays.length)
+    hit = (near <= far) & (far >= 0) & (near < rays.length)
     last = rays.length / march.step + 1  # clipped before it becomes an integer, whose range it may exceed
-    first = jnp.ceil(jnp.clip(near / march.step, 0, last)).astype(jnp.int32) - SLACK
-    until = jnp.floor(jnp.clip(far / march.step, 0, last)).astype(jnp.int32) + 1 + SLACK
-    none = jnp.zeros_like(first)
-    return CellRange(jnp.where(hit, jnp.maximum(first, 0), none), jnp.where(hit, until, none))
+    return jnp.clip(near / march.step, 0, last), jnp.clip(far / march.step, 0, last), hit
 
 
 def of_curved(

@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from .._util.checks import Arrayable, described, integer, is_traced
 from .._util.memory import memory_of_device
@@ -17,8 +18,9 @@ from ..camera import Camera
 from ..compositing import Compositing
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.batch import CellRange
+from ..engine.devices import Devices, check_not_sharded, mesh_of, number_of, on_all
 from ..engine.driver import Asked
-from ..engine.gradients import of_all_outputs, of_perturbed
+from ..engine.gradients import Sums, of_all_outputs, of_perturbed
 from ..engine.image import RenderOptions
 from ..engine.parts import NOTHING, Underway, arrive, march_part, resolve_part, set_out
 from ..engine.parts_gradient import Pulled, end_pull, pull_part, start_pull
@@ -35,10 +37,16 @@ from ..transfer import Transfer
 from ..transforms import SpaceLeaping
 from ..volume import Volume, part_of
 from .detail import level_for
+from .grid import is_straight
 from .opening import levels_of
+from .owned import render_owned
 from .sources import VoxelSource
 from .stream import CELL, Method, Stream
 from .summary_files import summary_of
+
+
+Own = Literal["rays", "bricks"]
+"""What devices may own."""
 
 
 def render_bricks(
@@ -59,6 +67,8 @@ def render_bricks(
     tolerance: float | None = None,
     cache: Literal["beside"] | str | Any | None = "beside",
     progress: Callable[[int, int], Any] | None = None,
+    devices: Devices | Any | None = None,
+    own: Own | Any = "rays",
     **options: Any,
 ) -> Rendering:
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
@@ -92,6 +102,17 @@ def render_bricks(
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
       first image; see `bricks.summary_of`.
     - `progress`: called with the numbers of bricks read and of those that hold anything visible.
+    - `devices`: as for `render`. `memory` is that of each device.
+    - `own`: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
+      is read once (in each process) and copied to all. It is exact for everything that one device renders,
+      and so are its gradients. `"bricks"`: each device has its own bricks, marches all rays through them, and
+      the partial images are combined front to back. No voxel goes to two devices or processes, but for what
+      is read around bricks; so where reading takes longest, and for several processes. Devices get
+      consecutive bricks of the order front to back, so that rays must be straight in the grid (no
+      `ToroidalMap`), and what a ray shows must not depend on what lies in front but by its transmittance
+      (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by `"over"`). An `EarlyTermination` sees what
+      is in front on the same device alone: up to `opacity_left` of the colours behind are added, which one
+      device leaves out. Each device keeps some 300 bytes for each pixel. No gradients.
 
     **Returns:** as `render`, and in `Rendering.bricks` what it took.
 
@@ -102,8 +123,9 @@ def render_bricks(
     or `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
-    unknown; for less memory than the smallest bricks take; and for what needs the whole volume at once
-    (labels, baked or deferred light). Nothing is written but the cache, which appears whole or not at all.
+    unknown; for less memory than the smallest bricks take; for what needs the whole volume at once (labels,
+    baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written but the
+    cache, which appears whole or not at all.
 
     Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
     are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the
@@ -111,7 +133,8 @@ def render_bricks(
     """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    _check(march, transfer, lighting, method, outputs)
+    _check(march, transfer, lighting, method, outputs, own)
+    mesh = mesh_of(devices)
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
     chosen = _level(levels, level, camera, transfer, tolerance, cache)
@@ -128,7 +151,11 @@ def render_bricks(
     how = compositing_of(compositing)
     scene = strong(Scene(volume, transfer, camera, march.divided(), how, lighting))
     memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
-    job = _Job(chosen, memory, _counts(bricks), method, outputs, cache, progress, [])
+    check_not_sharded(mesh, scene)
+    scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
+    job = _Job(chosen, memory, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
+    if owned:
+        _check_owned(scene, method)
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
     return Rendering(
         rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=job.streams[0].report())
@@ -137,7 +164,8 @@ def render_bricks(
 
 @dataclass(frozen=True)
 class _Job:
-    """How a scene is rendered. `streams`: those that did it, filled as they do."""
+    """How a scene is rendered. `owned`: whether devices own bricks. `streams`: those that did it, filled as
+    they do."""
 
     source: VoxelSource
     memory: int
@@ -146,14 +174,22 @@ class _Job:
     outputs: Asked
     cache: Any
     progress: Callable[[int, int], Any] | None
+    devices: Mesh | None
+    owned: bool
     streams: list[Stream]
+
+    def options(self, outputs: Any) -> RenderOptions:
+        """What is computed, and how rays are divided."""
+        tiling = Tiling.of_backend(self.devices)
+        return RenderOptions(outputs, tiling._replace(devices=None) if self.owned else tiling)
 
     def stream(self, marched: Scene, shown: Scene, options: RenderOptions) -> Stream:
         """The bricks of a scene, as rays are marched, and as they are shown."""
         cell = CELL if min(self.source.shape) > CELL else 4
         summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
         where = self.memory, self.counts, self.method, self.progress
-        stream = Stream.of(self.source, summary, marched, shown, options, *where)
+        least = number_of(self.devices) if self.owned else 1
+        stream = Stream.of(self.source, summary, marched, shown, options, *where, least)
         self.streams.append(stream)
         return stream
 
@@ -169,8 +205,11 @@ def _image(scene: Scene, job: _Job) -> Rendering:
     if mode.resolves:  # rays are marched without light, and pixels are computed from what that finds
         transfer, march = mode.marched(scene.transfer, scene.march, scene.volume)
         marched = scene._replace(transfer=transfer, march=march, lighting=None)
-    options = _options("depth" if mode.resolves and outputs == "rgba" else outputs)
+    options = job.options("depth" if mode.resolves and outputs == "rgba" else outputs)
     stream = job.stream(marched, scene, options)
+    if job.owned:
+        assert job.devices is not None
+        return render_owned(stream, job.devices)
     naive = job.method == "naive"
 
     def march_brick(
@@ -225,23 +264,19 @@ def _(perturbed: Any, scene: Scene, job: _Job) -> tuple[Rendering, Rendering]:
 
 @_differentiable.def_bwd
 def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _Job) -> Any:
-    options, whole = _options(job.outputs), of_all_outputs(rendering, cotangent)
+    options, whole = job.options(job.outputs), of_all_outputs(rendering, cotangent)
     stream = job.stream(scene, scene, options)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         stream = replace(stream, visible=np.ones_like(stream.visible))
 
-    def pull_brick(part: Volume, cells: CellRange, pulled: Pulled) -> Pulled:
+    def pull_brick(part: Volume, cells: CellRange, state: tuple[Sums, Pulled]) -> tuple[Sums, Pulled]:
         here, options_, acceleration = _on(part, scene, options)
-        return _pull_part(here, perturbed, options_, acceleration, pulled, cells)
+        return _pull_part(here, perturbed, options_, acceleration, *state, cells)
 
-    pulled = _start_pull(scene, perturbed, options, rendering, whole)
-    pulled = stream.through(pulled.underway.rays, pulled, lambda state: state.underway.at, pull_brick)
-    found = _end_pull(scene, perturbed, options, pulled, rendering, whole)
+    state = _start_pull(scene, perturbed, options, rendering, whole)
+    state = stream.through(state[1].underway.rays, state, lambda state: state[1].underway.at, pull_brick)
+    found = _end_pull(scene, perturbed, options, *state, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
-
-
-def _options(outputs: Any) -> RenderOptions:
-    return RenderOptions(outputs, Tiling.of_backend())
 
 
 def _on(
@@ -285,8 +320,10 @@ def _counts(bricks: Any) -> tuple[int, int, int] | None:
     return integer("bricks", x, 1), integer("bricks", y, 1), integer("bricks", z, 1)
 
 
-def _check(march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any) -> None:
-    for name, given, known in (("method", method, Method), ("outputs", outputs, Asked)):
+def _check(
+    march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any, own: Any
+) -> None:
+    for name, given, known in (("method", method, Method), ("outputs", outputs, Asked), ("own", own, Own)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
     if isinstance(transfer, LabelTransferFunction):
@@ -304,3 +341,19 @@ def _check(march: March, transfer: Transfer, lighting: Lighting | None, method: 
             f"{type(lighting).__name__} needs the whole volume here. Phong does not, and neither do "
             "ScattererTemplates that are not baked."
         )
+
+
+def _check_owned(scene: Scene, method: Method) -> None:
+    """Raises where partial images of bricks cannot be combined."""
+    march, mode = scene.march, scene.compositing
+    refused = {
+        f"method={method!r}": method != "overlap",
+        f"compositing by {type(mode).__name__}, which does not join parts of a ray": not mode.joins,
+        "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
+        "AdaptiveSampling, whose strides depend on what lies in front": march.strides_vary,
+        "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
+        "gradients": is_traced(scene),
+    }
+    for what, refuses in refused.items():
+        if refuses:
+            raise ValueError(f'own="bricks" does not go with {what}. Use own="rays".')

@@ -73,8 +73,11 @@ def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
     return math.ceil(math.prod(stored) * (COPIES * kind.itemsize + packed))
 
 
-def split(shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None) -> BrickGrid:
-    """The fewest bricks that fit into so many bytes: halves are cut off along the longest axis.
+def split(
+    shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None, least: int = 1
+) -> BrickGrid:
+    """The fewest bricks that fit into so many bytes: halves are cut off along the longest axis. There are at
+    least `least`, unless they would be smaller than bricks are.
 
     **Raises:** `ValueError` if the smallest ones do not fit."""
     memory = integer("memory", memory, 1)
@@ -84,10 +87,11 @@ def split(shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalM
         size = [_rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
         grid = BrickGrid(shape, (size[0], size[1], size[2]))
         needed = bytes_of(stored_of(grid, margin, probe), dtype, margin)
-        if needed <= memory:
-            return grid
         longest = max(range(3), key=lambda axis: (size[axis] > min(EDGE, cells[axis])) * size[axis])
-        if size[longest] <= min(EDGE, cells[longest]):
+        smallest = size[longest] <= min(EDGE, cells[longest])
+        if needed <= memory and (grid.number >= least or smallest):
+            return grid
+        if smallest:
             raise ValueError(
                 f"memory must be at least {needed} bytes, for bricks of {' x '.join(map(str, size))} cells "
                 f"and what is read around them; got {memory}."

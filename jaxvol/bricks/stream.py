@@ -8,11 +8,13 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jax.sharding import Mesh
+from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import apart
 from .._util.xla import compiled
 from ..camera import Camera
+from ..engine import devices
 from ..engine.batch import CellRange
 from ..engine.image import RenderOptions
 from ..engine.scene import Scene
@@ -87,16 +89,17 @@ class Stream:
         counts: Node | None,
         method: Method,
         progress: Callable[[int, int], Any] | None,
+        least: int = 1,
     ) -> "Stream":
         """The bricks of a scene: as its rays are marched, and as it is `shown`. `counts`: along each axis, in
-        place of as few as fit into `memory`."""
+        place of as few as fit into `memory`, and at least `least`."""
         march = marched.march
         space = march.locate(marched.volume)
         straight = is_straight(space)
         probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
         margin = Margin.of(march, _distances(space, source.shape), options.tiling.cells, shown)
         if counts is None:
-            grid = split(source.shape, source.dtype, memory, margin, probe)
+            grid = split(source.shape, source.dtype, memory, margin, probe, least)
         else:
             x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
@@ -107,6 +110,11 @@ class Stream:
             *(source, marched, options, grid, margin, order, visible, straight, stored),
             *(max(memory, bytes_of(stored, source.dtype, margin)), method, progress),
         )
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """The devices to which rays are dealt out."""
+        return self.options.tiling.devices
 
     def through(
         self,
@@ -160,10 +168,11 @@ class Stream:
             for brick in self.order:
                 if not self.visible[brick]:
                     continue
-                turn = self._turn(brick, {brick})
-                cells, any_ = _cells_of_straight(self.grid, self.scene.march, rays, living[0].finished, turn)
+                number = jnp.asarray(brick, jnp.int32)
+                finished = living[0].finished
+                cells, any_ = _cells_of_straight(self.grid, self.scene.march, rays, finished, number)
                 if any_:
-                    yield self._load(brick, cells, *self._around(brick))
+                    yield self._load(brick, cells, *self.around(brick))
             return
         reached, going = jnp.zeros(rays.length.shape, jnp.int32), True
         while going:
@@ -191,11 +200,13 @@ class Stream:
             own, load = jnp.asarray(~others), None
             turn = Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(others), own, jnp.asarray(others))
             while self.visible[brick]:
-                found = _cells_of_curved(self.grid, 0, self.scene.march, rays, living[0], reached, turn)
+                found = _cells_of_curved(
+                    self.mesh, self.grid, 0, self.scene.march, rays, living[0], reached, turn
+                )
                 if not bool(found.any):
                     break
                 if load is None:
-                    load = self._load(brick, found.cells, *self._around(brick))
+                    load = self._load(brick, found.cells, *self.around(brick))
                 else:
                     load = load._replace(cells=found.cells)
                 reached = found.reached
@@ -211,12 +222,12 @@ class Stream:
 
     def _found(self, brick: int, through: set[int], rays: Ray, at: Progress, reached: Array) -> Found | None:
         beyond = self.margin.steps
-        found = _cells_of_curved(
-            self.grid, beyond, self.scene.march, rays, at, reached, self._turn(brick, through)
-        )
+        turn = self._turn(brick, through)
+        march = self.scene.march
+        found = _cells_of_curved(self.mesh, self.grid, beyond, march, rays, at, reached, turn)
         return found if bool(found.any) else None
 
-    def _around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
+    def around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
         low, high = (np.asarray(end) for end in self.grid.cells(brick))
         return low - self.margin.cells, high + self.margin.cells
 
@@ -238,6 +249,10 @@ class Stream:
         return False
 
     def _load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:
+        """Starts to read a brick, for these cells."""
+        return Load(brick, cells, *self.read(brick, low, high))
+
+    def read(self, brick: int, low: np.ndarray, high: np.ndarray) -> tuple[Node, "Future[np.ndarray]"]:
         """Starts to read a brick: a part that begins at a multiple of BLOCK and holds these nodes."""
         shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
         first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
@@ -245,7 +260,7 @@ class Stream:
         x, y, z = first.tolist()
         self.loads.append(brick)
         self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
-        return Load(brick, cells, (x, y, z), self.source.read_async(first, first + stored))
+        return (x, y, z), self.source.read_async(first, first + stored)
 
 
 def _distances(space: Space, shape: Node) -> np.ndarray:
@@ -267,26 +282,41 @@ def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
 
 
 def _straight(
-    grid: BrickGrid, march: March, rays: Ray, finished: Bool[Array, "*rays"], turn: Turn
+    grid: BrickGrid, march: March, rays: Ray, finished: Bool[Array, "*rays"], brick: Int[Array, ""]
 ) -> tuple[CellRange, Bool[Array, ""]]:
-    cells = of_straight(grid, march, rays, ~finished, turn)
+    cells = of_straight(grid, march, rays, ~finished, brick)
     return cells, jnp.any(cells.until > cells.first)
 
 
 def _curved(
-    grid: BrickGrid, beyond: int, march: March, rays: Ray, at: Progress, reached: Array, turn: Turn
+    mesh: Mesh | None,
+    grid: BrickGrid,
+    beyond: int,
+    march: March,
+    rays: Ray,
+    at: Progress,
+    reached: Array,
+    turn: Turn,
 ) -> Found:
     """By beams of rays, as many as are looked at at a time."""
-    shape = rays.length.shape
-    by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), (rays, at, reached))
 
-    def some(each: tuple[Ray, Progress, Array]) -> Found:
-        rays, at, reached = each
-        return of_curved(grid, march, rays, at, reached, turn, beyond)
+    def program(whole: tuple[March, Turn], dealt: tuple[Ray, Progress, Array]) -> tuple[None, Found]:
+        march, turn = whole
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), dealt)
 
-    found = jax.lax.map(some, by_beam, batch_size=BEAMS)
-    cells, reached = jax.tree.map(lambda leaf: leaf.reshape(shape), (found.cells, found.reached))
-    return Found(cells, reached, jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any))
+        def some(each: tuple[Ray, Progress, Array]) -> Found:
+            rays, at, reached = each
+            return of_curved(grid, march, rays, at, reached, turn, beyond)
+
+        found: Found = jax.lax.map(some, by_beam, batch_size=BEAMS)
+        shape = dealt[0].length.shape
+        cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
+        reached = found.reached.reshape(shape)
+        return None, found._replace(cells=cells, reached=reached)
+
+    _, found = devices.split(mesh, program, (march, turn), (rays, at, reached))
+    low, high = jnp.min(found.low, 0), jnp.max(found.high, 0)
+    return found._replace(low=low, high=high, any=jnp.any(found.any))
 
 
 _cells_of_straight = compiled(_straight)

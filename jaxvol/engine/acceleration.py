@@ -82,7 +82,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
         through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
         own = OwnRays(*(jnp.stack(part, axis=-1) for part in (through.origin, through.direction)))
-        tiles, only = RayTiles.of(own, tiling._replace(tile=columns.size)), jnp.zeros((), jnp.int32)
+        one_tile = tiling._replace(tile=columns.size, devices=None)
+        tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
         rays = tiles.rays(own, space, only)
         beams = Beams(rays, tiles.beam_count, tiles.box(own, rays, only))
         pipeline = Pipeline(

@@ -12,6 +12,7 @@ from ..rendering import Rendering
 from ..selection import Selection
 from .acceleration import VolumeAcceleration
 from .adjoints import AbstractAdjoint, Adjoint, adjoint_of
+from .devices import check_not_sharded, mesh_of, on_all
 from .image import RenderOptions
 from .scene import Scene
 from .tiling import Tiling
@@ -21,23 +22,28 @@ Asked = Literal["all", "rgba"]
 """What a caller may ask for. Of the engine's outputs, the depth alone is for lightings that shade pixels."""
 
 
-def render_scene(scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None) -> Rendering:
+def render_scene(
+    scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None, devices: Any = None
+) -> Rendering:
     """The image of a scene whose parts are what they should be.
 
-    `outputs`, `adjoint`: as for `render`. `tiling`: by default that of the backend.
+    `outputs`, `adjoint`, `devices`: as for `render`. `tiling`: by default that of the devices.
 
-    **Raises:** `ValueError` for unknown outputs or an unknown adjoint."""
+    **Raises:** `ValueError` for unknown outputs or an unknown adjoint, and for devices that are none."""
     for name, given, known in (("outputs", outputs, Asked), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
+    tiling = Tiling.of_backend(mesh_of(devices)) if tiling is None else tiling
+    check_not_sharded(tiling.devices, scene)
     scene = strong(scene._replace(march=scene.march.divided()))
     volume, transfer, _, march, _, lighting = scene
     how = adjoint_of(adjoint, volume, march)
     if lighting is not None:
         lighting = lighting.prepared(volume, transfer, march)
-    options = RenderOptions(outputs, Tiling.of_backend() if tiling is None else tiling)
+    options = RenderOptions(outputs, tiling)
     acceleration = VolumeAcceleration.of(volume, transfer, march, lighting)
     scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))
+    scene, acceleration = on_all(tiling.devices, (scene, acceleration))
     if resolves(scene.compositing, lighting):
         return _resolved(scene, options, how, acceleration)
     return how.render(scene, options, acceleration)

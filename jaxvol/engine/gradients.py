@@ -23,6 +23,7 @@ from ..space import Ray, invalid
 from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
+from .devices import on_devices
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
@@ -171,6 +172,7 @@ def _of_voxels(scene: Scene, perturbed: Any) -> bool:
     return eqx.is_inexact_array(scene.volume.data) and perturbed.volume.data
 
 
+@on_devices("whole", dealt=("ranges",))
 def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,
@@ -194,9 +196,8 @@ def _vjp_by_tiles(
         return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    every = jnp.arange(image.tiles.number), ranges, *parts
-    sums, _ = jax.lax.scan(tile, varying(image.zeros(perturbed), parts), every)
-    return cotangents_of(scene, *sums, image.pull_shader)
+    sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), ranges, *parts)
+    return cotangents_of(scene, sums.total, sums.source, image.pull_shader)
 
 
 def cotangents_of(

@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.sharding import varying
@@ -17,6 +16,7 @@ from ..rendering import Rendering
 from ..space import Ray, Space, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, VisibleRangeRecorder
+from .devices import on_devices
 from .rays import RayTiles, vmap_rays
 from .scene import Scene
 from .tiling import Tiling
@@ -30,6 +30,7 @@ class RenderOptions(eqx.Module):
     tiling: Tiling = eqx.field(static=True)
 
 
+@on_devices("both")
 def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, CellRange | None]:
@@ -49,6 +50,7 @@ def march_image(
     return _over_tiles(scene, space, tiles, marched)
 
 
+@on_devices("whole")
 def scan_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, length: int
 ) -> Rendering:
@@ -82,10 +84,10 @@ def _over_tiles(
     else it returned, stacked."""
     fault = fault_of(scene)
 
-    def tile(number: Int[Array, ""]) -> tuple[Rendering, Any]:
-        return one(number, invalid(tiles.rays(scene.source, space, number), fault))
+    def tile(each: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
+        return one(each[0], invalid(tiles.rays(scene.source, space, each[0]), fault))
 
-    renderings, more = jax.lax.map(tile, jnp.arange(tiles.number))
+    renderings, more = tiles.map(tile)
     return jax.tree.map(tiles.assemble, renderings), more
 
 

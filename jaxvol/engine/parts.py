@@ -5,7 +5,8 @@ each part marches those cells of it that lie there (`CellRange`), from where the
 is made of voxels, the packed copy, ranges of blocks and windows, is made of each part.
 """
 
-from functools import partial
+from dataclasses import replace
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
@@ -18,9 +19,10 @@ from ..rendering import Rendering
 from ..space import Ray, invalid
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, with_fields
+from .devices import on_devices
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles, vmap_rays
-from .resolve import resolve_image
+from .resolve import resolve_pixels
 from .scene import Scene
 from .wavefront import march_rays
 
@@ -35,19 +37,21 @@ class Underway(eqx.Module):
     at: Progress
 
 
+@on_devices("dealt")
 def set_out(scene: Scene, options: RenderOptions) -> Underway:
     """All rays at their entries. Of the volume, no voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), fault_of(scene)
     space, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
 
-    def one(number: Int[Array, ""]) -> Underway:
-        rays = invalid(tiles.rays(scene.source, space, number), fault)
+    def one(each: tuple[Int[Array, ""]]) -> Underway:
+        rays = invalid(tiles.rays(scene.source, space, each[0]), fault)
         at = vmap_rays(lambda ray: begin(pipeline, ray, options.outputs))(rays)
         return Underway(rays, with_fields(at, finished=rays.length <= 0))
 
-    return jax.lax.map(one, jnp.arange(tiles.number))
+    return tiles.map(one)
 
 
+@on_devices("dealt", dealt=("underway", "ranges"))
 def march_part(
     scene: Scene,
     options: RenderOptions,
@@ -55,10 +59,11 @@ def march_part(
     underway: Underway,
     ranges: CellRange,
     anew: bool = False,
+    exact: bool = False,
 ) -> Underway:
     """The rays behind these of their cells. `scene`: with a part of the volume, which holds what they meet
-    there, and in a segment more. `anew`: the cells are marched whatever was before them, also what lies
-    behind them; and none beside them."""
+    there, and in a segment more. `exact`: they take no cell behind these. `anew`: nor does it count whether
+    they have come to the first of these, or past it: all of them are marched."""
     tiles, packed = RayTiles.of(scene.source, options.tiling), acceleration.packed(scene)
     index = empty_space_of(packed, acceleration, options.tiling)
     _, pipeline = pipeline_of(packed, acceleration)
@@ -71,13 +76,13 @@ def march_part(
             seen = opaque(pipeline, at) | (range_.until <= range_.first)
             start = with_fields(at, index=range_.first, finished=seen)
         after, _ = march_rays(
-            pipeline, index, beams, options.tiling, options.outputs, resumed=start, exact=anew
+            pipeline, index, beams, options.tiling, options.outputs, resumed=start, exact=anew or exact
         )
         # where marched anew, a ray may go back
         over = opaque(pipeline, after) if anew else at.finished | ended(pipeline, rays, after)
         return Underway(rays, with_fields(after, finished=over))
 
-    return jax.lax.map(one, (jnp.arange(tiles.number), underway, ranges))
+    return tiles.map(one, underway, ranges)
 
 
 def ended(pipeline: Pipeline, rays: Ray, at: Progress) -> Bool[Array, "groups rays"]:
@@ -91,6 +96,7 @@ def opaque(pipeline: Pipeline, at: Progress) -> Bool[Array, "groups rays"]:
     return vmap_rays(partial(stopped, pipeline))(at.composite)
 
 
+@on_devices("whole", dealt=("before", "after"))
 def resolve_part(
     scene: Scene,
     options: RenderOptions,
@@ -108,9 +114,9 @@ def resolve_part(
     for old, new in zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True):
         changed |= old != new
     changed = tiles.assemble(changed)
-    rgba = rendering.rgba * changed[..., None]
+    rgba = rendering.rgba * changed[..., None].astype(rendering.rgba.dtype)
     found = rgba, rendering.depth, rendering.details.selected
-    resolved = resolve_image(scene, options, acceleration, found)
+    resolved = resolve_pixels(scene, options, acceleration, found)
     return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)
 
 
@@ -120,6 +126,36 @@ def _assembled(scene: Scene, march: March, tiles: RayTiles, underway: Underway) 
     return jax.tree.map(tiles.assemble, renderings)
 
 
+def joined(scene: Scene, parts: Underway) -> Underway:
+    """Rays that have passed all parts of a volume, from several that were each marched through some of them,
+    front to back, and from a beginning of their own: along the first axis. Where a ray was stopped in front,
+    it does not show what is behind."""
+    _, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
+
+    def join(front: Progress, back: Progress) -> Progress:
+        both = replace(
+            front,
+            index=jnp.maximum(front.index, back.index),
+            composite=scene.compositing.joined(front.composite, back.composite),
+            finished=front.finished & back.finished,
+        )
+        if front.stats is not None and back.stats is not None:
+            samples, aligned = (
+                front.stats.samples + back.stats.samples,
+                front.stats.aligned | back.stats.aligned,
+            )
+            both = replace(both, stats=replace(front.stats, samples=samples, aligned=aligned))
+        stops = stopped(pipeline, front.composite)
+        return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
+
+    # a ray that met nothing here, or all that it may, is not held up here
+    over = parts.at.finished | (parts.at.index < scene.march.most_samples)
+    at = with_fields(parts.at, finished=over)
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(over.shape[0])]
+    return Underway(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(jax.vmap(vmap_rays(join)), each))
+
+
+@on_devices("whole", dealt=("underway",))
 def arrive(scene: Scene, options: RenderOptions, underway: Underway) -> Rendering:
     """The image of rays that have passed all parts."""
     at = underway.at

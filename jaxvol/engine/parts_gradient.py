@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.trees import PyTree
@@ -13,6 +12,7 @@ from ..reference import begin
 from ..rendering import Rendering
 from .acceleration import VolumeAcceleration
 from .batch import CellRange, with_fields
+from .devices import on_devices
 from .gradients import Pull, Sums, cotangents_of
 from .image import RenderOptions
 from .parts import NOTHING, Underway, ended
@@ -23,7 +23,7 @@ from .wavefront import march_rays
 
 
 class Pulled(eqx.Module):
-    """The second march of an image, underway: all but `sums` are of (tiles, groups, rays in a group).
+    """The second march of an image, underway, of (tiles, groups, rays in a group).
 
     - `given`: cotangents of the rays.
     - `carry`: what the samples so far are worth. `of_rays`: what they gave the rays.
@@ -33,12 +33,12 @@ class Pulled(eqx.Module):
     given: Cotangents
     carry: Array
     of_rays: PyTree
-    sums: Sums
 
 
+@on_devices("both")
 def start_pull(
     scene: Scene, perturbed: Any, options: RenderOptions, rendering: Rendering, cotangent: Rendering
-) -> Pulled:
+) -> tuple[Sums, Pulled]:
     """All rays at their entries, with the cotangents of their pixels. Of the volume, no voxel is read."""
     image = Pull.of(scene, perturbed, options, NOTHING)
     sums = image.zeros(perturbed)
@@ -53,18 +53,20 @@ def start_pull(
         return underway, given, replay.carry, replay.sums
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    underway, given, carry, of_rays = jax.lax.map(one, (jnp.arange(image.tiles.number), *parts))
-    return Pulled(underway, given, carry, of_rays, sums)
+    underway, given, carry, of_rays = image.tiles.map(one, *parts)
+    return sums, Pulled(underway, given, carry, of_rays)
 
 
+@on_devices("both", dealt=("pulled", "ranges"))
 def pull_part(
     scene: Scene,
     perturbed: Any,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
+    sums: Sums,
     pulled: Pulled,
     ranges: CellRange,
-) -> Pulled:
+) -> tuple[Sums, Pulled]:
     """The second march behind these cells of its rays, as `march_part`."""
     image = Pull.of(scene, perturbed, options, acceleration)
 
@@ -80,16 +82,17 @@ def pull_part(
         underway = Underway(underway.rays, with_fields(after, finished=over))
         return sums._replace(total=total), (underway, given, carry, of_rays)
 
-    numbers = jnp.arange(image.tiles.number)
-    every = numbers, pulled.underway, pulled.given, pulled.carry, pulled.of_rays, ranges
-    sums, (underway, given, carry, of_rays) = jax.lax.scan(one, pulled.sums, every)
-    return Pulled(underway, given, carry, of_rays, sums)
+    every = pulled.underway, pulled.given, pulled.carry, pulled.of_rays, ranges
+    sums, (underway, given, carry, of_rays) = image.tiles.scan(one, sums, *every)
+    return sums, Pulled(underway, given, carry, of_rays)
 
 
+@on_devices("whole", dealt=("pulled",))
 def end_pull(
     scene: Scene,
     perturbed: Any,
     options: RenderOptions,
+    sums: Sums,
     pulled: Pulled,
     rendering: Rendering,
     cotangent: Rendering,
@@ -103,5 +106,5 @@ def end_pull(
         return image.of_rays(sums, pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    sums, _ = jax.lax.scan(one, pulled.sums, (jnp.arange(image.tiles.number), pulled.of_rays, *parts))
-    return cotangents_of(scene, *sums, image.pull_shader)
+    sums, _ = image.tiles.scan(one, sums, pulled.of_rays, *parts)
+    return cotangents_of(scene, sums.total, sums.source, image.pull_shader)

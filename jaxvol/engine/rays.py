@@ -1,7 +1,8 @@
 """How is an image divided into tiles, and a tile into beams and groups of rays?
 
-Only one tile's rays are in memory beside the finished pixels, however large the image. They are arrays
-(groups, rays in a group), in which equally many groups in a row make up a beam.
+Only one tile's rays are in memory beside the finished pixels, however large the image; or one on each device,
+to which beams are dealt out in turn (`devices`). They are arrays (groups, rays in a group), in which equally
+many groups in a row make up a beam.
 """
 
 import math
@@ -16,11 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
+from .._util.trees import PyTree, added
 from .._util.xla import in_memory
 from ..beams import Box
 from ..camera import Camera
 from ..occupancy import Occupancy
 from ..space import Line, Ray, Space, enter
+from . import devices
 from .tiling import Tiling
 
 
@@ -50,7 +53,10 @@ class OwnRays(eqx.Module):
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
-    - `number`: of tiles. `beam_count`: of beams in each tile.
+    - `number`: of tiles, on each device. `beam_count`: of beams in each tile.
+
+    Where there are several devices, all but `of` is called inside `devices.split`, and is about the tiles of
+    this device.
     """
 
     number: int = eqx.field(static=True)
@@ -60,16 +66,56 @@ class RayTiles(eqx.Module):
     @classmethod
     def of(cls, source: Camera | OwnRays, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
         """The tiles of a camera's pixels, or of given rays; small ones for `"direct"`."""
-        side, most_beams = tiling.beam, tiling.direct_tile if direct else tiling.tile
+        side, most = tiling.beam, tiling.direct_tile if direct else tiling.tile
+        shares = devices.number_of(tiling.devices)
+
+        def divided(beams: int) -> tuple[int, int]:
+            count = max(min(most, -(-beams // shares)), 1)
+            return -(-beams // (count * shares)), count
+
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // side), -(-height // side)
-            count = min(most_beams, across * down)
-            return _PixelTiles(-(-across * down // count), count, tiling, source.size, across, down)
+            # or a device would have the same columns in every row, and perhaps a narrow object alone
+            across += shares > 1 and across % shares == 0
+            return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
-        needed = -(-math.prod(shape) // tiling.rays_per_beam)
-        count = max(min(most_beams, needed), 1)
-        return _OwnRayTiles(-(-needed // count), count, tiling, shape)
+        return _OwnRayTiles(*divided(-(-math.prod(shape) // tiling.rays_per_beam)), tiling, shape)
+
+    def scan(
+        self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
+    ) -> tuple[PyTree, PyTree]:
+        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what it returns beside. What it adds to
+        `sums` is summed over all devices."""
+        mesh, every = self.tiling.devices, (jnp.arange(self.number), *each)
+        if mesh is None:
+            return jax.lax.scan(f, sums, every)
+        found, results = jax.lax.scan(f, jax.tree.map(jnp.zeros_like, sums), every)
+        return added(sums, devices.summed(mesh, found)), results
+
+    def map(self, f: Callable[[PyTree], PyTree], *each: PyTree) -> PyTree:
+        """`f((tile, *each))` of the tiles, stacked."""
+        return jax.lax.map(f, (jnp.arange(self.number), *each))
+
+    def beams(self, tile: Int[Array, ""]) -> Int[Array, " beams"]:
+        """The numbers of a tile's beams."""
+        mesh = self.tiling.devices
+        turns = tile * self.beam_count + jnp.arange(self.beam_count)
+        return turns * devices.number_of(mesh) + devices.index_of(mesh)
+
+    def of_beams(self, leaf: Array) -> Array:
+        """From (tiles, groups, rays in a group, *rest) of each device to (beams, rays of a beam, *rest) of
+        all, in their order."""
+        beams = leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
+        return devices.collected(self.tiling.devices, beams)
+
+    def of_tiles(self, beams: Array) -> Array:
+        """The inverse of `of_beams`; 0 for beams that are missing."""
+        mesh, rest, count = self.tiling.devices, beams.shape[2:], self.number * self.beam_count
+        missing = count * devices.number_of(mesh) - beams.shape[0]
+        beams = devices.mine(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
+        groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
+        return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
     @abstractmethod
     def rays(self, source: Any, space: Space, tile: Int[Array, ""]) -> Ray:
@@ -113,13 +159,13 @@ class _PixelTiles(RayTiles):
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of the pixels (x, y) of each of a tile's beams."""
-        beam, side = (tile * self.beam_count + jnp.arange(self.beam_count))[:, None], self.tiling.beam
+        beam, side = self.beams(tile)[:, None], self.tiling.beam
         return (beam % self.across) * side + x[None], (beam // self.across) * side + y[None]
 
     def assemble(self, leaf: Array) -> Array:
         rest, (width, height) = leaf.shape[3:], self.size
         side, beam = self.tiling.side, self.tiling.beam
-        beams = leaf.reshape(-1, self.tiling.rays_per_beam, *rest)[: self.across * self.down]
+        beams = self.of_beams(leaf)[: self.across * self.down]
         image = beams.reshape(self.down, self.across, 2, 2, side, side, *rest)
         image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
         return image.reshape(self.down * beam, self.across * beam, *rest)[:height, :width]
@@ -131,9 +177,7 @@ class _PixelTiles(RayTiles):
         image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
         image = image.reshape(self.down, 2, side, self.across, 2, side, *rest)
         beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, self.tiling.rays_per_beam, *rest)
-        missing = self.number * self.beam_count - self.across * self.down
-        beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (1 + len(rest)))
-        return beams.reshape(self.number, -1, self.tiling.group, *rest)
+        return self.of_tiles(beams)
 
 
 class _OwnRayTiles(RayTiles):
@@ -141,15 +185,12 @@ class _OwnRayTiles(RayTiles):
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    @property
-    def _rays_per_tile(self) -> int:
-        return self.beam_count * self.tiling.rays_per_beam
-
     def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
             source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
-        number = tile * self._rays_per_tile + jnp.arange(self._rays_per_tile).reshape(-1, self.tiling.group)
+        size = self.tiling.rays_per_beam
+        number = (self.beams(tile)[:, None] * size + jnp.arange(size)[None]).reshape(-1, self.tiling.group)
         known = jnp.minimum(number, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
@@ -161,16 +202,15 @@ class _OwnRayTiles(RayTiles):
         return lambda occupancy: Box.around(occupancy, by_beam)
 
     def assemble(self, leaf: Array) -> Array:
-        rest = leaf.shape[3:]
-        return leaf.reshape(-1, *rest)[: math.prod(self.shape)].reshape(*self.shape, *rest)
+        rest, size = leaf.shape[3:], self.tiling.rays_per_beam
+        beams = self.of_beams(leaf)
+        rays = beams.reshape(beams.shape[0] * size, *rest)
+        return rays[: math.prod(self.shape)].reshape(*self.shape, *rest)
 
     def disassemble(self, leaf: Array) -> Array:
-        rest, count = leaf.shape[len(self.shape) :], math.prod(self.shape)
-        missing = self.number * self._rays_per_tile - count
-        padded = jnp.pad(leaf.reshape(count, *rest), [(0, missing)] + [(0, 0)] * len(rest))
-        # not -1, which is no number where there are no rays
-        groups = self._rays_per_tile // self.tiling.group
-        return padded.reshape(self.number, groups, self.tiling.group, *rest)
+        rest, count, size = leaf.shape[len(self.shape) :], math.prod(self.shape), self.tiling.rays_per_beam
+        padded = jnp.pad(leaf.reshape(count, *rest), [(0, -count % size)] + [(0, 0)] * len(rest))
+        return self.of_tiles(padded.reshape(-(-count // size), size, *rest))
 
 
 def _own_line(source: OwnRays, index: Int[Array, ""]) -> Line:

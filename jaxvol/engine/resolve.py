@@ -16,10 +16,13 @@ from .._util.vec3 import Scalar
 from ..reference import resolve
 from ..selection import Selection
 from ..space import Line
+from . import devices
 from .acceleration import VolumeAcceleration
+from .devices import on_devices
 from .image import RenderOptions, fault_of, pipeline_of
 from .rays import lines_at
 from .scene import Scene
+from .tiling import Tiling
 
 
 NUMBERS = 5
@@ -29,7 +32,7 @@ Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]
 """What a march found, of rays: `Rendering.rgba`, `Rendering.depth` and `Details.selected`."""
 
 
-def resolve_image(
+def resolve_pixels(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
     """Pixels, their depths, and their normals where these are asked for, from what the march found."""
@@ -46,16 +49,19 @@ def resolve_image(
     def some(indices: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk numbers"]:
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
-    resolved = of_visible(some, options.tiling.chunk, found, NUMBERS + 3 * with_normal)
+    resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal)
     return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
 
 
+resolve_image = on_devices("whole")(resolve_pixels)
+
+
 def of_visible(
-    some: Callable[..., Float[Array, "chunk numbers"]], size: int, found: Found, numbers: int = NUMBERS
+    some: Callable[..., Float[Array, "chunk numbers"]], tiling: Tiling, found: Found, numbers: int = NUMBERS
 ) -> Float[Array, "*rays numbers"]:
-    """Pixels of so many numbers by `some(indices, *found)`, called for `size` visible pixels at a time; or
-    once, for all pixels, if that is 0. Transparent pixels stay 0, at infinite depth."""
-    shape = found[1].shape
+    """Pixels of so many numbers by `some(indices, *found)`, called for a chunk of visible pixels at a time; or
+    once, for all pixels, if chunks have no size. Transparent pixels stay 0, at infinite depth."""
+    shape, size, mesh = found[1].shape, tiling.chunk, tiling.devices
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
     nothing = jnp.zeros((visible.size, numbers), flat[0].dtype).at[:, 4].set(jnp.inf)
@@ -63,8 +69,11 @@ def of_visible(
         return nothing.reshape(*shape, numbers)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
-    chosen = in_front(visible, size) if size > 0 else in_place(visible)
-    count = jnp.sum(visible, dtype=jnp.int32)
+    number, count = devices.number_of(mesh), jnp.sum(visible, dtype=jnp.int32)
+    if size > 0:
+        chosen = in_front(visible, size * number)
+    else:
+        chosen = in_place(jnp.pad(visible, (0, -visible.size % number)))
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
@@ -77,8 +86,8 @@ def of_visible(
         none = jnp.zeros((size, numbers), nothing.dtype)
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
-    if size > 0:
-        pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32)).reshape(-1, numbers)
-    else:
-        pixels = computed(chosen)
+    starts = jnp.arange(0, chosen.size, size, dtype=jnp.int32) if size > 0 else chosen
+    own = devices.mine(mesh, starts)
+    pixels = jax.lax.map(chunk, own) if size > 0 else computed(own)
+    pixels = devices.collected(mesh, pixels).reshape(-1, numbers)
     return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)

@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+from jax.sharding import Mesh
+
 from .._util.compaction import CHUNK
 from .._util.platform import on_gpu
 
@@ -23,6 +25,7 @@ class Tiling(NamedTuple):
     - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
       many steps as the slowest ray among them.
     - `chunk`: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
+    - `devices`: to which beams are dealt out, a mesh of one axis; None where JAX decides.
     """
 
     cells: int = 8
@@ -35,6 +38,7 @@ class Tiling(NamedTuple):
     direct_tile: int = 64
     searched: int = 16
     chunk: int = CHUNK
+    devices: Mesh | None = None
 
     @property
     def side(self) -> int:
@@ -52,10 +56,10 @@ class Tiling(NamedTuple):
         return self.beam**2
 
     @classmethod
-    def of_backend(cls) -> "Tiling":
-        """The sizes for programs that are traced now: `GPU` where they are for one, the defaults, which were
-        measured on CPUs, elsewhere."""
-        return GPU if on_gpu() else Tiling()
+    def of_backend(cls, devices: Mesh | None = None) -> "Tiling":
+        """The sizes for programs that are traced now, on these devices: `GPU` where they are for one, the
+        defaults, which were measured on CPUs, elsewhere."""
+        return (GPU if on_gpu() else Tiling())._replace(devices=devices)
 
 
 GPU = Tiling(batch=2**13, turns=16, tile=2**14, searched=2**16, chunk=0)

@@ -16,6 +16,7 @@ from jaxvol import selection
 from jaxvol._util.vec3 import apart
 from jaxvol.engine import visible_samples
 from jaxvol.engine.resolve import of_visible
+from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import (
     ConstantLight,
     Deferred,
@@ -63,7 +64,7 @@ def shaded_pixels(lighting, classification, space, line, rgba, depth):
     def some(places, rgba, depth, selected):
         return jax.vmap(one)(rgba, depth)
 
-    return of_visible(some, 2048, (rgba, depth, None))[:, :4]
+    return of_visible(some, Tiling(), (rgba, depth, None))[:, :4]
 
 
 @eqx.filter_jit
