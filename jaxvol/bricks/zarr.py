@@ -5,8 +5,10 @@ By tensorstore, which reads and decodes the chunks that a box touches, several a
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -21,6 +23,9 @@ from .sources import VoxelSource
 Triple: TypeAlias = tuple[float, float, float]
 
 SPACE = ("x", "y", "z")
+
+AT_ONCE = 2**24
+"""Bytes of decoded chunks that are read at a time, if a layer of single chunks has no more."""
 
 
 class ZarrSource(VoxelSource):
@@ -53,7 +58,7 @@ class ZarrSource(VoxelSource):
         missing: Literal["error", "fill"] | Any = "error",
         spacing: Triple | None = None,
         origin: Triple | None = None,
-        cache: int = 2**26,
+        cache: int = 2**24,
         beside: Path | None = None,
     ):
         if missing not in ("error", "fill"):
@@ -97,8 +102,16 @@ class ZarrSource(VoxelSource):
         }
 
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        # layer by layer: tensorstore holds all chunks of what it is asked for at once
+        axis, ends = self._layers(low, high)
+        voxels = np.empty(np.subtract(high, low), self._store.dtype.numpy_dtype)
         try:
-            return self._store[tuple(map(slice, low, high))].read(order="C").result()
+            for begin, end in pairwise(ends):
+                layer = [slice(a, b) for a, b in zip(low, high, strict=True)]
+                layer[axis] = slice(begin, end)
+                part = voxels[_along(axis, begin - low[axis], end - low[axis])]
+                part[...] = self._store[tuple(layer)].read().result()
+            return voxels
         except ValueError as fault:  # what tensorstore raises for all faults of files
             cure = (
                 'Fetch it again; or pass missing="fill", if chunks were left out because all their voxels '
@@ -110,6 +123,23 @@ class ZarrSource(VoxelSource):
                 f"{self.name}: the voxels from {low} to {high} cannot be read: a chunk is missing or "
                 f"damaged. {cure} (tensorstore: {fault})"
             ) from fault
+
+
+    def _layers(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> tuple[int, list[int]]:
+        """The axis along which a box has the most layers of chunks, and where it is cut along it: where chunks
+        end, so that each is read once, and a layer has no more than AT_ONCE bytes if it has several."""
+        of_axes = [
+            (b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)
+        ]  # chunks that the box touches
+        axis = int(np.argmax(of_axes))
+        chunk, count = self.chunks[axis], of_axes[axis]
+        whole = math.prod(of_axes) * math.prod(self.chunks) * self._store.dtype.numpy_dtype.itemsize
+        thick = chunk * max(1, AT_ONCE * count // whole)
+        return axis, [low[axis], *range((low[axis] // chunk * chunk) + thick, high[axis], thick), high[axis]]
+
+
+def _along(axis: int, begin: int, end: int) -> tuple[slice, ...]:
+    return tuple(slice(begin, end) if a == axis else slice(None) for a in range(3))
 
 
 def array_metadata(path: Path) -> tuple[Literal[2, 3], dict[str, Any]]:
