@@ -21,7 +21,7 @@ from .._util.npy import npy_header
 from .._util.voxels import check_shape
 from ..formats.raw import raw_header
 from .dtypes import voxel_type
-from .sources import VoxelSource
+from .sources import VoxelSource, empty_box
 
 
 GAP = 2**14
@@ -115,7 +115,7 @@ class FileSource(VoxelSource):
         run = memoryview(bytearray((rows - 1) * row_stride + row * size if whole_rows else row * size))
         together = max(1, min(count, AT_ONCE // (rows * row * size)))
         planes = np.empty((together, rows, row), self._type)
-        voxels = np.empty(np.subtract(high, low), self._type.newbyteorder("="))
+        voxels = empty_box(low, high, self._type.newbyteorder("="))
         ordered = voxels.transpose(order)
         with self._opened() as file:
             for begin in range(0, count, together):

@@ -17,7 +17,7 @@ import numpy as np
 from .._util.checks import described, integer
 from .._util.voxels import check_shape
 from .dtypes import voxel_type
-from .sources import VoxelSource
+from .sources import VoxelSource, empty_box
 
 
 Triple: TypeAlias = tuple[float, float, float]
@@ -104,7 +104,7 @@ class ZarrSource(VoxelSource):
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
         # layer by layer: tensorstore holds all chunks of what it is asked for at once
         axis, ends = self._layers(low, high)
-        voxels = np.empty(np.subtract(high, low), self._store.dtype.numpy_dtype)
+        voxels = empty_box(low, high, np.dtype(self._store.dtype.numpy_dtype))
         try:
             for begin, end in pairwise(ends):
                 layer = [slice(a, b) for a, b in zip(low, high, strict=True)]
@@ -123,7 +123,6 @@ class ZarrSource(VoxelSource):
                 f"{self.name}: the voxels from {low} to {high} cannot be read: a chunk is missing or "
                 f"damaged. {cure} (tensorstore: {fault})"
             ) from fault
-
 
     def _layers(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> tuple[int, list[int]]:
         """The axis along which a box has the most layers of chunks, and where it is cut along it: where chunks
