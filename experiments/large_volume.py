@@ -23,9 +23,8 @@ CHUNK = 64
 """Voxels along a side of a Zarr chunk."""
 
 
-def slabs(n: int, seed: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Slabs (n, n, thickness) of n³ voxels, data[x, y, z] of type uint8, along z: the first voxel of each along
-    z, and its voxels, which are contiguous along x."""
+def slabs(n: int, seed: int) -> Iterator[np.ndarray]:
+    """Slabs (thickness, n, n) of n³ voxels of type uint8, data[z, y, x], from the first to the last."""
     coarse = np.asarray(jv.phantom("head", COARSE).data, np.float32)
     weights = _weights(n)
     rng = np.random.default_rng(seed)
@@ -37,7 +36,7 @@ def slabs(n: int, seed: int) -> Iterator[tuple[int, np.ndarray]]:
             grain = rng.integers(0, GRAIN, values.shape, np.uint8)
             grain[values < AIR] = 0
             np.minimum(np.rint(values) + grain, 255, out=found, casting="unsafe")
-        yield first, slab.transpose(2, 1, 0)
+        yield slab
 
 
 def _weights(n: int) -> np.ndarray:
@@ -53,13 +52,13 @@ def _weights(n: int) -> np.ndarray:
 def write_raw(path: Path, n: int, seed: int) -> Path:
     """A raw file, x fastest."""
     with path.open("wb") as file:
-        for _, slab in slabs(n, seed):
-            file.write(slab.transpose(2, 1, 0).data)
+        for slab in slabs(n, seed):
+            file.write(slab.data)
     return path
 
 
-def write_zarr(path: Path, n: int, seed: int) -> Path:
-    """A Zarr array, version 3, of chunks of CHUNK³ voxels, compressed."""
+def zarr_of_raw(path: Path, raw: Path, n: int) -> Path:
+    """The voxels of a raw file as a Zarr array, version 3, in compressed chunks of CHUNK³ voxels."""
     import tensorstore
 
     codec = {"name": "blosc", "configuration": {"cname": "lz4", "clevel": 5, "shuffle": "noshuffle"}}
@@ -70,7 +69,9 @@ def write_zarr(path: Path, n: int, seed: int) -> Path:
         "metadata": {"shape": [n] * 3, "data_type": "uint8", "chunk_grid": grid, "codecs": [codec]},
         "store_data_equal_to_fill_value": True,  # an empty chunk is not a missing one
     }
-    array = tensorstore.open(spec, create=True).result()
-    for first, slab in slabs(n, seed):
-        array[:, :, first : first + slab.shape[2]].write(slab).result()
+    array = tensorstore.open(spec, create=True, delete_existing=True).result()
+    with raw.open("rb") as file:
+        for first in range(0, n, CHUNK):
+            slab = np.fromfile(file, np.uint8, n * n * min(CHUNK, n - first)).reshape(-1, n, n)
+            array[:, :, first : first + len(slab)].write(slab.transpose(2, 1, 0)).result()
     return path

@@ -263,7 +263,7 @@ def over_blocks(
             missing = -cells % BLOCK
             around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(data.ndim)]
             data, cells = jnp.pad(data, around, mode="edge"), cells + missing
-        # The last block may be shorter. To pad the nodes instead takes seven times as long, and a copy of them.
+        # The last block may be shorter. To pad the nodes takes seven times as long, and a copy of them.
         whole, rest = divmod(cells, BLOCK)
         found = []
         if whole:

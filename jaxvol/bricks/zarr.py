@@ -125,16 +125,15 @@ class ZarrSource(VoxelSource):
             ) from fault
 
     def _layers(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> tuple[int, list[int]]:
-        """The axis along which a box has the most layers of chunks, and where it is cut along it: where chunks
-        end, so that each is read once, and a layer has no more than AT_ONCE bytes if it has several."""
-        of_axes = [
-            (b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)
-        ]  # chunks that the box touches
-        axis = int(np.argmax(of_axes))
-        chunk, count = self.chunks[axis], of_axes[axis]
-        whole = math.prod(of_axes) * math.prod(self.chunks) * self._store.dtype.numpy_dtype.itemsize
-        thick = chunk * max(1, AT_ONCE * count // whole)
-        return axis, [low[axis], *range((low[axis] // chunk * chunk) + thick, high[axis], thick), high[axis]]
+        """The axis along which a box touches the most chunks, and where it is cut along it: between chunks,
+        so that each is read once; into parts of no more than AT_ONCE bytes, if they are thicker than one."""
+        counts = [(b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)]
+        axis = int(np.argmax(counts))
+        chunk = self.chunks[axis]
+        of_chunk = math.prod(self.chunks) * self._store.dtype.numpy_dtype.itemsize
+        layer = math.prod(counts) // counts[axis] * of_chunk
+        thick = chunk * max(1, AT_ONCE // layer)
+        return axis, [low[axis], *range(low[axis] // chunk * chunk + thick, high[axis], thick), high[axis]]
 
 
 def _along(axis: int, begin: int, end: int) -> tuple[slice, ...]:
