@@ -1,5 +1,6 @@
-"""How is a volume rendered within a tolerance and a budget of memory? In memory if it fits, else by bricks."""
+"""How is a volume rendered within a tolerance and a budget of memory? By bricks, where it does not fit."""
 
+import math
 import time
 from typing import Any, NamedTuple
 
@@ -24,19 +25,19 @@ from .sources import VoxelSource
 
 
 IN_MEMORY = 9
-"""Bytes for each byte of voxels, or less, that `render` takes: the voxels as read and in the device, a packed copy
-of 8-bit ones, what finding the extremes of blocks takes, and slopes."""
+"""Bytes for each byte of voxels, or less, that `render` takes: the voxels as read and in the device, a packed
+copy of 8-bit ones, what finding the extremes of blocks takes, and slopes."""
 
 
 class BudgetPlan(NamedTuple):
     """How to render a volume within a tolerance and a budget of memory. `print` shows it.
 
-    - `plan`: the march and its parts. Where the volume fits, that of the volume; otherwise that of a copy with
-      every `stride`-th voxel, whose step was divided by `stride`: `plan.error` is the copy's.
+    - `plan`: the march and its parts. Where the volume fits, that of the volume; otherwise that of a copy
+      with every `stride`-th voxel, whose step was divided by `stride`: `plan.error` is the copy's.
     - `source`: the volume. `memory`: the budget, bytes.
     - `stride`: 1 where the volume fits.
-    - `counts`: bricks along each axis; None where the volume fits. `loads`: how many of them are read at most:
-      those that may hold anything visible. `bytes_read`: of these, at most.
+    - `counts`: bricks along each axis; None where the volume fits. `loads`: how many of them are read at
+      most: those that may hold anything visible. `bytes_read`: of these, at most.
     - `compositing`: as given.
     """
 
@@ -69,10 +70,10 @@ class BudgetPlan(NamedTuple):
         if self.counts is None:
             return f"in memory: {size} of voxels, and what is made of them, fit into {given}\n{self.plan}"
         return (
-            f"{' x '.join(map(str, self.counts))} bricks: {size} of voxels, and what is made of them, do not fit "
-            f"into {given}; at most {self.loads} are read, {self.bytes_read / 2**20:.1f} MiB. Planned by a copy of "
-            f"every {self.stride}th voxel along each axis, at 1/{self.stride} of its step; error and time below "
-            f"are the copy's\n{self.plan}"
+            f"{' x '.join(map(str, self.counts))} bricks: {size} of voxels, and what is made of them, do not "
+            f"fit into {given}; at most {self.loads} are read, {self.bytes_read / 2**20:.1f} MiB. Planned on a "
+            f"copy of one voxel in {self.stride} along each axis, at 1/{self.stride} of its step; error and "
+            f"time below are the copy's\n{self.plan}"
         )
 
 
@@ -92,24 +93,25 @@ def plan(
 ) -> Plan | BudgetPlan:
     """Finds the cheapest way to render a scene within a tolerance, and within a budget of memory.
 
-    Of a `Volume`, without `memory`: the `Plan` of `planning.plan`, which has the other arguments, and says how
-    it is found. Otherwise a `BudgetPlan`:
+    Of a `Volume`, without `memory`: the `Plan` of `planning.plan`, which has the other arguments, and says
+    how it is found. Otherwise a `BudgetPlan`:
 
     - where the volume and what `render` makes of it fit into `memory` (IN_MEMORY bytes for each byte of
       voxels), it is read, and planned as a `Volume`;
-    - otherwise it is rendered by `render_bricks`. The march is planned on a copy of every n-th voxel along each
-      axis that fits, read slab by slab, and its step divided by n: as many steps a voxel as the copy needs.
+    - otherwise it is rendered by `render_bricks`. The march is planned on a copy of every n-th voxel along
+      each axis that fits, read slab by slab, and its step divided by n: as many steps a voxel as the copy
+      needs.
       That is cautious where the volume is smooth, but the error is that of the copy: detail finer than n
       voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
       that `AlphaCorrection` and `SpaceLeaping` are kept.
 
     **Arguments:**
 
-    - `volume`: a `Volume`, or what `bricks.levels_of` opens: an array, a memory map, a path. Of several levels
-      of detail, the finest.
+    - `volume`: a `Volume`, or what `bricks.levels_of` opens: an array, a memory map, a path. Of several
+      levels of detail, the finest.
     - `memory`: bytes, as for `render_bricks`; by default a quarter of the device's memory.
-    - `spacing`, `origin`, `cache`: as for `render_bricks`. `source`: other options of `bricks.levels_of`, such as
-      {"shape": (nx, ny, nz), "dtype": "uint8"}.
+    - `spacing`, `origin`, `cache`: as for `render_bricks`. `source`: other options of `bricks.levels_of`,
+      such as {"shape": (nx, ny, nz), "dtype": "uint8"}.
     - `options`: of `planning.plan`: `transforms`, `lighting`, `gradients`, `seed`.
 
     **Raises:** `ValueError` as `planning.plan` and `render_bricks` do.

@@ -76,7 +76,8 @@ def render_bricks(
       `dtype` of a raw file, and `axes`, `index` and `missing` of a Zarr array).
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
-      them an image takes some 550 bytes for each pixel, and compiled programs 300 MiB. By default a quarter of the device's memory.
+      them an image takes some 550 bytes for each pixel, and compiled programs some 300 MiB. By default a
+      quarter of the device's memory.
     - `bricks`: number of bricks along x, y and z, in place of as few as fit into `memory`. A toroidal volume
       is split across σ first.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has

@@ -65,12 +65,12 @@ def test_a_volume_that_does_not_fit_is_rendered_by_bricks(scene):
 
 
 def test_less_memory_than_a_copy_takes_is_named(scene):
-    with pytest.raises(ValueError, match="memory must hold a copy of 2 voxels along each axis .* got 100"):
+    with pytest.raises(ValueError, match=r"memory must hold a copy of 2 voxels along each axis .* got 100"):
         planned(scene, 100)
 
 
 def test_what_is_no_volume_is_named(scene):
     with pytest.raises(ValueError, match=r"no file no_such\.raw"):
         planned(scene, 10**9, "no_such.raw")
-    with pytest.raises(ValueError, match="memory must be an integer of at least 1; got 1.5"):
+    with pytest.raises(ValueError, match=r"memory must be an integer of at least 1; got 1\.5"):
         planned(scene, 1.5)
