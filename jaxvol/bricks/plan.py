@@ -66,12 +66,14 @@ class BudgetPlan(NamedTuple):
         return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
 
     def __str__(self) -> str:
-        size, given = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
+        size, given, read = (
+            f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory, self.bytes_read)
+        )
         if self.counts is None:
             return f"in memory: {size} of voxels, and what is made of them, fit into {given}\n{self.plan}"
         return (
             f"{' x '.join(map(str, self.counts))} bricks: {size} of voxels, and what is made of them, do not "
-            f"fit into {given}; at most {self.loads} are read, {self.bytes_read / 2**20:.1f} MiB. Planned on a "
+            f"fit into {given}; at most {self.loads} are read, {read}. Planned on a "
             f"copy of one voxel in {self.stride} along each axis, at 1/{self.stride} of its step; error and "
             f"time below are the copy's\n{self.plan}"
         )
@@ -123,10 +125,7 @@ def plan(
     place = {name: value for name, value in (("spacing", spacing), ("origin", origin)) if value is not None}
     opened, *_ = levels_of(volume, **place, **(source or {}))
     stride = 1
-    while (
-        IN_MEMORY * opened.dtype.itemsize * np.prod([-(-n // stride) for n in opened.shape], dtype=float)
-        > room
-    ):
+    while IN_MEMORY * opened.dtype.itemsize * math.prod(-(-n // stride) for n in opened.shape) > room:
         stride += 1
         if min(opened.shape) // stride < 2:
             raise ValueError(
