@@ -2,7 +2,7 @@
 
 import math
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import jax
 import numpy as np
@@ -38,7 +38,7 @@ class BudgetPlan(NamedTuple):
     - `stride`: 1 where the volume fits.
     - `counts`: bricks along each axis; None where the volume fits. `loads`: how many of them are read at
       most: those that may hold anything visible. `bytes_read`: of these, at most.
-    - `compositing`: as given.
+    - `compositing`, `cache`: as given.
     """
 
     plan: Plan
@@ -49,6 +49,7 @@ class BudgetPlan(NamedTuple):
     loads: int
     bytes_read: int
     compositing: Any
+    cache: Any
 
     @property
     def march(self) -> March:
@@ -63,7 +64,8 @@ class BudgetPlan(NamedTuple):
         how = {"compositing": self.compositing, "lighting": self.lighting} | options
         if self.counts is None:
             return render(self.plan.volume, transfer, camera, self.march, **how)
-        return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
+        how = {"memory": self.memory, "cache": self.cache} | how
+        return render_bricks(self.source, transfer, camera, self.march, **how)
 
     def __str__(self) -> str:
         size, given, read = (
@@ -79,6 +81,32 @@ class BudgetPlan(NamedTuple):
         )
 
 
+@overload
+def plan(
+    volume: Volume,
+    transfer: Transfer | Any,
+    camera: Camera | Any,
+    tolerance: float | Any,
+    *,
+    memory: None = None,
+    compositing: Mode | Compositing[Any] | Any = "over",
+    **options: Any,
+) -> Plan: ...
+@overload
+def plan(
+    volume: Openable,
+    transfer: Transfer | Any,
+    camera: Camera | Any,
+    tolerance: float | Any,
+    *,
+    memory: int | Any | None = None,
+    spacing: Arrayable | None = None,
+    origin: Arrayable | None = None,
+    compositing: Mode | Compositing[Any] | Any = "over",
+    cache: Any = "beside",
+    source: dict[str, Any] | None = None,
+    **options: Any,
+) -> BudgetPlan: ...
 def plan(
     volume: Volume | Openable,
     transfer: Transfer | Any,
@@ -134,7 +162,7 @@ def plan(
     copy = _copy(opened, stride)
     found = plan_in_memory(copy, transfer, camera, tolerance, **how)
     if stride == 1:
-        return BudgetPlan(found, opened, room, 1, None, 0, opened.nbytes, compositing)
+        return BudgetPlan(found, opened, room, 1, None, 0, opened.nbytes, compositing, cache)
     march, parts = _finer(found.march, stride), _parts(found.parts)
     stream = bricks_of(
         *(opened, transfer, camera, march),
@@ -146,7 +174,7 @@ def plan(
     loads = int(stream.visible.sum())
     nbytes = loads * int(np.prod(stream.stored)) * opened.dtype.itemsize
     found = found._replace(march=march, parts=parts, probed=time.perf_counter() - begun)
-    return BudgetPlan(found, opened, room, stride, stream.grid.counts, loads, nbytes, compositing)
+    return BudgetPlan(found, opened, room, stride, stream.grid.counts, loads, nbytes, compositing, cache)
 
 
 def _copy(source: VoxelSource, stride: int) -> Volume:
