@@ -96,7 +96,7 @@ def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]
                 "seconds": seconds(of_kind[name]),
                 "in memory": seconds(whole),
                 "ratio": round(seconds(of_kind[name]) / seconds(whole), 3),
-                "scaled": round(scaled, 3),
+                "scaled": round(scaled, 4),
                 "ratio, scaled": round(seconds(of_kind[name]) / scaled, 3),
                 "difference": float(np.max(np.abs(np.subtract(of_kind[name]["mean"], whole["mean"])))),
             }
