@@ -6,7 +6,7 @@ composited front to back into a `Rendering`.
 """
 
 from . import bricks as bricks, lighting as lighting, metrics as metrics
-from .bricks import render_bricks as render_bricks
+from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
 from .camera import Camera as Camera
 from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
 from .display import (
@@ -50,7 +50,7 @@ from .phantoms import (
     phantom as phantom,
     toroidal_phantom as toroidal_phantom,
 )
-from .planning import Plan as Plan, plan as plan
+from .planning import Plan as Plan
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .reference import render_ray_reference as render_ray_reference

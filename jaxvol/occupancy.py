@@ -7,6 +7,7 @@ are conservative: what is called empty is proven to be. They carry no gradient.
 """
 
 from collections.abc import Callable
+from functools import reduce
 
 import equinox as eqx
 import jax
@@ -258,16 +259,22 @@ def over_blocks(
 ) -> Shaped[Array, "*blocks"]:
     """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
     for axis in range(data.ndim):
-        count = -(-(data.shape[axis] - 1) // BLOCK)
-        missing = count * BLOCK + 1 - data.shape[axis] + margin
-        data = jnp.pad(
-            data, [(margin, missing) if i == axis else (0, 0) for i in range(data.ndim)], mode="edge"
-        )
-        parts = [
-            jax.lax.slice_in_dim(data, i, i + (count - 1) * BLOCK + 1, BLOCK, axis)
-            for i in range(BLOCK + 1 + 2 * margin)
-        ]
-        data = parts[0]
-        for part in parts[1:]:
-            data = combine(data, part)
+        cells = data.shape[axis] - 1
+        if margin:
+            missing = -cells % BLOCK
+            around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(data.ndim)]
+            data, cells = jnp.pad(data, around, mode="edge"), cells + missing
+        # The last block may be shorter. To pad the nodes takes seven times as long, and a copy of them.
+        whole, rest = divmod(cells, BLOCK)
+        found = []
+        if whole:
+            last, step = (whole - 1) * BLOCK, BLOCK
+            parts = range(BLOCK + 1 + 2 * margin)
+            found.append(
+                reduce(combine, [jax.lax.slice_in_dim(data, i, i + last + 1, step, axis) for i in parts])
+            )
+        if rest:
+            nodes = range(whole * BLOCK, cells + 1)
+            found.append(reduce(combine, [jax.lax.slice_in_dim(data, i, i + 1, 1, axis) for i in nodes]))
+        data = jnp.concatenate(found, axis) if len(found) > 1 else found[0]
     return data

@@ -10,6 +10,7 @@ from .files import npy as npy, raw as raw
 from .grid import BrickGrid as BrickGrid
 from .opening import levels_of as levels_of, source_of as source_of
 from .overlap import overlap_of as overlap_of, share as share
+from .plan import BudgetPlan as BudgetPlan, plan as plan
 from .render import render_bricks as render_bricks
 from .sources import ArraySource as ArraySource, VoxelSource as VoxelSource
 from .summary import Summary as Summary

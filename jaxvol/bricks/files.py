@@ -21,15 +21,15 @@ from .._util.npy import npy_header
 from .._util.voxels import check_shape
 from ..formats.raw import raw_header
 from .dtypes import voxel_type
-from .sources import VoxelSource
+from .sources import VoxelSource, empty_box
 
 
 GAP = 2**14
 """Bytes: what is not wanted between two rows is read with them if it is no more, since a system call, and on
 a disk the pages at its ends, cost as much."""
 
-AT_ONCE = 2**22
-"""Bytes read before they are brought into the order of axes that is asked for."""
+AT_ONCE = 2**23
+"""Bytes of a box that are read before they are brought into the order of axes that is asked for."""
 
 AGAIN = "Open it again."
 
@@ -112,28 +112,26 @@ class FileSource(VoxelSource):
         count, rows, row = (high[axis] - low[axis] for axis in order)
         plane_stride, row_stride, _ = (self._strides[axis] for axis in order)
         whole_rows = row_stride - row * size <= GAP
-        run = (rows - 1) * row_stride + row * size if whole_rows else rows * row * size
-        between = row_stride if whole_rows else row * size
-        together = max(1, min(count, AT_ONCE // run))
-        buffer = memoryview(bytearray(together * run))
-        voxels = np.empty(np.subtract(high, low), self._type.newbyteorder("="))
+        run = memoryview(bytearray((rows - 1) * row_stride + row * size if whole_rows else row * size))
+        together = max(1, min(count, AT_ONCE // (rows * row * size)))
+        planes = np.empty((together, rows, row), self._type)
+        voxels = empty_box(low, high, self._type.newbyteorder("="))
         ordered = voxels.transpose(order)
         with self._opened() as file:
             for begin in range(0, count, together):
-                planes = min(together, count - begin)
-                for plane in range(planes):
-                    at = self._start + (first + begin + plane) * plane_stride + b * row_stride + c * size
-                    part = buffer[plane * run : (plane + 1) * run]
+                some = planes[: count - begin]
+                for number, plane in enumerate(some):
+                    at = self._start + (first + begin + number) * plane_stride + b * row_stride + c * size
                     if whole_rows:
-                        self._fill(file, at, part)
+                        self._fill(file, at, run)
+                        plane[:] = np.ndarray((rows, row), self._type, run, 0, (row_stride, size))
                         continue
-                    for number in range(rows):
-                        self._fill(
-                            file, at + number * row_stride, part[number * between : (number + 1) * between]
-                        )
-                ordered[begin : begin + planes] = np.ndarray(
-                    (planes, rows, row), self._type, buffer, 0, (run, between, size)
-                )
+                    for of_plane in range(rows):
+                        self._fill(file, at + of_plane * row_stride, run)
+                        plane[of_plane] = np.frombuffer(run, self._type)
+                # one row of all planes after the other: NumPy transposes two axes fast, and three slowly
+                for of_plane in range(rows):
+                    ordered[begin : begin + len(some), of_plane] = some[:, of_plane]
         return voxels
 
     def _fill(self, file: FileIO, at: int, part: memoryview) -> None:

@@ -1,6 +1,6 @@
 """Renders a volume that need not fit into memory, brick by brick."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -86,7 +86,8 @@ def render_bricks(
       `dtype` of a raw file, and `axes`, `index` and `missing` of a Zarr array).
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
-      them an image takes some 300 bytes for each pixel. By default a quarter of the device's memory.
+      them an image takes some 550 bytes for each pixel, and compiled programs some 300 MiB. By default a
+      quarter of the device's memory.
     - `bricks`: number of bricks along x, y and z, in place of as few as fit into `memory`. A toroidal volume
       is split across σ first.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
@@ -138,7 +139,6 @@ def render_bricks(
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
     chosen = _level(levels, level, camera, transfer, tolerance, cache)
-    nothing = np.zeros((2, 2, 2), chosen.dtype)
     place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
     if len(known) < 2:
         if len(levels) > 1:
@@ -147,19 +147,66 @@ def render_bricks(
             part if name in known else given
             for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
         )
-    volume = part_of(Volume(nothing, *place), jnp.zeros(3, jnp.int32), chosen.shape)
-    how = compositing_of(compositing)
-    scene = strong(Scene(volume, transfer, camera, march.divided(), how, lighting))
-    memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
+    scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting)
     check_not_sharded(mesh, scene)
     scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
-    job = _Job(chosen, memory, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
+    job = _Job(chosen, budget(memory), _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
     if owned:
         _check_owned(scene, method)
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
     return Rendering(
         rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=job.streams[0].report())
     )
+
+
+def budget(memory: int | Any | None) -> int:
+    """Bytes that bricks may take: by default a quarter of the device's memory."""
+    return memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
+
+
+def bricks_of(
+    source: VoxelSource,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    *,
+    memory: int,
+    compositing: Mode | Compositing[Any] = "over",
+    lighting: Lighting | None = None,
+    cache: Any = "beside",
+) -> Stream:
+    """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
+    _check(march, transfer, lighting, "overlap", "all")
+    place = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
+    scene = _scene_of(source, place, transfer, camera, march, compositing, lighting)
+    marched = _marched(scene)
+    job = _Job(source, memory, None, "overlap", "all", cache, None, None, False, [])
+    return job.stream(marched, scene, job.options("all"))
+
+
+def _scene_of(
+    source: VoxelSource,
+    place: Iterable[Any],
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    compositing: Mode | Compositing[Any],
+    lighting: Lighting | None,
+) -> Scene:
+    """The scene of a source, without its voxels. `place`: its spacing and origin."""
+    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place)
+    volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape)
+    return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
+
+
+def _marched(scene: Scene) -> Scene:
+    """The scene as its rays are marched: of a mode that resolves, without light, since pixels are computed
+    from what that march finds."""
+    mode = scene.compositing
+    if not mode.resolves:
+        return scene
+    transfer, march = mode.marched(scene.transfer, scene.march, scene.volume)
+    return scene._replace(transfer=transfer, march=march, lighting=None)
 
 
 @dataclass(frozen=True)
@@ -201,10 +248,7 @@ _start_pull, _pull_part, _end_pull = map(compiled, (start_pull, pull_part, end_p
 
 def _image(scene: Scene, job: _Job) -> Rendering:
     mode, outputs = scene.compositing, job.outputs
-    marched, selects = scene, isinstance(mode, Selection)
-    if mode.resolves:  # rays are marched without light, and pixels are computed from what that finds
-        transfer, march = mode.marched(scene.transfer, scene.march, scene.volume)
-        marched = scene._replace(transfer=transfer, march=march, lighting=None)
+    marched, selects = _marched(scene), isinstance(mode, Selection)
     options = job.options("depth" if mode.resolves and outputs == "rgba" else outputs)
     stream = job.stream(marched, scene, options)
     if job.owned:

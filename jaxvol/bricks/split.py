@@ -19,9 +19,9 @@ from .ranges import reach
 EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
-COPIES = 4.5
-"""Of each voxel of a brick: as read, and in the device; of the next brick, as read; and what finding the
-extremes of blocks takes."""
+COPIES = 3
+"""Of each voxel of a brick: in the device; of the next brick, as read; and what reading and finding the
+extremes of blocks takes, less than one."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
 def split(
     shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None, least: int = 1
 ) -> BrickGrid:
-    """The fewest bricks that fit into so many bytes: halves are cut off along the longest axis. There are at
-    least `least`, unless they would be smaller than bricks are.
+    """Few bricks that fit into so many bytes: there is one more along the axis where they are longest, until
+    they do. There are at least `least`, unless they would be smaller than bricks are.
 
     **Raises:** `ValueError` if the smallest ones do not fit."""
     memory = integer("memory", memory, 1)
@@ -96,7 +96,7 @@ def split(
                 f"memory must be at least {needed} bytes, for bricks of {' x '.join(map(str, size))} cells "
                 f"and what is read around them; got {memory}."
             )
-        parts[longest] *= 2
+        parts[longest] += 1
 
 
 def stored_of(grid: BrickGrid, margin: Margin, probe: ToroidalMap | None) -> Node:

@@ -155,7 +155,8 @@ class Stream:
     def _part(self, load: Load) -> Volume:
         """A part of the volume, once it is read."""
         volume = self.scene.volume
-        part = Volume(load.voxels.result(), volume.spacing, volume.origin)
+        voxels = jax.device_put(load.voxels.result())  # on a CPU, not copied if a file was read (`empty_box`)
+        part = Volume(voxels, volume.spacing, volume.origin)
         return part_of(part, jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:

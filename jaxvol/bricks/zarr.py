@@ -5,8 +5,10 @@ By tensorstore, which reads and decodes the chunks that a box touches, several a
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -15,12 +17,15 @@ import numpy as np
 from .._util.checks import described, integer
 from .._util.voxels import check_shape
 from .dtypes import voxel_type
-from .sources import VoxelSource
+from .sources import VoxelSource, empty_box
 
 
 Triple: TypeAlias = tuple[float, float, float]
 
 SPACE = ("x", "y", "z")
+
+AT_ONCE = 2**24
+"""Bytes of decoded chunks that are read at a time, if a layer of single chunks has no more."""
 
 
 class ZarrSource(VoxelSource):
@@ -53,7 +58,7 @@ class ZarrSource(VoxelSource):
         missing: Literal["error", "fill"] | Any = "error",
         spacing: Triple | None = None,
         origin: Triple | None = None,
-        cache: int = 2**26,
+        cache: int = 2**24,
         beside: Path | None = None,
     ):
         if missing not in ("error", "fill"):
@@ -97,8 +102,16 @@ class ZarrSource(VoxelSource):
         }
 
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        # layer by layer: tensorstore holds all chunks of what it is asked for at once
+        axis, ends = self._layers(low, high)
+        voxels = empty_box(low, high, np.dtype(self._store.dtype.numpy_dtype))
         try:
-            return self._store[tuple(map(slice, low, high))].read(order="C").result()
+            for begin, end in pairwise(ends):
+                layer = [slice(a, b) for a, b in zip(low, high, strict=True)]
+                layer[axis] = slice(begin, end)
+                part = voxels[_along(axis, begin - low[axis], end - low[axis])]
+                part[...] = self._store[tuple(layer)].read().result()
+            return voxels
         except ValueError as fault:  # what tensorstore raises for all faults of files
             cure = (
                 'Fetch it again; or pass missing="fill", if chunks were left out because all their voxels '
@@ -110,6 +123,21 @@ class ZarrSource(VoxelSource):
                 f"{self.name}: the voxels from {low} to {high} cannot be read: a chunk is missing or "
                 f"damaged. {cure} (tensorstore: {fault})"
             ) from fault
+
+    def _layers(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> tuple[int, list[int]]:
+        """The axis along which a box touches the most chunks, and where it is cut along it: between chunks,
+        so that each is read once; into parts of no more than AT_ONCE bytes, if they are thicker than one."""
+        counts = [(b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)]
+        axis = int(np.argmax(counts))
+        chunk = self.chunks[axis]
+        of_chunk = math.prod(self.chunks) * self._store.dtype.numpy_dtype.itemsize
+        layer = math.prod(counts) // counts[axis] * of_chunk
+        thick = chunk * max(1, AT_ONCE // layer)
+        return axis, [low[axis], *range(low[axis] // chunk * chunk + thick, high[axis], thick), high[axis]]
+
+
+def _along(axis: int, begin: int, end: int) -> tuple[slice, ...]:
+    return tuple(slice(begin, end) if a == axis else slice(None) for a in range(3))
 
 
 def array_metadata(path: Path) -> tuple[Literal[2, 3], dict[str, Any]]:
