@@ -1,7 +1,7 @@
 """Kim, Kwon and Shin, Fig. 6: the order of bricks, by the depth of their centres.
 
-The paper's scan cut into six bricks, in the plane of the motor's turn, and a camera beside it. The numbers are
-the order in which `render_bricks` takes them; the lines are the distances of their centres from the camera.
+The paper's scan cut into six bricks, in the plane of the motor's turn, and a camera beside it. The numbers
+are the order in which `render_bricks` takes them; the lines are the distances of their centres from the camera.
 The ray leaves a brick through its curved face and comes back to it (the paper's Fig. 4); the dashed chord of
 that face is what K reaches to.
 """
@@ -60,7 +60,7 @@ def main(chosen: Namespace) -> None:
         axes.plot(*np.stack([eye, middle]).T, color="0.5", linewidth=0.7, linestyle=":")
         axes.plot(*middle, "k.", markersize=4)
         axes.annotate(str(turn), middle, (4, 4), textcoords="offset points", fontsize=13, weight="bold")
-    axes.plot(*eye, "ks", markersize=8)
+    axes.plot(float(eye[0]), float(eye[1]), "ks", markersize=8)
     axes.annotate("camera", eye, (0, 9), textcoords="offset points", fontsize=9, ha="center")
     # across the middle beam of the left bricks, a little below the farther face between two of them
     beta, gamma = (low + part * (high - low) for (low, high), part in ((ends[0], 0.25), (ends[2], 2 / 3)))

@@ -2,7 +2,7 @@
 
 A phantom of a fetus as the paper's probe would see it, cut into bricks along the beams alone, and seen along
 the fan. Left: each brick shows at once all that a ray meets in it (`method="naive"`), as the paper's Fig. 8
-does on its left; middle: with overlap (`"overlap"`); right: the difference, amplified. Below, the framed part.
+does on its left; middle: with overlap (`"overlap"`); right: the difference, amplified. Below, what is framed.
 """
 
 from argparse import Namespace
@@ -22,6 +22,7 @@ FLESH = [(35, (0.9, 0.35, 0.25), 0.0), (70, (0.95, 0.6, 0.45), 0.05), (170, (1.0
 """A transfer function in which skin is translucent."""
 ZOOM, MIDDLE = 2.6, (0.5, 0.42)
 EYE = (0.0, -290.0, 40.0)
+TITLES = {"naive": "no overlap, each read once", "overlap": "overlap"}
 
 
 @figure(__doc__, resolution=240, size=240)
@@ -36,9 +37,7 @@ def main(chosen: Namespace) -> None:
     )
     for row, camera in enumerate((whole, whole.zoom(ZOOM, MIDDLE))):
         images = {}
-        for column, (method, title) in enumerate(
-            (("naive", "no overlap, each once"), ("overlap", "overlap"))
-        ):
+        for column, (method, title) in enumerate(TITLES.items()):
             rendering = jv.render_bricks(
                 volume, transfer, camera, march, bricks=SPLIT, method=method, outputs="rgba"
             )
