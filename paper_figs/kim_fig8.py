@@ -49,8 +49,8 @@ def main(chosen: Namespace) -> None:
             )
             if row == 0:
                 side = chosen.size / ZOOM
-                corner = [chosen.size * middle - side / 2 for middle in MIDDLE]
-                axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor="w", linewidth=0.8))
+                x, y = (chosen.size * middle - side / 2 for middle in MIDDLE)
+                axes.add_patch(Rectangle((x, y), side, side, fill=False, edgecolor="w", linewidth=0.8))
         off = np.abs(images["naive"] - images["overlap"])
         share = np.mean(off.max(-1) > 1 / 255)
         caption = f"largest {off.max():.2f}\n{share:.0%} of the pixels by > 1/255"
