@@ -198,7 +198,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     repetitions=5,
     size=64,
     resolution=320,
-    only=common.some_of(map(named, TABLE), "SPLIT"),
+    only=common.some_of([named(split) for split in TABLE], "SPLIT"),
 )
 def main(chosen: Namespace) -> common.Answer:
     splits = [split for split in TABLE if named(split) in chosen.only]
