@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxvol as jv
+from jaxvol.bricks.split import COPIES
 from jaxvol.lighting import Deferred, Lighting, Phong
 from jaxvol.march import Quadrature
 
@@ -72,6 +73,25 @@ def ours(
         return program(case, march, None if lighting is None else lighting(case))
 
     return make
+
+
+def in_bricks(part: float, step: float, case: Case) -> Program:
+    """The base by `render_bricks` from memory, within `part` of what the whole volume takes there with the
+    copies that are made of it."""
+    volume, transfer, camera, voxel = case.scene
+    transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
+    march = jv.March(step * voxel, transforms, "midpoint")
+    memory = int(part * COPIES * volume.data.nbytes)
+
+    def render() -> jv.Rendering:
+        return jv.render_bricks(volume, transfer, camera, march, memory=memory, outputs="rgba")
+
+    def image() -> np.ndarray:
+        rendering = render()
+        assert not np.any(rendering.exhausted)
+        return np.asarray(rendering.image())
+
+    return Program(lambda: render().rgba, image)
 
 
 def tabulated(points: int, case: Case) -> Case:

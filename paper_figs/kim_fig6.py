@@ -1,7 +1,7 @@
 """Kim, Kwon and Shin, Fig. 6: the order of bricks, by the depth of their centres.
 
 The paper's scan cut into six bricks, in the plane of the motor's turn, and a camera beside it. The numbers
-are the order in which `render_bricks` takes them; the lines are the distances of their centres from the camera.
+are the order in which `render_bricks` takes them; the lines lead from the camera to their centres.
 The ray leaves a brick through its curved face and comes back to it (the paper's Fig. 4); the dashed chord of
 that face is what K reaches to.
 """
