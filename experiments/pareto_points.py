@@ -4,7 +4,7 @@ Each method has its own sweep around one base: the midpoint rule at steps of one
 (`AlphaCorrection`), space leaping by the hierarchy, and rays that end at a transmittance of 1e-4. In a lit
 scene the base is lit once per ray, by one template of eight photons; in a shaded one each sample is
 shaded by its gradient, and an isosurface where it is hit. A scene in bricks is rendered whole and by
-`render_bricks`, from memory, within a budget.
+`render_bricks`, from a file, within a budget.
 """
 
 from collections.abc import Callable
