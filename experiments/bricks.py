@@ -10,7 +10,8 @@ from several sides: whether a ray comes back to a brick depends on where it come
 
 Before each frame the file is dropped from the system's page cache, where the system can do that, so that
 frames read from the disk. Ranges of values are found before the first frame. A split into many bricks is
-timed once.
+timed once. `--only` measures some splits anew and keeps what the record says of the others, with the commit
+that they are of.
 """
 
 import os
@@ -26,7 +27,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.bricks import overlap_of, share
 
-from . import bricks_paper, common, timing
+from . import bricks_paper, common, record, timing
 from .bricks_paper import BEST, TABLE, Split
 from .common import plt
 
@@ -47,6 +48,7 @@ EYES: dict[str, tuple[float, float, float]] = {
 }
 """Where the camera is, mm. Across and along the fan, rays pass the curved faces at small angles."""
 VIEW = "across"
+FROM = f"{','.join(map(str, BEST))} from"
 QUICK: list[Split] = [(2, 1, 2)]
 
 
@@ -202,7 +204,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
 )
 def main(chosen: Namespace) -> common.Answer:
     splits = [split for split in TABLE if named(split) in chosen.only]
-    views = [view for view in EYES if view != VIEW]
+    views = [view for view in EYES if view != VIEW and BEST in splits]
     if chosen.quick:
         chosen.size, chosen.resolution, chosen.repetitions = 16, 48, 1
         splits, views = QUICK, []
@@ -235,16 +237,30 @@ def main(chosen: Namespace) -> common.Answer:
             }
         for view in views:
             from_[view] = measure(BEST, view)
-    result = {
+    about = {
         "image": [chosen.size] * 2,
-        "voxels": scan.shape,
+        "voxels": list(scan.shape),
         "step, mm": round(scan.step, 5),
-        "repetitions": chosen.repetitions,
         "view": VIEW,
-        "splits": rows,
-        f"{named(BEST)} from": from_,
     }
+    kept, kept_from = recorded(chosen, about)
+    rows = {name: (rows | kept)[name] for name in (*map(named, TABLE), *rows) if name in rows | kept}
+    result = {**about, "splits": rows, FROM: from_ or kept_from}
     return result, partial(draw, result)
+
+
+def recorded(chosen: Namespace, about: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What the record in the output says of the splits that are not chosen, with the commit and the command
+    that measured them, and of the views; nothing if quick, or of another image or scan."""
+    path = chosen.output / "bricks.json"
+    if chosen.quick or not path.is_file():
+        return {}, {}
+    found = record.read(path)
+    if any(found["result"][name] != value for name, value in about.items()):
+        return {}, {}
+    made = {"commit": found["commit"], "command": found["command"]}
+    splits = found["result"]["splits"].items()
+    return {n: {"measured": made, **row} for n, row in splits if n not in chosen.only}, found["result"][FROM]
 
 
 if __name__ == "__main__":

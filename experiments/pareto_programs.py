@@ -85,8 +85,8 @@ def _folder() -> TemporaryDirectory:
 
 
 def in_bricks(part: float, step: float, case: Case) -> Program:
-    """The base by `render_bricks` from a file, within `part` of what the whole volume takes in memory with the
-    copies that are made of it. Ranges of values are found once, before."""
+    """The base by `render_bricks` from a file, within `part` of what the whole volume takes in memory with
+    the copies that are made of it. Ranges of values are found once, before."""
     volume, transfer, camera, voxel = case.scene
     transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
     march = jv.March(step * voxel, transforms, "midpoint")
