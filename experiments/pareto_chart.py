@@ -32,6 +32,9 @@ COLORS = {
     "isosurface": "#1b9e77",
     "isosurface, no leaping": "#d95f02",
     "isosurface, leaping by distance": "#7570b3",
+    "whole": "#2b8cbe",
+    "bricks, memory of the whole": "#e6ab02",
+    "bricks, memory of a quarter": "#a6761d",
     VTK: "#555555",
     DRJIT: "#ff7f0e",
 }

@@ -3,7 +3,8 @@
 Each method has its own sweep around one base: the midpoint rule at steps of one voxel, cells cut at the exit
 (`AlphaCorrection`), space leaping by the hierarchy, and rays that end at a transmittance of 1e-4. In a lit
 scene the base is lit once per ray, by one template of eight photons; in a shaded one each sample is
-shaded by its gradient, and an isosurface where it is hit.
+shaded by its gradient, and an isosurface where it is hit. A scene in bricks is rendered whole and by
+`render_bricks`, from a file, within a budget.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,17 @@ import jaxvol as jv
 from jaxvol.lighting import Lighting
 
 from .accuracy import DRJIT, FINEST_OF, LONGEST, QUADRATURES, VTK
-from .pareto_programs import Program, by_drjit, by_vtk, deferred, lighting_of, ours, stored, tabulated
+from .pareto_programs import (
+    Program,
+    by_drjit,
+    by_vtk,
+    deferred,
+    in_bricks,
+    lighting_of,
+    ours,
+    stored,
+    tabulated,
+)
 from .pareto_scenes import Case, Row, copied
 
 
@@ -23,11 +34,12 @@ BASE = "midpoint, step 1"
 LIT_BASE = "lit, midpoint, step 1"
 SHADED_BASE = "shaded, midpoint, step 1"
 SURFACE_BASE = "isosurface, step 1"
+WHOLE_BASE = "whole, step 1"
 PHOTONS = 8
 
 
 def unlit(row: Row) -> bool:
-    return not row.lit
+    return not row.lit and not row.bricks
 
 
 class Setting(NamedTuple):
@@ -68,7 +80,7 @@ def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = lighting_of
 
 def straight(row: Row) -> bool:
     """Where frames are fast enough for all settings: each ray of a toroidal scan is bent sample by sample."""
-    return not row.lit and not row.toroidal
+    return unlit(row) and not row.toroidal
 
 
 def peer(row: Row) -> bool:
@@ -184,6 +196,17 @@ SURFACE: dict[str, Setting] = {
     for step in STEPS
 }
 
+BRICKS: dict[str, Setting] = {
+    **stepped("whole", "whole", STEPS, where=lambda row: row.bricks),
+    **{
+        f"bricks, memory {words}, step {step:g}": Setting(
+            f"bricks, memory {words}", partial(in_bricks, part, step), lambda row: row.bricks
+        )
+        for words, part in (("of the whole", 1.0), ("of a quarter", 0.25))
+        for step in STEPS
+    },
+}
+
 PEERS: dict[str, Setting] = {
     **{f"{VTK}, step {step:g}": Setting(VTK, partial(by_vtk, step), peer) for step in STEPS[1:]},
     **{
@@ -193,7 +216,7 @@ PEERS: dict[str, Setting] = {
     },
 }
 
-SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **SHADED, **SURFACE, **PEERS}
+SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **SHADED, **SURFACE, **BRICKS, **PEERS}
 
 GRADIENTS = (
     "midpoint, step 0.5",
@@ -223,4 +246,6 @@ def base_of(row: Row) -> str:
     """Name of the setting that all others of the scene are timed against."""
     if row.surface:
         return SURFACE_BASE
+    if row.bricks:
+        return WHOLE_BASE
     return SHADED_BASE if row.shaded else LIT_BASE if row.lit else BASE

@@ -1,6 +1,9 @@
 """What runs a setting of a method in a scene: a march, with or without light, or another program."""
 
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -9,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxvol as jv
+from jaxvol.bricks.split import COPIES
 from jaxvol.lighting import Deferred, Lighting, Phong
 from jaxvol.march import Quadrature
 
@@ -72,6 +76,34 @@ def ours(
         return program(case, march, None if lighting is None else lighting(case))
 
     return make
+
+
+@cache
+def _folder() -> TemporaryDirectory:
+    """Where volumes lie that are read brick by brick, until the program ends."""
+    return TemporaryDirectory()
+
+
+def in_bricks(part: float, step: float, case: Case) -> Program:
+    """The base by `render_bricks` from a file, within `part` of what the whole volume takes in memory with
+    the copies that are made of it. Ranges of values are found once, before."""
+    volume, transfer, camera, voxel = case.scene
+    transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
+    march = jv.March(step * voxel, transforms, "midpoint")
+    memory = int(part * COPIES * volume.data.nbytes)
+    path = Path(_folder().name) / f"{len(list(Path(_folder().name).glob('*.npy')))}.npy"
+    np.save(path, np.asarray(volume.data))
+    place: dict[str, Any] = {"spacing": volume.spacing, "origin": volume.origin}
+
+    def render() -> jv.Rendering:
+        return jv.render_bricks(path, transfer, camera, march, memory=memory, outputs="rgba", **place)
+
+    def image() -> np.ndarray:
+        rendering = render()
+        assert not np.any(rendering.exhausted)
+        return np.asarray(rendering.image())
+
+    return Program(lambda: render().rgba, image)
 
 
 def tabulated(points: int, case: Case) -> Case:

@@ -43,6 +43,7 @@ class Row(NamedTuple):
       phantom.
     - `file`: the real volume, None for a phantom.
     - `peers`: None, or why VTK and Dr.Jit are left out.
+    - `bricks`: whether it is rendered whole and in bricks, and not by all other settings.
     - `lit`: whether there is light; `shaded`: whether it is `Phong`'s; `surface`: whether an isosurface is
       shown.
     - `gradients`: whether gradients are measured, too.
@@ -56,6 +57,7 @@ class Row(NamedTuple):
     look: Literal["translucent", "opaque", "thin peak"] = "translucent"
     peers: str | None = None
     toroidal: bool = False
+    bricks: bool = False
     lit: bool = False
     shaded: bool = False
     surface: bool = False
@@ -193,6 +195,7 @@ ROWS: dict[str, Row] = {
     "engine, shaded": Row(partial(shaded, "engine"), ENGINE, lit=True, shaded=True),
     "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, lit=True, shaded=True),
     "engine, cut": Row(cut, ENGINE, peers=WHOLE),
+    "engine, in bricks": Row(partial(real, "engine"), ENGINE, peers=WHOLE, bricks=True),
     "engine, isosurface": Row(surface, ENGINE, peers=SURFACES, lit=True, surface=True),
 }
 

@@ -21,10 +21,10 @@ from typing import Any, Literal
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 
-from . import common
+from . import common, record
 from .atlas import ENTRIES, FAMILIES
 from .atlas.entry import Entry, pictured, sweep
-from .atlas.page import number, page
+from .atlas.page import Pictures, number, page, pictures_of
 from .common import plt
 
 
@@ -87,7 +87,7 @@ def _scale(panel: Any, name: Literal["x", "y"], scale: str, values: Sequence[flo
         axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
 
 
-def draw(result: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any], pictures: dict[str, Pictures], path: Path) -> None:
     """The chart of all entries, and the page beside it."""
     entries = result["entries"]
     rows = -(-len(entries) // COLUMNS)
@@ -117,7 +117,7 @@ def draw(result: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
 )
 def main(chosen: Namespace) -> common.Answer:
     entries: dict[str, Any] = {}
-    pictures: dict[str, Any] = {}
+    pictures: dict[str, Pictures] = {}
     if chosen.quick and chosen.only == list(ENTRIES):  # one of each family, since all take minutes to compile
         chosen.only = [family[0].name for family in FAMILIES.values()]
     for name in chosen.only:
@@ -132,8 +132,31 @@ def main(chosen: Namespace) -> common.Answer:
         entries[name] = {**about, **found, "outcome": entry.outcome, "does": entry.does, "size": entry.size}
         within, beyond = (number(found["edge"][side]) for side in ("within", "beyond"))
         print(f"{name:40} {entry.outcome:18} within {within}, beyond {beyond} ({entry.regime})", flush=True)
+    kept, shown = recorded(chosen)
+    entries, pictures = (
+        {n: all_[n] for n in ENTRIES if n in all_} for all_ in (entries | kept, pictures | shown)
+    )
     result = {"entries": entries}
     return result, partial(draw, result, pictures)
+
+
+def recorded(chosen: Namespace) -> tuple[dict[str, Any], dict[str, Pictures]]:
+    """What record and page in the output say of the entries that are not chosen, with the commit and the
+    command that measured them; nothing if quick."""
+    path = chosen.output / "stability.json"
+    page = path.with_suffix(".html")
+    if chosen.quick or not (path.is_file() and page.is_file()):
+        return {}, {}
+    found, text = record.read(path), page.read_text(encoding="utf-8")
+    made = {"commit": found["commit"], "command": found["command"]}
+    kept, shown = {}, {}
+    for name, entry in found["result"]["entries"].items():
+        if name in ENTRIES and name not in chosen.only:
+            kept[name] = {"measured": made, **entry}
+            shown[name] = dict(
+                zip(pictured(ENTRIES[name], entry), pictures_of(text, ENTRIES[name]), strict=True)
+            )
+    return kept, shown
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from . import (
     adaptive,
+    bricks,
     clips,
     fits,
     labels,
@@ -26,6 +27,7 @@ FAMILIES = {
     "faces of labels": labels.ENTRIES,
     "clips": clips.ENTRIES,
     "toroidal maps": probe.ENTRIES,
+    "bricks": bricks.ENTRIES,
     "isosurfaces": surfaces.ENTRIES,
     "scatterer templates": light.ENTRIES,
     "shading": normals.ENTRIES,

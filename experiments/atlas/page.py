@@ -3,6 +3,7 @@
 import base64
 import html
 import io
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -38,14 +39,17 @@ means that the failure does not occur anywhere in the sweep.
 
 Chart = Callable[[Any, Entry, dict[str, Any]], None]
 
+Pictures = dict[float, np.ndarray | str]
+"""Of an entry, by value: linear images, or what a page holds of them, data URIs."""
+
 
 def page(
     families: dict[str, list[Entry]],
     found: dict[str, dict[str, Any]],
-    pictures: dict[str, dict[float, np.ndarray]],
+    pictures: dict[str, Pictures],
     chart: Chart,
 ) -> str:
-    """The page of all entries that were measured."""
+    """The page of all entries in `found`."""
     body = ["<h1>Failure atlas</h1>", f"<p>{INTRODUCTION}</p>", _contents(families, found)]
     for family, entries in families.items():
         if entries:
@@ -57,6 +61,12 @@ def page(
         + "\n".join(body)
         + "\n</body></html>\n"
     )
+
+
+def pictures_of(text: str, entry: Entry) -> list[str]:
+    """The pictures of an entry that a page holds, as data URIs; none if it does not hold the entry."""
+    _, _, section = text.partition(f'<h3 id="{_anchor(entry)}">')
+    return re.findall(r'<figure class="picture"><img src="([^"]+)"', section.partition("<h3 ")[0])
 
 
 def number(value: float | None) -> str:
@@ -84,10 +94,11 @@ def _contents(families: dict[str, list[Entry]], found: dict[str, dict[str, Any]]
     return f"<table><tr><th>entry</th><th>what jaxvol does</th><th>edge</th></tr>\n{rows}</table>"
 
 
-def _entry(entry: Entry, found: dict[str, Any], pictures: dict[float, np.ndarray], chart: Chart) -> str:
+def _entry(entry: Entry, found: dict[str, Any], pictures: Pictures, chart: Chart) -> str:
     source, name = _source(entry.method)
     figures = "".join(
-        f'<figure class="picture"><img src="{_png(image)}" alt="{html.escape(entry.shows)}">'
+        f'<figure class="picture"><img src="{image if isinstance(image, str) else _png(image)}" '
+        f'alt="{html.escape(entry.shows)}">'
         f"<figcaption>{html.escape(entry.regime)}: <b>{number(value)}</b></figcaption></figure>"
         for value, image in pictures.items()
     )

@@ -103,7 +103,7 @@ class Stream:
         else:
             x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
-        stored = stored_of(grid, margin, probe)
+        stored = stored_of(grid, margin, probe if method == "overlap" else None)
         assert isinstance(marched.source, Camera)
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
         return cls(
@@ -242,11 +242,11 @@ class Stream:
         be."""
         low, high = self._box(found)
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
-        wanted = tuple(np.maximum(high - low + 1 + BLOCK, self.stored).tolist())
-        larger = stored_shape(self.grid.shape, wanted)
-        if bytes_of(larger, self.source.dtype, self.margin) > self.memory:
+        wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
+        x, y, z = map(max, wanted, self.stored)
+        if bytes_of((x, y, z), self.source.dtype, self.margin) > self.memory:
             return True
-        self.stored = larger
+        self.stored = x, y, z
         return False
 
     def _load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:

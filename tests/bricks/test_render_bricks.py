@@ -10,7 +10,9 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, VoxelSource, source_of
+from jaxvol.bricks.stream import Stream
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
+from jaxvol.occupancy import BLOCK
 
 
 TRANSFER = jv.TransferFunction.from_points(
@@ -171,6 +173,25 @@ def test_without_overlap_bricks_are_read_again(bricks):
     assert_same(whole_fog(), found)
     assert found.bricks.loads > found.bricks.needed
     assert found.bricks.reloads == found.bricks.loads - found.bricks.needed
+
+
+def test_no_more_is_read_at_a_time_than_the_largest_brick_takes(monkeypatch):
+    """Each new shape of what is read compiles a program, so that it must not grow from brick to brick."""
+    volume, probe, transfer = fog()
+    needed, found = [], Stream._box
+
+    def recorded(stream, cells):
+        low, high = found(stream, cells)
+        if not needed:
+            needed.append(stream.stored)  # by the distances between nodes in the middle of the scan
+        needed.append(np.minimum(high, np.array(volume.shape) - 1) - np.maximum(low, 0) + 2 * BLOCK - 1)
+        return low, high
+
+    monkeypatch.setattr(Stream, "_box", recorded)
+    march = jv.March(1.0, (probe,))
+    bricks = jv.render_bricks(volume, transfer, SIDE, march, bricks=(4, 3, 2), method="reload").bricks
+    assert bricks.loads > 24
+    assert np.all(np.array(bricks.stored) <= np.max(needed, axis=0))
 
 
 def test_the_naive_order_is_visibly_wrong():
