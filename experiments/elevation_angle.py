@@ -9,7 +9,7 @@ one that is flat by the secant. The nearer the angles, the more both look like a
 which of them the shells are, their shape would tell the angle. Each shape is fitted under both readings.
 The readings are told apart if, under the shape that leaves least, all windows of depth agree on one of them,
 and what it leaves is less than what its shells differ by from the best ones under the other reading.
-As a control, the same is done for shells that are made under either reading.
+As a control, the same is done for perfect shells, made under either reading.
 
 *Images with known cameras*: each reading is taken as the truth of reference images, and a fit starts from the
 other one.
@@ -40,6 +40,8 @@ START, MOTOR_RADIUS, SPAN = 52.70, 22.70, 69.58
 """mm: of the first sample from the fan's apex and from the motor axis, and the length of a beam."""
 READINGS = {"half angle": ELEVATION, "whole angle": ELEVATION / 2}
 """Half of the range of elevation under both readings of the header, degrees."""
+SHAPE = (91, 128, 239)
+"""Of the scan: planes, beams, samples."""
 WINDOWS = ((15, 60), (60, 110))
 """Samples of a beam with two or three shells each."""
 MOST = 12
@@ -62,17 +64,15 @@ def scan(folder: Path) -> np.ndarray:
     return np.ascontiguousarray(np.asarray(jv.load(folder / SCAN).data).transpose(2, 1, 0))
 
 
-def made(half: float, shape: tuple[int, int, int], seed: int) -> np.ndarray:
-    """Echoes [β, σ, γ] of shells 18 samples apart, whose centres lie off the axis, under a range of `half`
-    degrees to either side, with speckle. The first plane is empty, as in the scan."""
-    rng = np.random.default_rng(seed)
+def made(half: float, shape: tuple[int, int, int]) -> np.ndarray:
+    """Echoes [β, σ, γ] of perfect shells 18 samples apart, whose centres lie off the axis, under a range of
+    `half` degrees to either side. The first plane is empty, as in the scan."""
     late = np.cos(np.deg2rad(np.linspace(-half, half, shape[0] - 1)))
     late = (late - late.max()) / np.ptp(late)
-    sample = np.arange(shape[2]) - 2.5 * late[:, None, None]
+    sample = np.arange(shape[2]) - 2.5 * late[:, None]
     echo = 40 + 150 * np.exp(-((np.mod(sample + 9, 18) - 9) ** 2) / 8)
-    white = rng.normal(size=(2, shape[0] - 1, *shape[1:]))
-    speckle = np.hypot(*(gaussian_filter(part, (1, 1, 1)) for part in white))
-    return np.concatenate([np.zeros((1, *shape[1:])), echo * (speckle / speckle.mean())])
+    planes = np.concatenate([np.zeros((1, shape[2])), echo])
+    return np.repeat(planes[:, None], shape[1], axis=1)
 
 
 def bow(echo: np.ndarray, window: tuple[int, int]) -> np.ndarray:
@@ -196,8 +196,7 @@ def slices_of(echo: np.ndarray) -> dict[str, np.ndarray]:
     size=32,
 )
 def main(chosen: Namespace) -> common.Answer:
-    shape = (31, 32, 160) if chosen.quick else (91, 128, 239)
-    control = {name: made(half, shape, chosen.seed) for name, half in READINGS.items()}
+    control = {name: made(half, SHAPE) for name, half in READINGS.items()}
     result: dict[str, Any] = {
         "half of the range, degrees": READINGS,
         "control": {name: measure(echo) for name, echo in control.items()},
