@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import common, probe_geometry, timing
+from . import common, elevation_angle, probe_geometry, timing
 from .common import plt
 
 
@@ -58,9 +57,8 @@ def phantom(name: str, folder: Path | None, size: int, resolution: int) -> Scene
 
 def scan(folder: Path | None, size: int, resolution: int) -> Scene:
     assert folder is not None
-    data = np.asarray(jv.load(folder / probe_geometry.SCAN).data)
-    volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
-    probe = probe_geometry.real_probe(probe_geometry.elevation_angle.ELEVATION / 2)
+    volume = jv.Volume(elevation_angle.scan(folder))
+    probe = elevation_angle.probe_of(elevation_angle.READINGS["whole angle"])
     camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
     return Scene(volume, probe, jv.colormap("gray", (60, 200), (0.0, 0.5)), camera)
 
