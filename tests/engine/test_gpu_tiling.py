@@ -58,6 +58,9 @@ def toroidal() -> Scene:
     return Scene(volume, transfer, camera, march)
 
 
+OF_MEANS = jv.TransferFunction.from_points([(0, (0.2, 0.4, 0.9), 0.0), (100, (1, 0.8, 0.5), 0.6)])
+"""Of means along rays, which are lower than the values of the parts."""
+
 LIGHT = DirectionalLight((0.4, 0.8, 0.6), (2.0, 2.0, 2.0))
 SCATTERERS = ScattererTemplates(Material(0.8, 0.1, 1.4), LIGHT, templates=1, photons=2)
 ADAPTIVE = jv.AdaptiveSampling(0.02), jv.Jitter(3), jv.AlphaCorrection(), jv.SpaceLeaping()
@@ -75,7 +78,7 @@ SCENES = {
     "Phong": lambda: engine(lighting=Phong()),
     "scatterers": lambda: engine(lighting=SCATTERERS),
     "maximum": lambda: engine(compositing=jv.Maximum()),
-    "average": lambda: engine(compositing=jv.Average()),
+    "average": lambda: engine(compositing=jv.Average())._replace(transfer=OF_MEANS),
     "isosurface": lambda: engine(compositing=jv.Isosurface(120.0), lighting=Phong()),
 }
 
