@@ -6,6 +6,8 @@ takes part. Anywhere else it is told; two processes on one machine, for example:
 
     python examples/several_processes.py --coordinator localhost:12345 --processes 2 --process 1 &
     python examples/several_processes.py --coordinator localhost:12345 --processes 2 --process 0
+
+With `--bricks`, each process reads and renders parts of the volume of its own.
 """
 
 import argparse
@@ -25,7 +27,7 @@ def scene(resolution: int, size: int) -> tuple[jv.Volume, jv.TransferFunction, j
         [(60, (0.0, 0.0, 0.0), 0.0), (90, (0.8, 0.7, 0.5), 0.02), (255, (1, 1, 1), 0.9)], unit_distance=0.02
     )
     camera = jv.Camera.looking_at(volume, (0.5, -0.9, 0.3), size=(size, size))
-    transforms = jv.Jitter(seed=0), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-4)
+    transforms = jv.Jitter(seed=0), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-5)
     return volume, transfer, camera, jv.March(2 / resolution, transforms)
 
 
@@ -41,11 +43,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--output", type=Path, default=Path("head.png"), help=".png, or .npy for (H, W, 4) floats"
     )
+    parser.add_argument("--bricks", action="store_true", help="each process has parts of the volume")
     given = parser.parse_args(argv)
 
     # before anything else of JAX, which would begin without the other processes
     jax.distributed.initialize(given.coordinator, given.processes, given.process)
-    rendering = jv.render(*scene(given.resolution, given.size), devices=jax.devices())
+    parts = scene(given.resolution, given.size)
+    if given.bricks:
+        rendering = jv.render_bricks(*parts, devices=jax.devices(), own="bricks")
+    else:
+        rendering = jv.render(*parts, devices=jax.devices())
 
     # every process has the whole image; one of them saves it
     if jax.process_index() == 0:

@@ -3,10 +3,11 @@
 The head phantom, leaping, with early termination. Strong scaling: one image of 512² pixels on 1, 2, 4 and 8
 devices, against the same image where `devices` is not given. Weak scaling: 256² pixels for each device.
 
-Where there is no accelerator, devices are parts of the host, which share its cores; and one device uses all
-cores already. Then times cannot fall with their number: they show what dealing out rays costs. `balance` does
-not depend on the machine: the samples that devices take on average, over those of the one that takes most. It
-bounds how much faster so many devices of their own could be.
+Where there is no accelerator, devices are parts of the host, which share its cores; and one device uses these
+already, though not all of them all the time. Then times do not show how an image scales, but what dealing out
+rays gains and costs on a host. `balance` does not depend on the machine: the samples that devices take on
+average, over those of the one that takes most. It bounds how much faster so many devices of their own could
+be.
 """
 
 import math
@@ -126,7 +127,9 @@ def draw(found: dict[str, Any], path: Path) -> None:
         panel.set_xscale("log", base=2)
         panel.set_xticks(NUMBERS, NUMBERS)
         panel.set_ylim(bottom=0)
-        panel.set_xlabel(f"devices ({found['platform']})", fontsize=9)
+        panel.set_xlabel(
+            "devices, parts of one host" if found["platform"] == "cpu" else "devices", fontsize=9
+        )
         panel.tick_params(labelsize=8)
         panel.legend(fontsize=8)
         panel.grid(alpha=0.3)

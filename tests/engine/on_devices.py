@@ -349,8 +349,10 @@ def bricks():
     def loss(transfer: jv.TransferFunction, render: Callable[..., jv.Rendering], **more: Any) -> Any:
         return jnp.sum(render(volume, transfer, camera, jv.March(0.05, MOVING[:3]), **more).rgba * weights())
 
-    of_one = jax.grad(loss)(thin(), jv.render)
-    assert_same_gradient(jax.grad(loss)(thin(), jv.render_bricks, bricks=(2, 2, 2), devices=every), of_one)
+    # a leap counts as empty what has no extinction, and blocks of bricks are others
+    some = eqx.tree_at(lambda t: t.extinction, thin(), jnp.maximum(thin().extinction, 1e-3))
+    of_one = jax.grad(loss)(some, jv.render)
+    assert_same_gradient(jax.grad(loss)(some, jv.render_bricks, bricks=(2, 2, 2), devices=every), of_one)
 
 
 def curved_bricks():
