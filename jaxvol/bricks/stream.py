@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from .._util.memory import give_back
 from .._util.vec3 import apart
 from .._util.xla import compiled
 from ..camera import Camera
@@ -126,6 +127,7 @@ class Stream:
             following = next(turns, None)
             state = march(part, cells, state)
             del part, cells
+            give_back()  # decoders keep what they freed, as much as a brick
             living[0] = where(state)
             if self.progress is not None:
                 self.progress(len(self.loads), int(self.visible.sum()))
