@@ -128,7 +128,7 @@ class ArraySource(VoxelSource):
 
 
 def empty_box(low: Corner, high: Corner, dtype: np.dtype) -> np.ndarray:
-    """An array for the voxels of a box. It is aligned to pages, so that `jax.device_put` uses it in place where
+    """An array for the voxels of a box. It is aligned to pages, so that `jax.device_put` uses it in place if
     the device is the CPU; and goes back to the system when it is dropped, where `malloc` might keep it."""
     shape = tuple(int(b) - int(a) for a, b in zip(low, high, strict=True))
     return np.ndarray(shape, dtype, mmap.mmap(-1, math.prod(shape) * dtype.itemsize))

@@ -122,12 +122,12 @@ class Stream:
         load = next(turns, None)
         while load is not None:
             jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
+            give_back()  # decoders keep what they freed, as much as a brick
             part, cells = self._part(load), load.cells
             load = None  # and with it the voxels as they were read
             following = next(turns, None)
             state = march(part, cells, state)
             del part, cells
-            give_back()  # decoders keep what they freed, as much as a brick
             living[0] = where(state)
             if self.progress is not None:
                 self.progress(len(self.loads), int(self.visible.sum()))
