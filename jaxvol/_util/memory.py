@@ -1,5 +1,6 @@
-"""Checks that an allocation fits into memory before it is made, since running out ends the process."""
+"""Does an allocation fit into memory? Running out would end the process. And how is memory given back?"""
 
+import ctypes
 import os
 from pathlib import Path
 
@@ -24,6 +25,13 @@ def memory_of_device() -> int:
     container = Path("/sys/fs/cgroup/memory.max")
     limit = container.read_text().strip() if container.is_file() else "max"
     return machine if limit == "max" else min(machine, int(limit))
+
+
+def give_back() -> None:
+    """Gives memory that was freed back to the system, where the C library is one that keeps it (glibc)."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(0)
 
 
 def _spelled(count: int) -> str:

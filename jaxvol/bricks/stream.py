@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
+from .._util.memory import give_back
 from .._util.vec3 import apart
 from .._util.xla import compiled
 from ..camera import Camera
@@ -129,6 +130,7 @@ class Stream:
         load = next(turns, None)
         while load is not None:
             jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
+            give_back()  # decoders keep what they freed, as much as a brick
             part, cells = self._part(load), load.cells
             load = None  # and with it the voxels as they were read
             following = next(turns, None)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._util.checks import Arrayable, finite_array, integer
+from .._util.memory import give_back
 from ..occupancy import BLOCK, Blocks, SlopeRanges, over_blocks, widened
 from ..variation import Windows
 from ..volume import Volume
@@ -171,6 +172,7 @@ def scan(
         done += int(np.prod(slab.blocks))
         if progress is not None:
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
+    give_back()
     return Summary(source.shape, cell, ranges)
 
 
