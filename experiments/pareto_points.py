@@ -203,7 +203,7 @@ BRICKS: dict[str, Setting] = {
             f"bricks, memory {words}", partial(in_bricks, part, step), lambda row: row.bricks
         )
         for words, part in (("of the whole", 1.0), ("of a quarter", 0.25))
-        for step in STEPS[1:4]
+        for step in STEPS[2:4]
     },
 }
 
