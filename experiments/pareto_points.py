@@ -197,13 +197,13 @@ SURFACE: dict[str, Setting] = {
 }
 
 BRICKS: dict[str, Setting] = {
-    **stepped("whole", "whole", STEPS, where=lambda row: row.bricks),
+    **stepped("whole", "whole", STEPS[1:], where=lambda row: row.bricks),
     **{
         f"bricks, memory {words}, step {step:g}": Setting(
             f"bricks, memory {words}", partial(in_bricks, part, step), lambda row: row.bricks
         )
         for words, part in (("of the whole", 1.0), ("of a quarter", 0.25))
-        for step in STEPS
+        for step in STEPS[2:4]
     },
 }
 

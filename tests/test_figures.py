@@ -9,6 +9,7 @@ import pytest
 from skimage.io import imread
 
 from experiments import (
+    bricks,
     fit_transfer,
     gradient_errors,
     kisti,
@@ -20,11 +21,13 @@ from experiments import (
 )
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.scenes import PHANTOM
-from paper_figs import chae_fig5, common, kisti_table, lee_tables, table1
+from paper_figs import chae_fig5, common, kim_fig9, kim_table1, kisti_table, lee_tables, table1
 
 
 ROOT = Path(__file__).parent.parent
-FIGURES = sorted({path.stem for path in (ROOT / "paper_figs").glob("*fig*.py")} - {"chae_fig5"} | {"gallery"})
+FIGURES = sorted(
+    {path.stem for path in (ROOT / "paper_figs").glob("*fig*.py")} - {"chae_fig5", "kim_fig9"} | {"gallery"}
+)
 """Figures that need no recorded results."""
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
 """Experiments with stored records."""
@@ -64,6 +67,8 @@ def test_every_figure_in_the_readme_exists():
         "fig12",
         "fig13",
         "gallery",
+        "kim_fig6",
+        "kim_fig8",
         "kisti_fig",
         *lee,
     ] == FIGURES
@@ -191,6 +196,19 @@ def test_chae_and_shin_s_figure_5_is_drawn_from_the_record(measured, tmp_path):
 
 
 @pytest.mark.slow
+def test_bricks_are_read_once_with_overlap_and_again_without(measured, tmp_path):
+    for row in record.read(measured / "bricks.json")["result"]["splits"].values():
+        once, again, naive = (row[method] for method in bricks.METHODS)
+        assert once["loads"] == once["needed"] < again["loads"]
+        assert max(once["largest error"], again["largest error"]) < 2e-5
+        assert naive["loads"] == naive["needed"]
+    kim_table1.main(["--results", str(measured), "--output", str(tmp_path)])
+    assert "| 2 × 1 × 2 | *7.58* |" in (tmp_path / "kim_table1.md").read_text(encoding="utf-8")
+    kim_fig9.main(["--results", str(measured), "--output", str(tmp_path)])
+    assert imread(tmp_path / "kim_fig9.png").std() > 10
+
+
+@pytest.mark.slow
 def test_the_report_s_table_is_written_from_the_record(measured, tmp_path):
     kisti_table.main(["--results", str(measured), "--output", str(tmp_path)])
     text = (tmp_path / "kisti_table.md").read_text(encoding="utf-8")
@@ -208,6 +226,7 @@ def test_table_1_is_written_from_the_record(measured, tmp_path):
 def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
     assert table1.table(record.read(record.RESULTS / "overhead.json")) in text
+    assert kim_table1.table(record.read(record.RESULTS / "bricks.json")) in text
     measured = record.read(record.RESULTS / "kisti.json")
     for table in (kisti_table.table(measured, part) for part in ("shaded", "scenes")):
         assert table in text
