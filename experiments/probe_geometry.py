@@ -31,7 +31,7 @@ from .common import plt
 
 
 OFF, GOAL, NOISE = 0.2, 0.005, 0.01
-STAGES = ((1 / 8, 1e-3), (None, 1e-5))
+STAGES = ((1 / 8, 1e-3), (1 / 32, 1e-3), (None, 1e-5))
 """From coarse to fine: standard deviation of the blur, in parts of the image's height, and `rtol` of the fit.
 The last one is without blur, since neighbouring pixels of blurred noise are not independent, as the
 covariance supposes."""
