@@ -31,11 +31,13 @@ from .common import plt
 
 
 OFF, GOAL, NOISE = 0.2, 0.005, 0.01
-STAGES = ((1 / 8, 1e-3), (None, 1e-5))
+STAGES = ((1 / 8, 1e-3), (1 / 32, 1e-3), (None, 1e-5))
 """From coarse to fine: standard deviation of the blur, in parts of the image's height, and `rtol` of the fit.
 The last one is without blur, since neighbouring pixels of blurred noise are not independent, as the
 covariance supposes."""
 STEPS = 100
+PATIENCE = 4
+"""Steps that do not lower the loss, after which a stage ends."""
 NAMES = ("a", "b", "first β", "last β", "first σ", "last σ", "last γ")
 PLACES = ((60, -250, -110), (0, 0, 85), (1, 0, 0)), ((-220, 120, 40), (0, 0, 85), (0, 0, 1))
 """Position, focal point and up of the cameras, mm."""
@@ -113,7 +115,7 @@ def found_from(scene: Scene, targets: list[Any], start: jv.ToroidalMap) -> tuple
     fits: list[jv.Fit] = []
     for blur, rtol in STAGES:
         residual = jv.ImageResidual(scene, targets, blur=blur)
-        fits.append(jv.fit(residual, start, max_steps=STEPS, rtol=rtol))
+        fits.append(jv.fit(residual, start, max_steps=STEPS, rtol=rtol, patience=PATIENCE))
         start = fits[-1].parameters
     return fits[-1], sum(len(fit.losses) for fit in fits)
 

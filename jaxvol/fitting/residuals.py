@@ -128,7 +128,9 @@ class ImageResidual(Residual):
     - `blur`: compare blurred images: standard deviation of a Gaussian, in parts of the image's height. From
       coarse to fine, such as 1/16, 1/48 and None, each fit from where the last one ended, a fit finds a
       geometry whose start is off by more than the size of features, which a derivative cannot see. Whole
-      images are then differentiated at once. Pixels beyond the border do not count.
+      images are then differentiated at once. Pixels beyond the border do not count. The noise of blurred
+      pixels is not independent, as `Fit.uncertainty` supposes: its standard errors are too small, several
+      times under noise of single pixels. Those of a last fit without blur are right.
 
     The residual is divided by the square root of the number of its entries, so that the loss, half the
     sum of squares, is half the mean squared error: an error of PSNR p dB has the loss 10^(-p/10) / 2.

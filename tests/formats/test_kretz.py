@@ -157,6 +157,18 @@ BAD = {
         changed((0xC300, 1), np.rad2deg(BETA).tobytes()),
         r"no probe: beta_range must lie",
     ),
+    "fans over more than π": (
+        changed((0xC300, 2), np.linspace(0.5, 3.5, SHAPE[1]).tobytes()),
+        r"no probe: sigma_range must lie in \[0, π\]",
+    ),
+    "angles from the middle": (
+        changed((0xC300, 1), (BETA - np.pi / 2).tobytes()),
+        r"no probe: beta_range must lie in \[0, π\]",
+    ),
+    "an angle of NaN in the middle": (
+        changed((0xC300, 1), np.where(np.arange(SHAPE[0]) == 1, np.nan, BETA).tobytes()),
+        "evenly spaced angles",
+    ),
     "no resolution at all": (changed((0xC100, 1), struct.pack(F64, 0)), "positive length in metres; got 0.0"),
     "negative resolution": (changed((0xC100, 1), struct.pack(F64, -4e-4)), "in metres; got -0.0004"),
     "infinite resolution": (changed((0xC100, 1), struct.pack(F64, np.inf)), "in metres; got inf"),
