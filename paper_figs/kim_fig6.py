@@ -59,9 +59,11 @@ def main(chosen: Namespace) -> None:
         middle = np.asarray(scan.to_world((low + high) / 2))[1:]
         axes.plot(*np.stack([eye, middle]).T, color="0.5", linewidth=0.7, linestyle=":")
         axes.plot(*middle, "k.", markersize=4)
-        axes.annotate(str(turn), middle, (4, 4), textcoords="offset points", fontsize=13, weight="bold")
+        axes.annotate(
+            str(turn), tuple(middle), (4, 4), textcoords="offset points", fontsize=13, weight="bold"
+        )
     axes.plot(float(eye[0]), float(eye[1]), "ks", markersize=8)
-    axes.annotate("camera", eye, (0, 9), textcoords="offset points", fontsize=9, ha="center")
+    axes.annotate("camera", tuple(eye), (0, 9), textcoords="offset points", fontsize=9, ha="center")
     # across the middle beam of the left bricks, a little below the farther face between two of them
     beta, gamma = (low + part * (high - low) for (low, high), part in ((ends[0], 0.25), (ends[2], 2 / 3)))
     face = [(beta + turn * (ends[0, 1] - ends[0, 0]) / 4, math.pi / 2, gamma) for turn in (-1, 0, 1)]

@@ -173,12 +173,12 @@ def bricks_of(
     march: March,
     *,
     memory: int,
-    compositing: Mode | Compositing[Any] = "over",
+    compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | None = None,
     cache: Any = "beside",
 ) -> Stream:
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
-    _check(march, transfer, lighting, "overlap", "all")
+    _check(march, transfer, lighting, "overlap", "all", "rays")
     place = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
     scene = _scene_of(source, place, transfer, camera, march, compositing, lighting)
     marched = _marched(scene)
@@ -192,7 +192,7 @@ def _scene_of(
     transfer: Transfer,
     camera: Camera,
     march: March,
-    compositing: Mode | Compositing[Any],
+    compositing: Mode | Compositing[Any] | Any,
     lighting: Lighting | None,
 ) -> Scene:
     """The scene of a source, without its voxels. `place`: its spacing and origin."""
