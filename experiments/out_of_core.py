@@ -27,7 +27,7 @@ from .common import plt
 from .large_volume import write_raw, zarr_of_raw
 
 
-SIZES = 64, 256, 1024, 2048
+SIZES = 64, 256, 2048
 """MiB of voxels."""
 LARGE = 2048
 """The size that the goals are for."""
@@ -80,7 +80,7 @@ def peak(row: dict[str, Any]) -> float:
 
 def allowed(result: dict[str, Any], kind: str) -> float:
     """The peak that is allowed, MiB."""
-    return OVER * result["memory"] + peak(result["constant"][f"{kind}, {result['pixels']}"])
+    return OVER * result["memory"] + peak(result["constant"][kind])
 
 
 def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]:
@@ -138,9 +138,9 @@ def draw(result: dict[str, Any], path: Path) -> None:
     volumes={"type": Path, "metavar": "FOLDER", "help": "keep the volumes here (default: delete them)"},
 )
 def main(chosen: Namespace) -> common.Answer:
-    sizes, memory, resident, of_constant = list(chosen.sizes), MEMORY, RESIDENT, (16, chosen.pixels)
+    sizes, memory, resident = list(chosen.sizes), MEMORY, RESIDENT
     if chosen.quick:
-        chosen.pixels, sizes, memory, resident, of_constant = 32, [2], 4, (2, 2), (32,)
+        chosen.pixels, sizes, memory, resident = 32, [2], 4, (2, 2)
     result: dict[str, Any] = {"pixels": chosen.pixels, "sizes": sizes, "memory": memory}
     bricks: dict[str, dict[str, Any]] = {kind: {} for kind in FORMATS}
     constant, whole = {}, {}
@@ -148,10 +148,9 @@ def main(chosen: Namespace) -> common.Answer:
         folder = chosen.volumes or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for kind in FORMATS:
-            for pixels in of_constant:
-                path = volume(folder, SMALL, kind, chosen.seed)
-                constant[f"{kind}, {pixels}"] = image(path, SMALL, pixels, 8)
-                said(f"constant, {kind}, {pixels} pixels", constant[f"{kind}, {pixels}"])
+            small = image(volume(folder, SMALL, kind, chosen.seed), SMALL, chosen.pixels, 8)
+            constant[kind] = small
+            said(f"constant, {kind}", small)
         for size in sizes:
             voxels = side(size)
             for kind in FORMATS:

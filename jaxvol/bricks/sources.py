@@ -5,7 +5,6 @@ data[x, y, z], whatever the order of axes in a file.
 """
 
 import math
-import mmap
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,6 +22,9 @@ from .dtypes import Box, converted, voxel_type
 
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
+
+ALIGNED = 64
+"""Bytes, of whose multiples the addresses of JAX's arrays are."""
 
 _READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
@@ -128,10 +130,13 @@ class ArraySource(VoxelSource):
 
 
 def empty_box(low: Corner, high: Corner, dtype: np.dtype) -> np.ndarray:
-    """An array for the voxels of a box. It is aligned to pages, so that `jax.device_put` uses it in place if
-    the device is the CPU; and goes back to the system when it is dropped, where `malloc` might keep it."""
+    """An array for the voxels of a box. It is aligned as JAX aligns its own, so that `jax.device_put` uses it
+    in place where the device is the CPU."""
     shape = tuple(int(b) - int(a) for a, b in zip(low, high, strict=True))
-    return np.ndarray(shape, dtype, mmap.mmap(-1, math.prod(shape) * dtype.itemsize))
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + ALIGNED, np.uint8)
+    start = -memory.ctypes.data % ALIGNED
+    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def array_of(volume: Volume) -> ArraySource:
