@@ -105,7 +105,7 @@ def render_bricks(
     unknown; for less memory than the smallest bricks take; and for what needs the whole volume at once
     (labels, baked or deferred light). Nothing is written but the cache, which appears whole or not at all.
 
-    Where it fails, and where not: `experiments/stability.py`, "wrong order", "overlap under k".
+    Where it fails, and where not: `experiments/stability.py`, "wrong order".
 
     Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
     are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the
