@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from .entry import Entry, signed
+from .entry import Entry
 
 
 SHAPE = 24, 32, 48
@@ -49,16 +49,13 @@ def whole(depth: float, size: int) -> np.ndarray:
     return np.asarray(jv.render(volume(), fog(depth), view(size), march, **how).rgba, np.float64)
 
 
-def by_bricks(depth: float, size: int, method: str, memory: int | None = None) -> jv.Rendering:
-    how = {"bricks": BRICKS, "method": method, "memory": memory, "outputs": "rgba"}
+def by_bricks(depth: float, size: int, method: str) -> jv.Rendering:
+    how = {"bricks": BRICKS, "method": method, "outputs": "rgba"}
     return jv.render_bricks(volume(), fog(depth), view(size), jv.March(STEP, (PROBE,)), **how)
 
 
 def error(found: jv.Rendering, truth: np.ndarray) -> float:
     return float(np.abs(np.asarray(found.rgba) - truth).max())
-
-
-# -- the order of a ray's samples -------------------------------------------------------------------------
 
 
 def ordered(depth: float, size: int) -> dict[str, float]:
@@ -91,50 +88,4 @@ ORDER = Entry(
 )
 
 
-# -- less overlap than rays need --------------------------------------------------------------------------
-
-FOG = 1.0
-"""Optical depth at which a wrong order shows most."""
-
-
-@cache
-def ample(size: int) -> int:
-    """Bytes that bricks take with as much overlap as the rays of this view need."""
-    report = by_bricks(FOG, size, "overlap").bricks
-    assert report is not None
-    return report.bytes_held
-
-
-def short(part: float, size: int) -> dict[str, float]:
-    """`part`: of the memory that bricks take with all their overlap."""
-    found = by_bricks(FOG, size, "overlap", max(1, int(part * ample(size))))
-    report = found.bricks
-    assert report is not None
-    return {"error": error(found, whole(FOG, size)), "bricks read again": float(report.reloads)}
-
-
-def short_picture(part: float, size: int) -> np.ndarray:
-    found = by_bricks(FOG, size, "overlap", max(1, int(part * ample(size))))
-    return signed((np.asarray(found.rgba, np.float64) - whole(FOG, size))[..., :3], LEVEL)
-
-
-SHORT = Entry(
-    name="overlap under k",
-    question="What happens where memory leaves bricks less overlap than rays that come back need?",
-    method="jaxvol.render_bricks",
-    regime="memory over that of bricks with all their overlap",
-    values=(1.0, 0.8, 0.6, 0.4, 0.0),
-    measure=short,
-    metric="largest error of a pixel; number of bricks read again",
-    judged="error",
-    limit=2e-5,
-    outcome="bounded",
-    does="A brick that would not fit with its overlap is read without it, and again for the rays that come "
-    "back: more reads, the same image. Bricks have at least the paper's K, whatever memory there is.",
-    picture=short_picture,
-    shows="error of the image, ± 1 / 255 from blue to red",
-    scales=("linear", "symlog"),
-    size=SIZE,
-)
-
-ENTRIES = (ORDER, SHORT)
+ENTRIES = (ORDER,)

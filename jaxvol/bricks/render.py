@@ -128,7 +128,7 @@ def render_bricks(
     baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written but the
     cache, which appears whole or not at all.
 
-    Where it fails, and where not: `experiments/stability.py`, "wrong order", "overlap under k".
+    Where it fails, and where not: `experiments/stability.py`, "wrong order".
 
     Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
     are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the

@@ -175,15 +175,6 @@ def test_without_overlap_bricks_are_read_again(bricks):
     assert found.bricks.reloads == found.bricks.loads - found.bricks.needed
 
 
-@pytest.mark.slow
-def test_bricks_short_of_overlap_are_read_again_and_the_image_stays():
-    volume, probe, transfer = fog()
-    march = jv.March(1.0, (probe, jv.Jitter(0)))
-    found = jv.render_bricks(volume, transfer, SIDE, march, bricks=(1, 1, 4), memory=1)
-    assert_same(whole_fog(), found)
-    assert found.bricks.reloads > 0
-
-
 def test_no_more_is_read_at_a_time_than_the_largest_brick_takes(monkeypatch):
     """Each new shape of what is read compiles a program, so that it must not grow from brick to brick."""
     volume, probe, transfer = fog()
