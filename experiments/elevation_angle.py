@@ -11,8 +11,8 @@ The readings are told apart if, under the shape that leaves least, all windows o
 and what it leaves is less than what its shells differ by from the best ones under the other reading.
 As a control, the same is done for perfect shells, made under either reading.
 
-*Images with known cameras*: each reading is taken as the truth of reference images, and a fit starts from the
-other one.
+*Images with known cameras*, with `--references`: each reading is taken as the truth of reference images, and
+a fit starts from the other one.
 
 The scan is read from the folder that JAXVOL_DATA names; without one, only the control is measured.
 """
@@ -194,6 +194,7 @@ def slices_of(echo: np.ndarray) -> dict[str, np.ndarray]:
     "Is the elevation angle of a real scan half of its sweep or all of it, and do the data settle that?",
     __doc__,
     size=32,
+    references={"action": "store_true", "help": "fits to images, too, which take minutes"},
 )
 def main(chosen: Namespace) -> common.Answer:
     control = {name: made(half, SHAPE) for name, half in READINGS.items()}
@@ -208,11 +209,11 @@ def main(chosen: Namespace) -> common.Answer:
         shown = scan(folder)
         result["voxels alone"] = measure(shown.astype(np.float64))
         print(f"voxels alone: {result['voxels alone']['reading']}")
-        result["references under one reading, start from the other"] = references(
-            shown, chosen.size, probe_geometry.NOISE, chosen.seed
-        )
-        for name, row in result["references under one reading, start from the other"].items():
-            print(f"references as {name}: worst error {row['worst']:.3%} after {row['steps']} steps")
+        if chosen.references:
+            found = references(shown, chosen.size, probe_geometry.NOISE, chosen.seed)
+            result["references under one reading, start from the other"] = found
+            for name, row in found.items():
+                print(f"references as {name}: worst error {row['worst']:.3%} after {row['steps']} steps")
     return result, partial(draw, result, slices_of(shown))
 
 
