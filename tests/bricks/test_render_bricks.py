@@ -399,9 +399,43 @@ def test_under_jit_it_says_what_to_do():
         jax.vmap(image)(TRANSFER.extinction[None])
 
 
-def test_bricks_are_numbered_and_ordered_from_the_eye():
+def test_bricks_are_numbered_along_the_axes():
     grid = BrickGrid((9, 17, 5), (4, 8, 3))
     assert grid.counts == (2, 2, 2)
     assert grid.cells(7) == ((4, 8, 3), (8, 16, 4))
     x, y, z = (jnp.asarray(c) for c in ([0.0, 4.0, 8.0, -1], [7.9, 8.0, 16.0, 99], [2.9, 3.0, 4.0, 0]))
     assert grid.brick_of((x, y, z)).tolist() == [0, 7, 7, 2]
+
+
+DIRECTIONS = [(-1, 0, -1), (0.3, 0, 0.95), (-0.3, 0, -0.95), (0.2, -0.7, 0.4), (1e-3, 1, -1e-3), (0, 0, 1)]
+
+
+@pytest.mark.parametrize("parallel", [True, False])
+@pytest.mark.parametrize("distance", [0.4, 100.0, 3e7])
+@pytest.mark.parametrize("spacing", [1e-6, 1.0, 1e7])
+def test_no_ray_meets_a_brick_after_one_that_is_behind_it(spacing, distance, parallel):
+    """`distance` of the eye from the middle, in voxels. Rays of a parallel camera all run along its axis; of
+    the others, one to each corner of a brick is followed by its brick at 400 points."""
+    volume = jv.Volume(np.zeros((33, 33, 33), np.uint8), (spacing, spacing, 2 * spacing))
+    grid, space = BrickGrid(volume.shape, (16, 11, 20)), jv.March(1.0).locate(volume)
+    middle = np.asarray(volume.center, float)
+    for direction in DIRECTIONS:
+        forward = np.asarray(direction) / np.linalg.norm(direction)
+        eye = middle - distance * spacing * forward
+        scale = {"parallel_scale": 20.0 * spacing} if parallel else {}
+        camera = jv.Camera(eye, middle, (0.1, 1, 0.2), size=(8, 8), **scale)
+        place = np.argsort(grid.order(space, camera))
+        assert sorted(place) == list(range(grid.number))
+        nodes = np.stack(np.meshgrid(*np.linspace(0.5, 31.5, 4)[None].repeat(3, 0)), -1).reshape(-1, 3)
+        if parallel:
+            toward = np.broadcast_to(forward / (1, 1, 2), nodes.shape)
+        else:
+            toward = nodes - eye / (spacing, spacing, 2 * spacing)
+        along = np.linspace(-40, 40, 400)[:, None, None] * toward / np.linalg.norm(toward, axis=-1)[:, None]
+        points = nodes + along
+        ahead = np.sum((points - eye / (spacing, spacing, 2 * spacing)) * toward, -1) > 0
+        inside = np.all((points > 0) & (points < 32), -1) & (ahead | parallel)
+        bricks = np.asarray(grid.brick_of(tuple(jnp.asarray(c) for c in np.moveaxis(points, -1, 0))))
+        for ray in range(len(nodes)):
+            met = place[bricks[inside[:, ray], ray]]
+            assert np.all(np.diff(met) >= 0)
