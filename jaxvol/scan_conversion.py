@@ -13,15 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, integer, is_traced, require
+from ._util.files import MOST_VOXELS
 from ._util.memory import require_room
 from ._util.vec3 import Scalar, apart
 from ._util.voxels import DTYPES
 from .march import March
 from .transforms import ToroidalMap
 from .volume import Volume
-
-
-MOST_NODES = 2**31 - 1
 
 
 def scan_convert(
@@ -172,13 +170,13 @@ def _grid(
         low, high = (np.asarray(corner, np.float64) for corner in probe.corners)
         # a sector that is a whole number of spacings wide gets no further node from rounding
         wide = np.ceil((high - low) / np.asarray(spacing, np.float64) - 1e-4)
-        nx, ny, nz = (int(min(n, MOST_NODES)) + 1 for n in np.maximum(wide, 1))
+        nx, ny, nz = (int(min(n, MOST_VOXELS)) + 1 for n in np.maximum(wide, 1))
     else:
         if not isinstance(shape, tuple | list) or len(shape) != 3:
             raise ValueError(f"shape must be three numbers of nodes, along x, y and z; got {shape!r}.")
         nx, ny, nz = (integer("shape", n, 2) for n in shape)
     nodes = nx, ny, nz
-    if math.prod(nodes) > MOST_NODES:
+    if math.prod(nodes) > MOST_VOXELS:
         raise ValueError(
             "spacing must be so wide, or shape so small, that the grid has fewer than 2**31 nodes; got "
             f"{nodes}."

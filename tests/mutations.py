@@ -201,8 +201,8 @@ MUTATIONS = [
     Mutation(
         "bricks: nothing is read around them but what interpolation needs",
         "bricks/split.py",
-        "math.ceil(steps * d) + around",
-        "math.ceil(0 * d) + around",
+        "x, y, z = far + ",
+        "x, y, z = 0 * far + ",
         ("bricks/test_render_bricks.py::test_every_way_to_render_bricks_looks_like_the_whole[residual]",),
     ),
     Mutation(
