@@ -3,23 +3,19 @@
 import math
 from functools import cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import BrickGrid, Summary, source_of
-from jaxvol.bricks.ranges import Turn
+from jaxvol.bricks import Summary, source_of
 from jaxvol.bricks.render import _scene_of
 from jaxvol.bricks.split import Margin, nodes_within, split, stored_of
-from jaxvol.bricks.stream import Stream, _curved
+from jaxvol.bricks.stream import Stream
 from jaxvol.engine.image import RenderOptions
-from jaxvol.engine.parts import set_out
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import ScattererTemplates
 
-from ..scenes import in_float64
 from .test_render_bricks import SIDE, SUN, TRANSFER, assert_same, fog
 
 
