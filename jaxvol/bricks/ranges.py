@@ -151,7 +151,7 @@ def of_curved(
             lambda index: index.astype(rays.length.dtype) * march.step < rays.length + march.step
         )(index)
 
-    number = jnp.arange(CHUNK)[:, None, None]
+    number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
     def while_in(allowed: Bool[Array, " bricks"], index: Array, going: Array) -> tuple[Array, Array]:
         """Moves rays on while they are in these bricks; and the index behind the last cell on the way that

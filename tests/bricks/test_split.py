@@ -3,19 +3,23 @@
 import math
 from functools import cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import Summary, source_of
+from jaxvol.bricks import BrickGrid, Summary, source_of
+from jaxvol.bricks.ranges import Turn
 from jaxvol.bricks.render import _scene_of
 from jaxvol.bricks.split import Margin, nodes_within, split, stored_of
-from jaxvol.bricks.stream import Stream
+from jaxvol.bricks.stream import Stream, _curved
 from jaxvol.engine.image import RenderOptions
+from jaxvol.engine.parts import set_out
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import ScattererTemplates
 
+from ..scenes import in_float64
 from .test_render_bricks import SIDE, SUN, TRANSFER, assert_same, fog
 
 
@@ -144,3 +148,28 @@ def test_less_memory_than_a_brick_at_the_apex_takes_is_named():
     march = jv.March(1.0, (near_apex(), jv.Jitter(0)))
     with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
         jv.render_bricks(np.asarray(volume.data), transfer, SIDE, march, memory=150_000)
+
+
+# ---- cells of curved rays ----
+
+
+def cells_of_fog(march, brick=0):
+    """The cells of an image's rays in a brick of the fog, at the beginning of a march."""
+    volume, _, transfer = fog()
+    place = np.ones(3, volume.spacing.dtype), np.zeros(3, volume.spacing.dtype)
+    options = RenderOptions("all", Tiling.of_backend(None))
+    scene = _scene_of(source_of(np.asarray(volume.data)), place, transfer, SIDE, march, "over", None)
+    underway = set_out(scene, options)
+    grid, empty = BrickGrid(volume.shape, (39, 47, 16)), jnp.zeros(5, bool).at[4].set(True)
+    turn = Turn(jnp.asarray(brick, jnp.int32), empty, empty.at[brick].set(True), empty)
+    reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
+    return _curved(None, grid, 11, march, underway.rays, underway.at, reached, turn)
+
+
+def test_cells_of_curved_rays_are_found_under_64_bits():
+    """Traced only: a loop whose state changes its type is an error then."""
+    with in_float64():
+        _, probe, _ = fog()
+        found = jax.eval_shape(lambda step: cells_of_fog(jv.March(step, (probe,))), jnp.ones(()))
+    assert found.cells.until.dtype == np.int32
+    assert found.low.dtype == np.float64
