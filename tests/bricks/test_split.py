@@ -173,3 +173,11 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
         found = jax.eval_shape(lambda step: cells_of_fog(jv.March(step, (probe,))), jnp.ones(()))
     assert found.cells.until.dtype == np.int32
     assert found.low.dtype == np.float64
+
+
+def test_no_cells_are_looked_for_behind_the_last_sample_of_a_ray():
+    """A ray of 10**6 steps has 16 samples at the most, which end in the first few bricks."""
+    _, probe, _ = fog()
+    found = cells_of_fog(jv.March(1e-4, (probe,), max_samples=16), brick=3)
+    assert bool(found.any)
+    assert 1 <= int(jnp.max(found.cells.until)) <= 16
