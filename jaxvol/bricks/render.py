@@ -34,7 +34,7 @@ from ..modes import Mode, compositing_of
 from ..rendering import Details, Rendering
 from ..selection import Selection
 from ..transfer import Transfer
-from ..transforms import SpaceLeaping
+from ..transforms import SpaceLeaping, ToroidalMap
 from ..volume import Volume, part_of
 from .detail import level_for
 from .grid import is_straight
@@ -99,7 +99,8 @@ def render_bricks(
       (`Lighting.farthest_read`).
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
       are no larger than a pixel; or, with a `tolerance`, whose error by ranges of values stays below that
-      (`bricks.level_for`).
+      (`bricks.level_for`). Under a `ToroidalMap` it is the finest, 0: its ranges are those of the finest
+      level's nodes, and the nodes of the others lie elsewhere.
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
       first image; see `bricks.summary_of`.
     - `progress`: called with the numbers of bricks read and of those that hold anything visible.
@@ -140,7 +141,7 @@ def render_bricks(
     mesh = mesh_of(devices)
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
-    chosen = _level(levels, level, camera, transfer, tolerance, cache)
+    chosen = _level(levels, level, camera, transfer, march, tolerance, cache)
     place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
     if len(known) < 2:
         if len(levels) > 1:
@@ -338,12 +339,19 @@ def _level(
     level: int | Literal["auto"] | Any,
     camera: Camera,
     transfer: Transfer,
+    march: March,
     tolerance: float | None,
     cache: Any,
 ) -> VoxelSource:
+    mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
     if level != "auto":
-        return levels[integer("level", level, 0, len(levels) - 1)]
-    if len(levels) == 1:
+        chosen = integer("level", level, 0, len(levels) - 1)
+        if mapped and chosen:
+            raise ValueError(
+                f"level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got {level}."
+            )
+        return levels[chosen]
+    if len(levels) == 1 or mapped:
         return levels[0]
     if is_traced(camera, transfer):
         raise ValueError(
