@@ -87,7 +87,8 @@ class FileSource(VoxelSource):
 
     def fingerprint(self) -> dict[str, Any] | None:
         """Path, size and times of the file, a checksum of pieces of it, and where its voxels lie. The times
-        alone may miss a change within a tick of the system's clock; a file of up to 256 KiB is read whole."""
+        alone may miss a change within a tick of the system's clock, or through a memory map that was not
+        written back; a file of up to 256 KiB is read whole."""
         if self._writable:
             return None
         with self._opened() as file:

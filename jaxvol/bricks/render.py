@@ -125,7 +125,8 @@ def render_bricks(
     or `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
-    unknown; for less memory than the smallest bricks take; for what needs the whole volume at once (labels,
+    unknown; for voxels outside of the ranges of values found before, which tell that it changed; for less
+    memory than the smallest bricks take; for what needs the whole volume at once (labels,
     baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written but the
     cache, which appears whole or not at all.
 
@@ -348,7 +349,8 @@ def _level(
         chosen = integer("level", level, 0, len(levels) - 1)
         if mapped and chosen:
             raise ValueError(
-                f"level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got {level}."
+                "level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got "
+                f"{level}."
             )
         return levels[chosen]
     if len(levels) == 1 or mapped:

@@ -26,7 +26,7 @@ from ..transforms import ToroidalMap
 from ..volume import Volume, part_of
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
-from .sources import VoxelSource
+from .sources import VoxelSource, in_background
 from .split import Margin, bytes_of, check_part, fits, split, stored_of, stored_shape
 from .summary import Summary
 
@@ -63,6 +63,7 @@ class Stream:
     """
 
     source: VoxelSource
+    summary: Summary
     scene: Scene
     options: RenderOptions
     space: Space
@@ -115,7 +116,20 @@ class Stream:
         assert isinstance(marched.source, Camera)
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
         return cls(
-            *(source, marched, options, space, grid, margin, order, visible, straight, alone, stored),
+            *(
+                source,
+                summary,
+                marched,
+                options,
+                space,
+                grid,
+                margin,
+                order,
+                visible,
+                straight,
+                alone,
+                stored,
+            ),
             *(max(memory, bytes_of(alone, source.dtype, margin)), method, progress),
         )
 
@@ -277,7 +291,20 @@ class Stream:
         x, y, z = first.tolist()
         self.loads.append(brick)
         self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
-        return (x, y, z), self.source.read_async(first, first + stored)
+        return (x, y, z), in_background(self._read, first, first + stored)
+
+    def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """The voxels of a box, whose range tells whether they are those of the summary."""
+        voxels = self.source.read(low, high)
+        least, most = self.summary.range_of(low, high)
+        if float(voxels.min()) < least or float(voxels.max()) > most:
+            raise ValueError(
+                f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
+                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now "
+                f"{voxels.min()} to {voxels.max()}. Delete the file of ranges beside it (`cache`), or pass "
+                "cache=None, and open it again."
+            )
+        return voxels
 
 
 def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:

@@ -244,5 +244,5 @@ def test_under_a_toroidal_map_the_level_is_the_finest(tmp_path):
     assert _level(*given, jv.March(1.0), None, None).shape == (16, 16, 16)
     assert _level(*given, march, None, None).shape == (64, 64, 64)
     assert _level(*given, march, 0.5, None).shape == (64, 64, 64)
-    with pytest.raises(ValueError, match="level must be 0 under a ToroidalMap.*got 1"):
+    with pytest.raises(ValueError, match=r"level must be 0 under a ToroidalMap.*got 1"):
         jv.render_bricks(tmp_path, transfer(), far, march, level=1)

@@ -10,8 +10,9 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, Summary, source_of
+from jaxvol.bricks.files import FileSource
 from jaxvol.bricks.ranges import Turn
-from jaxvol.bricks.render import _scene_of
+from jaxvol.bricks.render import _scene_of, bricks_of
 from jaxvol.bricks.split import Margin, nodes_within, split, stored_of
 from jaxvol.bricks.stream import Stream, _curved
 from jaxvol.engine.image import RenderOptions
@@ -148,6 +149,28 @@ def test_less_memory_than_a_brick_at_the_apex_takes_is_named():
     march = jv.March(1.0, (near_apex(), jv.Jitter(0)))
     with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
         jv.render_bricks(np.asarray(volume.data), transfer, SIDE, march, memory=150_000)
+
+
+# ---- what is read ----
+
+
+@pytest.mark.parametrize("value", [0, 250])
+def test_voxels_outside_of_the_ranges_found_before_are_refused(value, tmp_path, monkeypatch):
+    """As where a file changes within a tick of the clock: its fingerprint is the same."""
+    data = np.full((41, 35, 50), 100, np.uint8)
+    monkeypatch.setattr(FileSource, "fingerprint", lambda _: {"same": 1})
+    path, march = tmp_path / "a.npy", jv.March(1.0)
+
+    def read():
+        stream = bricks_of(source_of(path), TRANSFER, SIDE, march, memory=10**6)
+        return stream.read(0, *stream.around(0))[1].result()
+
+    np.save(path, data)
+    np.testing.assert_array_equal(read(), data)
+    data[20, 20, 20] = value
+    np.save(path, data)
+    with pytest.raises(ValueError, match=rf"a.npy changed since the ranges.* 100\.0 to 100\.0 .*{value}"):
+        read()
 
 
 # ---- cells of curved rays ----
