@@ -76,7 +76,9 @@ def render_bricks(
     The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
     is read. Of each ray it is kept how far it has come. A brick that no ray needs is not read: one in which
     nothing is visible, outside of the view, or behind what is opaque. The image is that of `render`, to
-    2e-5 in float32, whatever the bricks.
+    2e-5 in float32, whatever the bricks, and so are depth and normal; `samples` may be others, since what is
+    empty is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray whose last
+    samples would lie in empty bricks is not exhausted here.
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
