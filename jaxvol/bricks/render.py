@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._util.checks import Arrayable, described, integer, is_traced
+from .._util.checks import Arrayable, described, integer, is_traced, number
 from .._util.memory import memory_of_device
 from .._util.trees import PyTree, strong
 from .._util.xla import compiled
@@ -141,6 +141,8 @@ def render_bricks(
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     _check(march, transfer, lighting, method, outputs, own)
+    if tolerance is not None:
+        number("tolerance", tolerance, above=0, below=1)
     mesh = mesh_of(devices)
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
@@ -382,7 +384,7 @@ def _check(
     march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any, own: Any
 ) -> None:
     for name, given, known in (("method", method, Method), ("outputs", outputs, Asked), ("own", own, Own)):
-        if given not in get_args(known):
+        if not isinstance(given, str) or given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
     if isinstance(transfer, LabelTransferFunction):
         raise ValueError(

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from .._util.checks import Arrayable
+from .._util.checks import Arrayable, is_traced
 from .._util.voxels import check_shape, given_array
 from ..volume import Volume
 from .dtypes import Box, converted, voxel_type
@@ -112,7 +112,7 @@ class VoxelSource(ABC):
 class ArraySource(VoxelSource):
     """Voxels of an array in memory, data[x, y, z], of any memory layout. It is not copied.
 
-    **Raises:** `ValueError` for arrays of a shape or type that no volume has.
+    **Raises:** `ValueError` for arrays of a shape or type that no volume has, and for traced ones.
     """
 
     def __init__(
@@ -121,6 +121,7 @@ class ArraySource(VoxelSource):
         spacing: tuple[float, float, float] | None = None,
         origin: tuple[float, float, float] | None = None,
     ):
+        check_known(data)
         array = given_array("data", data)
         check_shape(array.shape)
         self._data = np.asarray(array)
@@ -148,10 +149,21 @@ def empty_box(low: Corner, high: Corner, dtype: np.dtype) -> np.ndarray:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
+def check_known(thing: Any) -> None:
+    """**Raises** `ValueError` for traced voxels, spacing or origin."""
+    if is_traced(thing):
+        raise ValueError(
+            "source must not be traced, since it is read while an image is made: there are no gradients to "
+            "voxels by bricks (jv.render has them), and none inside jax.jit and jax.vmap. For gradients to "
+            "spacing and origin, pass these to render_bricks, beside an array."
+        )
+
+
 def array_of(volume: Volume) -> ArraySource:
     """The voxels of a `Volume`.
 
-    **Raises:** `ValueError` for one with labels or a field, which are not voxels."""
+    **Raises:** `ValueError` for one with labels or a field, which are not voxels, and for a traced one."""
+    check_known(volume)
     for part in ("labels", "field"):
         if getattr(volume, part) is not None:
             raise ValueError(

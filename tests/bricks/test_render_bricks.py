@@ -362,6 +362,9 @@ LABELLED = jv.LabelTransferFunction({1: TRANSFER})
         ({"memory": -1}, "memory must be an integer of at least 1; got -1"),
         ({"bricks": (2, 2)}, "bricks must be three numbers"),
         ({"bricks": (0, 1, 1)}, "bricks must be an integer of at least 1; got 0"),
+        ({"method": np.array(["overlap", "reload"])}, "method must be one of overlap, reload, naive"),
+        ({"tolerance": "x"}, "tolerance must be"),
+        ({"tolerance": -5.0, "level": 0}, "tolerance must be"),
         ({"method": "fast"}, "method must be one of overlap, reload, naive; got 'fast'"),
         ({"outputs": "depth"}, "outputs must be one of all, rgba"),
         ({"source": "no_such.raw"}, "no_such.raw"),
@@ -397,6 +400,19 @@ def test_under_jit_it_says_what_to_do():
         jax.jit(image)(TRANSFER.extinction)
     with pytest.raises(ValueError, match=r"not inside jax\.jit, jax\.vmap"):
         jax.vmap(image)(TRANSFER.extinction[None])
+
+
+def test_a_gradient_to_the_source_says_what_to_do():
+    data, camera = balls().astype(np.float32), outside(jv.Volume(balls()), 16)
+
+    def image(source):
+        return jnp.sum(jv.render_bricks(source, TRANSFER, camera, jv.March(1.0)).rgba)
+
+    for given in (image, lambda data: image(jv.Volume(data))):
+        with pytest.raises(ValueError, match=r"source must not be traced.*no gradients to voxels"):
+            jax.grad(given)(jnp.asarray(data))
+    with pytest.raises(ValueError, match=r"source must not be traced.*gradients to spacing"):
+        jax.grad(lambda spacing: image(jv.Volume(data, spacing)))(jnp.ones(3))
 
 
 def test_bricks_are_numbered_along_the_axes():
