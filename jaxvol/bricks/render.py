@@ -105,7 +105,9 @@ def render_bricks(
       level's nodes, and the nodes of the others lie elsewhere.
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
       first image; see `bricks.summary_of`.
-    - `progress`: called with the numbers of bricks read and of those that hold anything visible.
+    - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
+      anything visible. The former may end below the latter, where bricks are not needed, or above it, where
+      they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
     - `devices`: as for `render`. `memory` is that of each device.
     - `own`: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
       is read once (in each process) and copied to all. It is exact for everything that one device renders,

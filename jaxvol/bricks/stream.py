@@ -58,6 +58,7 @@ class Stream:
     - `scene`: with a volume without its voxels.
     - `visible`: for each brick, whether anything may be visible in it.
     - `straight`: whether rays are straight in the grid.
+    - `done`: bricks that were rendered. `loads`: those whose reading has begun.
     - `stored`: nodes along each axis that are read at a time. `alone`: as many suffice for each brick without
       the bricks that had their turn before. `memory`: bytes that these may take.
     """
@@ -77,6 +78,7 @@ class Stream:
     memory: int
     method: Method
     progress: Callable[[int, int], Any] | None = None
+    done: int = 0
     loads: list[int] = field(default_factory=list)
     bytes_read: int = 0
 
@@ -157,10 +159,15 @@ class Stream:
             state = march(part, cells, state)
             del part, cells
             living[0] = where(state)
-            if self.progress is not None:
-                self.progress(len(self.loads), int(self.visible.sum()))
+            self.finish(1, int(self.visible.sum()))
             load = following
         return state
+
+    def finish(self, bricks: int, of: int) -> None:
+        """Says that so many more bricks are rendered, `of` all that hold anything visible."""
+        self.done += bricks
+        if self.progress is not None:
+            self.progress(self.done, of)
 
     def report(self) -> BrickReport:
         """What all passes so far took."""
