@@ -104,7 +104,8 @@ def render_bricks(
       (`bricks.level_for`). Under a `ToroidalMap` it is the finest, 0: its ranges are those of the finest
       level's nodes, and the nodes of the others lie elsewhere.
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
-      first image; see `bricks.summary_of`.
+      first image; see `bricks.summary_of`. With `tolerance` it is over all levels. What nobody knows to be
+      unchanged, an array or a memory map open for writing, has it in each image.
     - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
       anything visible. The former may end below the latter, where bricks are not needed, or above it, where
       they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
@@ -148,7 +149,8 @@ def render_bricks(
     mesh = mesh_of(devices)
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
-    chosen = _level(levels, level, camera, transfer, march, tolerance, cache)
+    room = budget(memory)
+    chosen = _level(levels, level, camera, transfer, march, tolerance, room, cache)
     place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
     if len(known) < 2:
         if len(levels) > 1:
@@ -160,7 +162,7 @@ def render_bricks(
     scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting)
     check_not_sharded(mesh, scene)
     scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
-    job = _Job(chosen, budget(memory), _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
+    job = _Job(chosen, room, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
     if owned:
         _check_owned(scene, method)
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
@@ -242,8 +244,11 @@ class _Job:
 
     def stream(self, marched: Scene, shown: Scene, options: RenderOptions) -> Stream:
         """The bricks of a scene, as rays are marched, and as they are shown."""
-        cell = CELL if min(self.source.shape) > CELL else 4
-        summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
+        if self.streams:  # the second march of a gradient
+            summary = self.streams[0].summary
+        else:
+            cell = CELL if min(self.source.shape) > CELL else 4
+            summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
         where = self.memory, self.counts, self.method, self.progress
         least = number_of(self.devices) if self.owned else 1
         stream = Stream.of(self.source, summary, marched, shown, options, *where, least)
@@ -348,6 +353,7 @@ def _level(
     transfer: Transfer,
     march: March,
     tolerance: float | None,
+    memory: int,
     cache: Any,
 ) -> VoxelSource:
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
@@ -366,7 +372,9 @@ def _level(
             f"level must be one of 0 to {len(levels) - 1} where gradients are taken; got 'auto', which "
             "depends on what is differentiated."
         )
-    summaries = [summary_of(each, CELL, cache=cache) for each in levels] if tolerance is not None else None
+    summaries = None
+    if tolerance is not None:
+        summaries = [summary_of(each, CELL, memory=memory, cache=cache) for each in levels]
     return levels[level_for(levels, camera, transfer, summaries, tolerance=tolerance)]
 
 

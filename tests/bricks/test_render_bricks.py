@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import BrickGrid, VoxelSource, source_of
+from jaxvol.bricks import BrickGrid, VoxelSource, source_of, summary_files
 from jaxvol.bricks.stream import Stream
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 from jaxvol.occupancy import BLOCK
@@ -300,6 +300,25 @@ def test_gradients_through_bricks_are_those_of_the_whole(transforms, lighting):
     assert len(leaves) > 5
     for a, b in zip(leaves, jax.tree.leaves(found), strict=True):
         assert np.linalg.norm(a - b) <= 1e-5 * max(np.linalg.norm(a), 1e-3)
+
+
+def test_the_second_march_of_a_gradient_has_the_ranges_of_the_first(monkeypatch):
+    data, size, passes = balls(), 16, []
+    camera, march = outside(jv.Volume(data), size), jv.March(1.0, (jv.SpaceLeaping(),))
+    scan = summary_files.scan
+
+    def counted(*given, **more):
+        passes.append(given)
+        return scan(*given, **more)
+
+    monkeypatch.setattr(summary_files, "scan", counted)
+
+    def loss(extinction):
+        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
+        return jnp.sum(jv.render_bricks(data, transfer, camera, march, bricks=(2, 1, 2)).rgba[..., 3])
+
+    assert np.any(jax.grad(loss)(jnp.asarray([0.0, 0.02, 0.5])))
+    assert len(passes) == 1
 
 
 def test_the_gradient_by_an_extinction_agrees_with_differences():
