@@ -7,7 +7,7 @@ all, and whoever finds it damaged makes it anew.
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 import warnings
 import zipfile
 from pathlib import Path
@@ -99,9 +99,10 @@ def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> 
     }
     arrays["about"] = told
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, part = tempfile.mkstemp(prefix=f"{path.name}.", suffix=".part", dir=path.parent)
+    # not by tempfile, whose files nobody else may read
+    part = path.with_name(f"{path.name}.{secrets.token_hex(8)}.part")
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with part.open("xb") as file:
             with zipfile.ZipFile(file, "w") as archive:
                 for name, array in arrays.items():
                     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -110,7 +111,7 @@ def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> 
             os.fsync(file.fileno())
         os.replace(part, path)
     except BaseException:
-        os.unlink(part)
+        part.unlink(missing_ok=True)
         raise
 
 

@@ -266,6 +266,17 @@ def test_a_finished_pass_is_not_repeated(dtype, tmp_path, reads):
     assert len(summary_files_in(tmp_path)) == 2
 
 
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_others_may_read_the_file_as_far_as_they_may_read_new_files(mask, tmp_path):
+    before = os.umask(mask)
+    try:
+        summary_of(data_file(tmp_path, voxels("uint8", SHAPE)))
+    finally:
+        os.umask(before)
+    [path] = tmp_path.glob("*.npz")
+    assert path.stat().st_mode & 0o777 == 0o666 & ~mask
+
+
 def test_bfloat16_survives_the_file(tmp_path, reads):
     data = voxels("bfloat16", SHAPE)
     import tensorstore
