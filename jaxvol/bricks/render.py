@@ -90,8 +90,9 @@ def render_bricks(
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
       them an image takes some 550 bytes for each pixel, and compiled programs some 300 MiB. By default a
       quarter of the device's memory.
-    - `bricks`: number of bricks along x, y and z, in place of as few as fit into `memory`. A toroidal volume
-      is split across σ first.
+    - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory`, of which there is
+      one more along their longest axis until they do. There are fewer along an axis of too few voxels. What
+      these bricks take may exceed `memory`.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
       fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
