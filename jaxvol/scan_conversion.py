@@ -55,7 +55,8 @@ def scan_convert(
     **Returns:** a `Volume` with its spacing and origin. A grid node within rounding of a face counts as
     inside.
 
-    Beside the result, memory is taken for one plane of nodes at a time. Differentiable with respect to float
+    Beside the result, the device's memory is taken for one plane of nodes at a time; and for a result of
+    floats, that of the host for 5 bytes a node at the most, while it is seen to be finite. Differentiable with respect to float
     voxels and to the probe. For the probe, the grid must be given (`spacing`, `shape` and `origin`), since
     its size cannot depend on traced values; where a node crosses a face its value jumps, which the gradient
     does not see.
