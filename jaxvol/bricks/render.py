@@ -88,8 +88,10 @@ def render_bricks(
       `dtype` of a raw file, and `axes`, `index` and `missing` of a Zarr array).
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
-      them an image takes some 550 bytes for each pixel, and compiled programs some 300 MiB. By default a
-      quarter of the device's memory.
+      them an image takes some 550 bytes for each pixel, compiled programs some 300 MiB, the ranges of values
+      2 / 16³ of the voxels, and Zarr 16 MiB of decoded chunks for each level that is read. By default a
+      quarter of the device's memory. Where rays are curved in the grid, more may be read of a later brick
+      than of those before, which compiles programs again.
     - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory`, of which there is
       one more along their longest axis until they do. There are fewer along an axis of too few voxels. What
       these bricks take may exceed `memory`.
