@@ -191,7 +191,7 @@ def bricks_of(
     cache: Any = "beside",
 ) -> Stream:
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
-    _check(march, transfer, lighting, "overlap", "all")
+    _check(march, transfer, lighting, "overlap", "all", "rays")
     place = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
     scene = _scene_of(source, place, transfer, camera, march, compositing, lighting)
     marched = _marched(scene)
