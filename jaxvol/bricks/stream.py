@@ -280,8 +280,8 @@ class Stream:
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
         wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
         x, y, z = map(max, wanted, self.stored)
-        largest = tuple(map(max, (x, y, z), self.alone))
-        if not fits(largest, self.source.dtype, self.margin, self.memory):
+        nx, ny, nz = map(max, (x, y, z), self.alone)
+        if not fits((nx, ny, nz), self.source.dtype, self.margin, self.memory):
             return False
         self.stored = x, y, z
         return True

@@ -90,7 +90,8 @@ def test_light_is_looked_for_among_more_nodes_near_the_apex():
     march = jv.March(0.5, (probe,))
     scene = _scene_of(source, ((1, 1, 1), (0, 0, 0)), TRANSFER, SIDE, march, "over", lighting)
     margin = Margin.of(march, space, SHAPE, 8, scene)
-    assert margin.light == lighting.farthest_read > 0
+    assert margin.light == lighting.farthest_read
+    assert margin.light > 0
     apex, far = (
         margin.of_points(space, SHAPE, np.array(at), np.array(at)) for at in ((20, 24, 0), (20, 24, 60))
     )
