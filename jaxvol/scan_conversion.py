@@ -13,15 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, integer, is_traced, require
+from ._util.files import MOST_VOXELS
 from ._util.memory import require_room
 from ._util.vec3 import Scalar, apart
 from ._util.voxels import DTYPES
 from .march import March
 from .transforms import ToroidalMap
 from .volume import Volume
-
-
-MOST_NODES = 2**31 - 1
 
 
 def scan_convert(
@@ -52,19 +50,22 @@ def scan_convert(
     - `shape`, `origin`: number of nodes along x, y, z, at least 2, and the world position of the first node;
       by default those of the grid that just encloses the sector, centered on it.
     - `fill_value`: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
-    - `dtype`: type of the voxels; by default the volume's own. Integers are rounded.
+    - `dtype`: type of the voxels; by default the volume's own. Values are rounded to integers, and become
+      the least or greatest one of the type where they lie beyond it.
 
     **Returns:** a `Volume` with its spacing and origin. A grid node within rounding of a face counts as
     inside.
 
-    Beside the result, memory is taken for one plane of nodes at a time. Differentiable with respect to float
-    voxels and to the probe. For the probe, the grid must be given (`spacing`, `shape` and `origin`), since
-    its size cannot depend on traced values; where a node crosses a face its value jumps, which the gradient
-    does not see.
+    Beside the result, memory is taken for one plane of nodes at a time; and then on the host, where a result
+    of floats is checked to be finite, for as much as it takes itself and a byte a node.
+
+    Differentiable with respect to float voxels and to the probe. For the probe, the grid must be given
+    (`spacing`, `shape` and `origin`), since its size cannot depend on traced values; where a node crosses a
+    face its value jumps, which the gradient does not see.
 
     **Raises:** `ValueError` for arguments of other kinds, a spacing that is not positive, a grid of 2**31
-    nodes or more or larger than the device's memory, a type that voxels cannot have, and a `fill_value` that
-    the type does not hold.
+    nodes or more or larger than the device's memory, a type that voxels cannot have, values that are
+    infinite in it (float16 ends at 65504), and a `fill_value` that the type does not hold.
     """
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a Volume; got {described(volume)}.")
@@ -107,7 +108,9 @@ def _resampled(
         for c, n, more in zip(at, volume.shape, slack, strict=True):
             inside = inside & (c >= -more) & (c <= n - 1 + more)
         value = jnp.where(inside, volume.value(at), fill)
-        value = jnp.rint(value) if dtype.kind in "ui" else value
+        if dtype.kind in "ui":
+            limits = jnp.iinfo(dtype)
+            value = jnp.clip(jnp.rint(value), limits.min, limits.max)
         if volume.labels is None:
             return value.astype(dtype), None
         return value.astype(dtype), jnp.where(inside, volume.label(at), 0).astype(volume.labels.dtype)
@@ -172,13 +175,13 @@ def _grid(
         low, high = (np.asarray(corner, np.float64) for corner in probe.corners)
         # a sector that is a whole number of spacings wide gets no further node from rounding
         wide = np.ceil((high - low) / np.asarray(spacing, np.float64) - 1e-4)
-        nx, ny, nz = (int(min(n, MOST_NODES)) + 1 for n in np.maximum(wide, 1))
+        nx, ny, nz = (int(min(n, MOST_VOXELS)) + 1 for n in np.maximum(wide, 1))
     else:
         if not isinstance(shape, tuple | list) or len(shape) != 3:
             raise ValueError(f"shape must be three numbers of nodes, along x, y and z; got {shape!r}.")
         nx, ny, nz = (integer("shape", n, 2) for n in shape)
     nodes = nx, ny, nz
-    if math.prod(nodes) > MOST_NODES:
+    if math.prod(nodes) > MOST_VOXELS:
         raise ValueError(
             "spacing must be so wide, or shape so small, that the grid has fewer than 2**31 nodes; got "
             f"{nodes}."

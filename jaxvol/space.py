@@ -67,6 +67,11 @@ class Space(eqx.Module):
         """World point of a grid coordinate."""
 
     @abstractmethod
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        """Least world distance between neighbouring nodes along each axis, between two grid coordinates,
+        which may lie beyond the grid; 0 where nodes meet."""
+
+    @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         """World-space cells that may hold anything visible, from the visible blocks of the grid; or of a box
         of it that begins at the node `first`, where the volume is only a part of the grid."""
@@ -193,6 +198,9 @@ class Affine(Space):
     def point(self, coordinate: Vec3) -> Vec3:
         x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
         return x, y, z
+
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        return self.spacing
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         x, y, z = (BLOCK * step for step in self.spacing)

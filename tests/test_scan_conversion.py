@@ -62,6 +62,18 @@ def resampled(data, probe, grid):
     return np.where(outside <= 0, value, np.nan), np.abs(outside) < 1e-3
 
 
+def test_values_beyond_an_integer_type_become_its_ends():
+    data = np.broadcast_to(np.linspace(-3000, 3000, SHAPE[2]), SHAPE).astype(np.int16)
+    volume = jv.scan_convert(jv.Volume(data), jv.ToroidalMap(*PROBE), fill_value=7, dtype="uint8", **GRID)
+    expected, unsure = resampled(data, PROBE, GRID)
+    sure = np.isfinite(expected) & ~unsure
+    assert np.min(expected[sure]) < -1000
+    assert np.max(expected[sure]) > 1000
+    np.testing.assert_allclose(
+        np.asarray(volume.data, float)[sure], np.clip(expected[sure], 0, 255), rtol=0, atol=0.51
+    )
+
+
 @pytest.mark.parametrize("name", PROBES)
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float16", "float32"])
 def test_nodes_hold_what_scipy_interpolates_in_float64(name, dtype):

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .checks import Arrayable, described, finite, is_traced, require
+from .files import MOST_VOXELS
 
 
 DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
@@ -25,7 +26,7 @@ WHOLE = {
 def voxel_array(data: Arrayable) -> Array:
     data = given_array("data", data)
     check_shape(data.shape)
-    if data.size >= 2**31:
+    if data.size > MOST_VOXELS:
         raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
     if data.dtype.kind in "bui" and str(data.dtype) not in DTYPES:
         return jnp.asarray(_narrow(data))

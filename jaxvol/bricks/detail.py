@@ -88,7 +88,7 @@ def nearest_pixel(
         visible = np.ones((1, 1, 1), bool)
     else:
         edges = [_nodes(summary, axis) for axis in range(3)]
-        visible = np.asarray(transfer.visible(summary.blocks(spacing=source.spacing)))
+        visible = np.asarray(transfer.visible(summary.blocks()))
     edges = _in_world(source, edges)
     for normal, offset in shown.sides:
         visible = visible & (_greatest(normal, edges) + offset >= 0)

@@ -87,7 +87,8 @@ class FileSource(VoxelSource):
 
     def fingerprint(self) -> dict[str, Any] | None:
         """Path, size and times of the file, a checksum of pieces of it, and where its voxels lie. The times
-        alone may miss a change within a tick of the system's clock; a file of up to 256 KiB is read whole."""
+        alone may miss a change within a tick of the system's clock, or through a memory map that was not
+        written back; a file of up to 256 KiB is read whole."""
         if self._writable:
             return None
         with self._opened() as file:
@@ -105,6 +106,17 @@ class FileSource(VoxelSource):
             "pieces": digest.hexdigest(),
             "voxels": [self._type.str, self._start, *self.shape, *self._strides],
         }
+
+    def holds(self, array: np.ndarray) -> bool:
+        """Whether the file has these voxels, as far as samples of them tell."""
+        for piece in range(SAMPLES):
+            x, y, z = ((n - 1) * piece // (SAMPLES - 1) for n in self.shape)
+            nx, ny, nz = self.shape
+            low, high = (x, y, z), (min(x + 8, nx), min(y + 8, ny), min(z + 8, nz))
+            own, given = self._stored(low, high), array[tuple(map(slice, low, high))]
+            if own.tobytes() != given.astype(own.dtype).tobytes():
+                return False
+        return True
 
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
         order, size = self._order, self._type.itemsize
@@ -207,7 +219,8 @@ def mapped(
     origin: tuple[float, float, float] | None = None,
 ) -> FileSource | None:
     """The file under a memory map (`np.memmap`), or under a part or a transposed view of one; None for other
-    arrays, and those whose voxels lie in the file at odd distances or not at all."""
+    arrays, those whose voxels lie in the file at odd distances or not at all, and maps of which the file has
+    other voxels, since another one has taken its name: SAMPLES boxes along the diagonal are compared."""
     root: Any = array
     while isinstance(root, np.ndarray) and not isinstance(root.base, mmap.mmap):
         root = root.base
@@ -215,8 +228,9 @@ def mapped(
         return None
     if array.ndim != 3 or min(array.strides) != array.itemsize:
         return None
+    # a map has no name but the one under which its file was opened
     start = root.offset + array.__array_interface__["data"][0] - root.__array_interface__["data"][0]
-    return FileSource(
+    source = FileSource(
         Path(root.filename),
         array.dtype,
         array.shape,
@@ -226,6 +240,7 @@ def mapped(
         origin=origin,
         writable=root.mode != "r",
     )
+    return source if source.holds(array) else None
 
 
 def triple(name: str, value: Any) -> tuple[float, float, float] | None:

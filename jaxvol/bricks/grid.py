@@ -66,14 +66,14 @@ class BrickGrid:
         centers = (index + 0.5) * self.size
         eye, (_, _, forward) = camera.position, axes_of(camera)
         parallel = camera.parallel_scale is not None
-        if is_straight(space):
-            scale = np.asarray(self.size)
-            ends = (space.coordinate(apart(p)) for p in (eye, eye + forward))
-            own, ahead = (np.array([float(c) for c in end]) for end in ends)
+        path = space.path(apart(eye), apart(forward))
+        if isinstance(path, Straight):
+            # not from the coordinates of two points, which float32 rounds to the same ones far away
+            start, rate = (np.array([float(c) for c in part]) for part in (path.start, path.rate))
             if parallel:
-                depth = (centers / scale) @ np.sign(np.where(np.abs(ahead - own) < 1e-6, 0, ahead - own))
+                depth = index @ np.sign(rate)
             else:
-                depth = np.sum(np.abs(centers - own) / scale, axis=-1)
+                depth = np.sum(np.abs(centers - start) / self.size, axis=-1)
         else:
             x, y, z = (jnp.asarray(c) for c in np.minimum(centers, np.asarray(self.shape) - 1).T)
             toward = np.stack(

@@ -46,7 +46,7 @@ def levels_of(
       | | read |
       |---|---|
       | an array, data[x, y, z] | in place |
-      | a memory map (`np.memmap`) or a view of one | from its file, box by box |
+      | a memory map (`np.memmap`) or a view of one | from its file; in place if that was replaced |
       | path of a `.raw` file, x fastest | from the file, box by box; header as for `jv.load` |
       | path of a `.npy` file, data[x, y, z] | from the file, box by box |
       | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |

@@ -74,11 +74,10 @@ def render_owned(stream: Stream, mesh: Mesh) -> Rendering:
     turn = next(turns, None)
     while turn is not None:
         jax.block_until_ready(share)  # or two bricks, and what is made of both, would be in memory
-        placed = _placed(stream, mesh, turn)
+        placed, number = _placed(stream, mesh, turn), len(turn.reading)
         turn = next(turns, None)
         newest[0] = share = _march(mesh, grid, scene, options, share, *placed)
-        if stream.progress is not None:
-            stream.progress(len(stream.loads), int(wanted.sum()))
+        stream.finish(number, int(wanted.sum()))
     return _join(mesh, scene, options, share)
 
 

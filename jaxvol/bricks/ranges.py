@@ -114,7 +114,8 @@ def _within(
         high.append(jnp.where(i == count - 1, jnp.inf, ((i + 1) * size).astype(rays.length.dtype)))
     near, far = slab_interval(path.start, path.rate, (low[0], low[1], low[2]), (high[0], high[1], high[2]))
     hit = (near <= far) & (far >= 0) & (near < rays.length)
-    last = rays.length / march.step + 1  # clipped before it becomes an integer, whose range it may exceed
+    # clipped before it becomes an integer, whose range it may exceed; no march has 2**30 cells
+    last = jnp.minimum(rays.length / march.step + 1, 2.0**30)
     return jnp.clip(near / march.step, 0, last), jnp.clip(far / march.step, 0, last), hit
 
 
@@ -147,11 +148,10 @@ def of_curved(
         return jnp.where(inside, grid.brick_of(coordinate), grid.number)
 
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
-        return jax.vmap(
-            lambda index: index.astype(rays.length.dtype) * march.step < rays.length + march.step
-        )(index)
+        front = index.astype(rays.length.dtype) * march.step
+        return (front < (rays.length + march.step)[None]) & (index < march.most_samples)
 
-    number = jnp.arange(CHUNK)[:, None, None]
+    number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
     def while_in(allowed: Bool[Array, " bricks"], index: Array, going: Array) -> tuple[Array, Array]:
         """Moves rays on while they are in these bricks; and the index behind the last cell on the way that

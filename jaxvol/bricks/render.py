@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._util.checks import Arrayable, described, integer, is_traced
+from .._util.checks import Arrayable, described, integer, is_traced, number
 from .._util.memory import memory_of_device
 from .._util.trees import PyTree, strong
 from .._util.xla import compiled
@@ -34,7 +34,7 @@ from ..modes import Mode, compositing_of
 from ..rendering import Details, Rendering
 from ..selection import Selection
 from ..transfer import Transfer
-from ..transforms import SpaceLeaping
+from ..transforms import SpaceLeaping, ToroidalMap
 from ..volume import Volume, part_of
 from .detail import level_for
 from .grid import is_straight
@@ -76,7 +76,9 @@ def render_bricks(
     The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
     is read. Of each ray it is kept how far it has come. A brick that no ray needs is not read: one in which
     nothing is visible, outside of the view, or behind what is opaque. The image is that of `render`, to
-    2e-5 in float32, whatever the bricks.
+    2e-5 in float32, whatever the bricks, and so are depth and normal; `samples` may be others, since what is
+    empty is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray whose last
+    samples would lie in empty bricks is not exhausted here.
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
@@ -86,10 +88,13 @@ def render_bricks(
       `dtype` of a raw file, and `axes`, `index` and `missing` of a Zarr array).
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
-      them an image takes some 550 bytes for each pixel, and compiled programs some 300 MiB. By default a
-      quarter of the device's memory.
-    - `bricks`: number of bricks along x, y and z, in place of as few as fit into `memory`. A toroidal volume
-      is split across σ first.
+      them an image takes some 550 bytes for each pixel, compiled programs some 300 MiB, the ranges of values
+      2 / 16³ of the voxels, and Zarr 16 MiB of decoded chunks for each level that is read. By default a
+      quarter of the device's memory. Where rays are curved in the grid, more may be read of a later brick
+      than of those before, which compiles programs again.
+    - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory`, of which there is
+      one more along their longest axis until they do. There are fewer along an axis of too few voxels. What
+      these bricks take may exceed `memory`.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
       fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
@@ -99,10 +104,14 @@ def render_bricks(
       (`Lighting.farthest_read`).
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
       are no larger than a pixel; or, with a `tolerance`, whose error by ranges of values stays below that
-      (`bricks.level_for`).
+      (`bricks.level_for`). Under a `ToroidalMap` it is the finest, 0: its ranges are those of the finest
+      level's nodes, and the nodes of the others lie elsewhere.
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
-      first image; see `bricks.summary_of`.
-    - `progress`: called with the numbers of bricks read and of those that hold anything visible.
+      first image; see `bricks.summary_of`. With `tolerance` it is over all levels. What nobody knows to be
+      unchanged, an array or a memory map open for writing, has it in each image.
+    - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
+      anything visible. The former may end below the latter, where bricks are not needed, or above it, where
+      they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
     - `devices`: as for `render`. `memory` is that of each device.
     - `own`: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
       is read once (in each process) and copied to all. It is exact for everything that one device renders,
@@ -124,7 +133,8 @@ def render_bricks(
     or `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
-    unknown; for less memory than the smallest bricks take; for what needs the whole volume at once (labels,
+    unknown; for voxels outside of the ranges of values found before, which tell that it changed; for less
+    memory than the smallest bricks take; for what needs the whole volume at once (labels,
     baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written but the
     cache, which appears whole or not at all.
 
@@ -137,10 +147,13 @@ def render_bricks(
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     _check(march, transfer, lighting, method, outputs, own)
+    if tolerance is not None:
+        number("tolerance", tolerance, above=0, below=1)
     mesh = mesh_of(devices)
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
-    chosen = _level(levels, level, camera, transfer, tolerance, cache)
+    room = budget(memory)
+    chosen = _level(levels, level, camera, transfer, march, tolerance, room, cache)
     place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
     if len(known) < 2:
         if len(levels) > 1:
@@ -152,7 +165,7 @@ def render_bricks(
     scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting)
     check_not_sharded(mesh, scene)
     scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
-    job = _Job(chosen, budget(memory), _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
+    job = _Job(chosen, room, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
     if owned:
         _check_owned(scene, method)
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
@@ -234,8 +247,11 @@ class _Job:
 
     def stream(self, marched: Scene, shown: Scene, options: RenderOptions) -> Stream:
         """The bricks of a scene, as rays are marched, and as they are shown."""
-        cell = CELL if min(self.source.shape) > CELL else 4
-        summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
+        if self.streams:  # the second march of a gradient
+            summary = self.streams[0].summary
+        else:
+            cell = CELL if min(self.source.shape) > CELL else 4
+            summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
         where = self.memory, self.counts, self.method, self.progress
         least = number_of(self.devices) if self.owned else 1
         stream = Stream.of(self.source, summary, marched, shown, options, *where, least)
@@ -338,19 +354,30 @@ def _level(
     level: int | Literal["auto"] | Any,
     camera: Camera,
     transfer: Transfer,
+    march: March,
     tolerance: float | None,
+    memory: int,
     cache: Any,
 ) -> VoxelSource:
+    mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
     if level != "auto":
-        return levels[integer("level", level, 0, len(levels) - 1)]
-    if len(levels) == 1:
+        chosen = integer("level", level, 0, len(levels) - 1)
+        if mapped and chosen:
+            raise ValueError(
+                "level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got "
+                f"{level}."
+            )
+        return levels[chosen]
+    if len(levels) == 1 or mapped:
         return levels[0]
     if is_traced(camera, transfer):
         raise ValueError(
             f"level must be one of 0 to {len(levels) - 1} where gradients are taken; got 'auto', which "
             "depends on what is differentiated."
         )
-    summaries = [summary_of(each, CELL, cache=cache) for each in levels] if tolerance is not None else None
+    summaries = None
+    if tolerance is not None:
+        summaries = [summary_of(each, CELL, memory=memory, cache=cache) for each in levels]
     return levels[level_for(levels, camera, transfer, summaries, tolerance=tolerance)]
 
 
@@ -370,7 +397,7 @@ def _check(
     march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any, own: Any
 ) -> None:
     for name, given, known in (("method", method, Method), ("outputs", outputs, Asked), ("own", own, Own)):
-        if given not in get_args(known):
+        if not isinstance(given, str) or given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
     if isinstance(transfer, LabelTransferFunction):
         raise ValueError(

@@ -7,18 +7,20 @@ data[x, y, z], whatever the order of axes in a file.
 import math
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from .._util.checks import Arrayable
+from .._util.checks import Arrayable, is_traced
 from .._util.voxels import check_shape, given_array
 from ..volume import Volume
 from .dtypes import Box, converted, voxel_type
 
+
+Result = TypeVar("Result")
 
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
@@ -27,6 +29,11 @@ ALIGNED = 64
 """Bytes, of whose multiples the addresses of JAX's arrays are."""
 
 _READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
+
+
+def in_background(function: Callable[..., Result], *arguments: Any) -> "Future[Result]":
+    """A call in another thread of those that read."""
+    return _READERS.submit(function, *arguments)
 
 
 class VoxelSource(ABC):
@@ -62,19 +69,21 @@ class VoxelSource(ABC):
         where that is an array: do not write to it.
 
         **Raises:** `ValueError` for a box that is empty or exceeds the volume; for voxels that are NaN,
-        infinite, or not exact in `dtype`; and where the data are missing, damaged, or changed since the
-        source was made.
+        infinite, or not exact in `dtype`; and where the data are missing, damaged, or, as far as size and
+        time of a single file tell, changed since the source was made.
         """
         box = self._box(low, high)
         return converted(self._stored(*box), box, self.name)
 
     def read_async(self, low: Corner, high: Corner) -> "Future[np.ndarray]":
         """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
-        return _READERS.submit(self.read, low, high)
+        return in_background(self.read, low, high)
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any] | None:
-        """Identifies the data, as a tree that JSON can hold. Equal fingerprints mean equal voxels.
+        """Identifies the data, as a tree that JSON can hold. Equal fingerprints mean equal voxels, as far as
+        times of files tell: these may miss a change within a tick of the system's clock, and one through a
+        memory map until it is written back.
 
         None: nothing identifies them, such as an array that anybody may write to. What is computed from the
         voxels is then valid for this object alone, and while nobody writes to it."""
@@ -103,7 +112,7 @@ class VoxelSource(ABC):
 class ArraySource(VoxelSource):
     """Voxels of an array in memory, data[x, y, z], of any memory layout. It is not copied.
 
-    **Raises:** `ValueError` for arrays of a shape or type that no volume has.
+    **Raises:** `ValueError` for arrays of a shape or type that no volume has, and for traced ones.
     """
 
     def __init__(
@@ -112,6 +121,7 @@ class ArraySource(VoxelSource):
         spacing: tuple[float, float, float] | None = None,
         origin: tuple[float, float, float] | None = None,
     ):
+        check_known(data)
         array = given_array("data", data)
         check_shape(array.shape)
         self._data = np.asarray(array)
@@ -139,10 +149,21 @@ def empty_box(low: Corner, high: Corner, dtype: np.dtype) -> np.ndarray:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
+def check_known(thing: Any) -> None:
+    """**Raises** `ValueError` for traced voxels, spacing or origin."""
+    if is_traced(thing):
+        raise ValueError(
+            "source must not be traced, since it is read while an image is made: there are no gradients to "
+            "voxels by bricks (jv.render has them), and none inside jax.jit and jax.vmap. For gradients to "
+            "spacing and origin, pass these to render_bricks, beside an array."
+        )
+
+
 def array_of(volume: Volume) -> ArraySource:
     """The voxels of a `Volume`.
 
-    **Raises:** `ValueError` for one with labels or a field, which are not voxels."""
+    **Raises:** `ValueError` for one with labels or a field, which are not voxels, and for a traced one."""
+    check_known(volume)
     for part in ("labels", "field"):
         if getattr(volume, part) is not None:
             raise ValueError(

@@ -1,17 +1,21 @@
 """How large may bricks be, and how much larger are they read than they are?"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from .._util.checks import integer
+from .._util.files import MOST_VOXELS
 from ..engine.scene import Scene
 from ..march import RUN, March
 from ..occupancy import BLOCK
+from ..space import Space
 from ..transforms import ToroidalMap
-from .grid import BrickGrid, Node
+from ..transforms.adaptive_sampling import FARTHEST
+from .grid import BrickGrid, Node, is_straight
 from .overlap import most
 from .ranges import reach
 
@@ -28,34 +32,71 @@ extremes of blocks takes, less than one."""
 class Margin:
     """What is read around a brick.
 
-    - `cells`: along each axis, on both sides: as far as cells that begin in the brick may reach, and one more
-      where the gradient is read.
-    - `steps`: the same in steps along a ray.
+    - `cells`: along each axis, on both sides, and for any brick: as far as cells that begin in the brick may
+      reach, and what is read around these.
+    - `steps`: how far these cells may reach, in steps along a ray. `length`: the same as a world length.
+    - `light`: world length around a sample within which light is looked for.
+    - `around`: nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`.
     - `slopes`: whether the gradient is read.
-    - `around`: nodes more, for interpolation, slopes, the windows of `AdaptiveSampling`, and light.
     """
 
     cells: Node
     steps: int
+    length: float
+    light: float
     around: int
     slopes: bool
 
     @classmethod
-    def of(cls, march: March, spacing: np.ndarray, segment: int, shown: Scene) -> "Margin":
-        """That of a march in a grid of this spacing, which takes `segment` cells of a ray at a time. `shown`:
+    def of(cls, march: March, space: Space, shape: Node, segment: int, shown: Scene) -> "Margin":
+        """That of a march in a grid of this shape, which takes `segment` cells of a ray at a time. `shown`:
         what is measured and lit there."""
         transfer, lighting = shown.transfer, shown.lighting
-        steps, length = reach(march, segment), float(march.step) / spacing
+        steps = reach(march, segment)
+        # where rays are curved, a brick's own cells are found by points that may lie four steps apart
+        length = (steps + (0 if is_straight(space) else 4)) * float(march.step)
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
         around = 2 if slopes else 1
         if march.looks_ahead:  # blocks around a run's own, and the windows of these
-            rounds = math.ceil(RUN * march.longest_stride * float(np.max(length)) / (2 * BLOCK))
-            around += BLOCK * (rounds + 2)
-        if lighting is not None:
-            assert lighting.farthest_read is not None
-            around += math.ceil(lighting.farthest_read / float(np.min(spacing)))
-        x, y, z = (math.ceil(steps * d) + around for d in length)
-        return cls((x, y, z), steps, around, slopes)
+            shortest = min(_distances(space, np.zeros(3), np.asarray(shape) + BLOCK))
+            rounds = RUN * march.longest_stride * float(march.step) / max(2 * BLOCK * shortest, 1e-30)
+            around += BLOCK * (math.ceil(min(rounds, FARTHEST)) + 2)  # runs that touch more are not made
+        light = 0.0 if lighting is None else lighting.farthest_read
+        assert light is not None
+        margin = cls((0, 0, 0), steps, length, light, around, slopes)
+        return replace(margin, cells=margin.of_box(space, shape, np.zeros(3), np.asarray(shape) - 1))
+
+    def of_box(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> Node:
+        """Nodes along each axis that are read around the cells that begin in a box."""
+        far = nodes_within(space, shape, low, high, self.length)
+        x, y, z = far + self.of_points(space, shape, low, high) + (0 if is_straight(space) else 1)
+        return int(x), int(y), int(z)
+
+    def of_points(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Nodes along each axis that are read around points in a box."""
+        return nodes_within(space, shape, low, high, self.light) + self.around
+
+
+def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, length: float) -> np.ndarray:
+    """Nodes along each axis, on both sides of a box of a grid of this shape, that hold everything within a
+    world length of it. Where rays are curved they follow from the least distances between nodes in the box
+    and in these nodes themselves, also beyond the grid, through which a ray may come to other nodes of it."""
+    nodes = np.zeros(3)
+    while length > 0:
+        distances = np.asarray(_distances(space, low - nodes, high + nodes))
+        with np.errstate(divide="ignore"):
+            more = np.maximum(nodes, np.minimum(np.ceil(length / distances), shape))
+        if np.array_equal(more, nodes):
+            break
+        nodes = more
+    return nodes.astype(int)
+
+
+def _distances(space: Space, low: np.ndarray, high: np.ndarray) -> tuple[float, float, float]:
+    ends = [tuple(jnp.asarray(c, space.middle[0].dtype) for c in end.tolist()) for end in (low, high)]
+    (x0, y0, z0), (x1, y1, z1) = ends
+    dx, dy, dz = space.least_distances((x0, y0, z0), (x1, y1, z1))
+    return float(dx), float(dy), float(dz)
 
 
 def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
@@ -73,11 +114,17 @@ def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
     return math.ceil(math.prod(stored) * (COPIES * kind.itemsize + packed))
 
 
+def fits(stored: Node, dtype: Any, margin: Margin, memory: int) -> bool:
+    """Whether parts of this shape can be volumes, and take no more than so many bytes."""
+    return math.prod(stored) <= MOST_VOXELS and bytes_of(stored, dtype, margin) <= memory
+
+
 def split(
     shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None, least: int = 1
 ) -> BrickGrid:
-    """Few bricks that fit into so many bytes: there is one more along the axis where they are longest, until
-    they do. There are at least `least`, unless they would be smaller than bricks are.
+    """Few bricks that fit into so many bytes, and have fewer than 2**31 voxels: there is one more along the
+    axis where they are longest, until they do. There are at least `least`, unless they would be smaller than
+    bricks are.
 
     **Raises:** `ValueError` if the smallest ones do not fit."""
     memory = integer("memory", memory, 1)
@@ -86,17 +133,27 @@ def split(
     while True:
         size = [_rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
         grid = BrickGrid(shape, (size[0], size[1], size[2]))
-        needed = bytes_of(stored_of(grid, margin, probe), dtype, margin)
+        stored = stored_of(grid, margin, probe)
         longest = max(range(3), key=lambda axis: (size[axis] > min(EDGE, cells[axis])) * size[axis])
         smallest = size[longest] <= min(EDGE, cells[longest])
-        if needed <= memory and (grid.number >= least or smallest):
+        if fits(stored, dtype, margin, memory) and (grid.number >= least or smallest):
             return grid
         if smallest:
+            check_part(stored)
             raise ValueError(
-                f"memory must be at least {needed} bytes, for bricks of {' x '.join(map(str, size))} cells "
-                f"and what is read around them; got {memory}."
+                f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
+                f"{' x '.join(map(str, size))} cells and what is read around them; got {memory}."
             )
         parts[longest] += 1
+
+
+def check_part(stored: Node) -> None:
+    """**Raises** `ValueError` if a part of this shape has more voxels than a volume may have."""
+    if math.prod(stored) > MOST_VOXELS:
+        raise ValueError(
+            "bricks must be so many, and steps so short, that a brick and what is read around it have fewer "
+            f"than 2**31 voxels; got {' x '.join(map(str, stored))}."
+        )
 
 
 def stored_of(grid: BrickGrid, margin: Margin, probe: ToroidalMap | None) -> Node:

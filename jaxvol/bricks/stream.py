@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
@@ -12,7 +12,6 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
 from .._util.memory import give_back
-from .._util.vec3 import apart
 from .._util.xla import compiled
 from ..camera import Camera
 from ..engine import devices
@@ -28,8 +27,8 @@ from ..transforms import ToroidalMap
 from ..volume import Volume, part_of
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
-from .sources import VoxelSource
-from .split import Margin, bytes_of, split, stored_of, stored_shape
+from .sources import VoxelSource, in_background
+from .split import Margin, bytes_of, check_part, fits, split, stored_of, stored_shape
 from .summary import Summary
 
 
@@ -60,21 +59,27 @@ class Stream:
     - `scene`: with a volume without its voxels.
     - `visible`: for each brick, whether anything may be visible in it.
     - `straight`: whether rays are straight in the grid.
-    - `stored`: nodes along each axis that are read at a time. `memory`: bytes that these may take.
+    - `done`: bricks that were rendered. `loads`: those whose reading has begun.
+    - `stored`: nodes along each axis that are read at a time. `alone`: as many suffice for each brick without
+      the bricks that had their turn before. `memory`: bytes that these may take.
     """
 
     source: VoxelSource
+    summary: Summary
     scene: Scene
     options: RenderOptions
+    space: Space
     grid: BrickGrid
     margin: Margin
     order: list[int]
     visible: np.ndarray
     straight: bool
+    alone: Node
     stored: Node
     memory: int
     method: Method
     progress: Callable[[int, int], Any] | None = None
+    done: int = 0
     loads: list[int] = field(default_factory=list)
     bytes_read: int = 0
 
@@ -98,18 +103,37 @@ class Stream:
         space = march.locate(marched.volume)
         straight = is_straight(space)
         probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
-        margin = Margin.of(march, _distances(space, source.shape), options.tiling.cells, shown)
+        margin = Margin.of(march, space, source.shape, options.tiling.cells, shown)
         if counts is None:
             grid = split(source.shape, source.dtype, memory, margin, probe, least)
         else:
             x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
-        stored = stored_of(grid, margin, probe if method == "overlap" else None)
+        alone = stored_of(grid, margin, probe if method == "overlap" else None)
+        check_part(alone)
+        stored = alone
+        if not straight and method != "naive":  # what is read is found from the rays: begin with less
+            middle = (np.asarray(source.shape) - 1) / 2
+            typical = replace(margin, cells=margin.of_box(space, source.shape, middle, middle))
+            stored = stored_of(grid, typical, probe if method == "overlap" else None)
         assert isinstance(marched.source, Camera)
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
         return cls(
-            *(source, marched, options, grid, margin, order, visible, straight, stored),
-            *(max(memory, bytes_of(stored, source.dtype, margin)), method, progress),
+            *(
+                source,
+                summary,
+                marched,
+                options,
+                space,
+                grid,
+                margin,
+                order,
+                visible,
+                straight,
+                alone,
+                stored,
+            ),
+            *(max(memory, bytes_of(alone, source.dtype, margin)), method, progress),
         )
 
     @property
@@ -137,10 +161,15 @@ class Stream:
             state = march(part, cells, state)
             del part, cells
             living[0] = where(state)
-            if self.progress is not None:
-                self.progress(len(self.loads), int(self.visible.sum()))
+            self.finish(1, int(self.visible.sum()))
             load = following
         return state
+
+    def finish(self, bricks: int, of: int) -> None:
+        """Says that so many more bricks are rendered, `of` all that hold anything visible."""
+        self.done += bricks
+        if self.progress is not None:
+            self.progress(self.done, of)
 
     def report(self) -> BrickReport:
         """What all passes so far took."""
@@ -185,8 +214,9 @@ class Stream:
                     continue
                 through = {brick} if self.method == "reload" else {brick, *had}
                 found = self._found(brick, through, rays, living[0], reached)
-                if found is not None and self._too_large(found):
-                    found = self._found(brick, {brick}, rays, living[0], reached)
+                if found is not None and not self._fits(found):
+                    found = self._found(brick, {brick}, rays, living[0], reached, over_empty=False)
+                    assert found is None or self._fits(found)
                 had.add(brick)
                 if found is not None:
                     going, reached = True, found.reached
@@ -215,41 +245,48 @@ class Stream:
                 reached = found.reached
                 yield load
 
-    def _turn(self, brick: int, through: set[int]) -> Turn:
+    def _found(
+        self,
+        brick: int,
+        through: set[int],
+        rays: Ray,
+        at: Progress,
+        reached: Array,
+        *,
+        over_empty: bool = True,
+    ) -> Found | None:
+        """The cells of rays in a brick and in those `through` which they go on from it. `over_empty`: and in
+        those that are empty."""
         empty = np.append(~self.visible, True)
-        through_ = empty.copy()
-        through_[list(through)] = True
-        return Turn(
-            jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(through_), jnp.asarray(empty)
-        )
-
-    def _found(self, brick: int, through: set[int], rays: Ray, at: Progress, reached: Array) -> Found | None:
-        beyond = self.margin.steps
-        turn = self._turn(brick, through)
-        march = self.scene.march
+        on = empty.copy() if over_empty else np.zeros_like(empty)
+        on[list(through)] = True
+        turn = Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(on), jnp.asarray(empty))
+        march, beyond = self.scene.march, self.margin.steps
         found = _cells_of_curved(self.mesh, self.grid, beyond, march, rays, at, reached, turn)
         return found if bool(found.any) else None
 
     def around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
         low, high = (np.asarray(end) for end in self.grid.cells(brick))
-        return low - self.margin.cells, high + self.margin.cells
+        margin = np.asarray(self.margin.of_box(self.space, self.grid.shape, low, high))
+        return low - margin, high + margin
 
     def _box(self, found: Found) -> tuple[np.ndarray, np.ndarray]:
-        around = self.margin.around
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
+        around = self.margin.of_points(self.space, self.grid.shape, low, high)
         return np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
 
-    def _too_large(self, found: Found) -> bool:
-        """Whether a box does not fit into what is read at a time, also if that is made as large as it may
-        be."""
+    def _fits(self, found: Found) -> bool:
+        """Whether a box fits into what is read at a time, which is made larger for it as far as memory goes:
+        so far that each brick alone still fits."""
         low, high = self._box(found)
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
         wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
         x, y, z = map(max, wanted, self.stored)
-        if bytes_of((x, y, z), self.source.dtype, self.margin) > self.memory:
-            return True
+        nx, ny, nz = map(max, (x, y, z), self.alone)
+        if not fits((nx, ny, nz), self.source.dtype, self.margin, self.memory):
+            return False
         self.stored = x, y, z
-        return False
+        return True
 
     def _load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:
         """Starts to read a brick, for these cells."""
@@ -263,15 +300,20 @@ class Stream:
         x, y, z = first.tolist()
         self.loads.append(brick)
         self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
-        return (x, y, z), self.source.read_async(first, first + stored)
+        return (x, y, z), in_background(self._read, first, first + stored)
 
-
-def _distances(space: Space, shape: Node) -> np.ndarray:
-    """World distances between nodes along the three axes, in the middle of the grid. Where rays are curved,
-    they differ elsewhere, and what a brick reads is found from its rays."""
-    middle = jnp.asarray([(n - 1) / 2 for n in shape])
-    along = jax.jacfwd(lambda at: jnp.stack(space.point(apart(at))))(middle)
-    return np.linalg.norm(np.asarray(along, float), axis=0)
+    def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """The voxels of a box, whose range tells whether they are those of the summary."""
+        voxels = self.source.read(low, high)
+        least, most = self.summary.range_of(low, high)
+        if float(voxels.min()) < least or float(voxels.max()) > most:
+            raise ValueError(
+                f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
+                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now "
+                f"{voxels.min()} to {voxels.max()}. Delete the file of ranges beside it (`cache`), or pass "
+                "cache=None, and open it again."
+            )
+        return voxels
 
 
 def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:

@@ -23,49 +23,37 @@ COPIES = 8
 """Slabs in memory at once: this one, as read and as an array of JAX; the next; and what JAX needs to find the
 extremes of blocks."""
 
-LAYER = 1024
-"""Bytes for each voxel of a face across x, that the ranges of slopes and of windows need: they are found
-layer by layer along x, in single precision."""
-
 
 class Slab(NamedTuple):
     """A part of a volume that is read at once.
 
-    - `voxels`: those of its blocks; if there is a margin, also of one block more on each side, where the
-      volume has one.
-    - `first`: index of its first block along each axis, and `blocks`: number of blocks, without the margin.
-    - `skipped`: blocks of `voxels` along each axis that come before `first`.
+    - `voxels`: those of its blocks, with the nodes on all their faces.
+    - `first`: index of its first block along each axis, and `blocks`: number of blocks.
     """
 
     voxels: np.ndarray
     first: tuple[int, int, int]
     blocks: tuple[int, int, int]
-    skipped: tuple[int, int, int]
 
 
-def slabs(source: VoxelSource, memory: int, *, margin: bool = False) -> Iterator[Slab]:
+def slabs(source: VoxelSource, memory: int) -> Iterator[Slab]:
     """Cut a source into slabs of whole blocks of BLOCK³ cells, of which each is in one slab.
 
-    `memory`: bytes for what is computed of a slab; it is exceeded if a single chunk exceeds it. `margin`:
-    whether slabs overlap by one block on each side, and more is computed of each.
+    `memory`: bytes for what is computed of a slab; it is exceeded if a single chunk exceeds it.
     """
-    extra = BLOCK if margin else 0
     axis = _axis(source)
-    extent = _extent(source, axis, memory, margin)
+    extent = _extent(source, axis, memory)
     cuts = [[*range(0, n - 1, step), n - 1] for n, step in zip(source.shape, extent, strict=True)]
     columns = product(*_with([list(pairwise(cut)) for cut in cuts], axis, [(0, 0)]))
     for column in columns:
-        yield from _column(source, axis, extent[axis], column, extra)
+        yield from _column(source, axis, extent[axis], column)
 
 
-def _column(
-    source: VoxelSource, axis: int, step: int, nodes: tuple[tuple[int, int], ...], extra: int
-) -> Iterator[Slab]:
+def _column(source: VoxelSource, axis: int, step: int, nodes: tuple[tuple[int, int], ...]) -> Iterator[Slab]:
     """The slabs of the blocks between these first and last nodes across `axis`, along which they are read."""
     length = source.shape[axis]
     ends = [*range(step, length - 1, step), length]
-    low = [max(0, first - extra) for first, _ in nodes]
-    high = [min(n, last + 1 + extra) for (_, last), n in zip(nodes, source.shape, strict=True)]
+    low, high = [first for first, _ in nodes], [last + 1 for _, last in nodes]
 
     def reading(begin: int, end: int) -> "Future[np.ndarray]":
         return source.read_async(_with(low, axis, begin), _with(high, axis, end))
@@ -77,21 +65,19 @@ def _column(
         if following is not None:
             coming = reading(end, following)
         voxels = new if kept is None else np.concatenate([kept, new], axis)
-        # blocks that are complete, with their margins
-        blocks = -(-(length - 1) // BLOCK) if following is None else max(0, (end - 1 - extra) // BLOCK)
+        # blocks that are complete
+        blocks = -(-(length - 1) // BLOCK) if following is None else (end - 1) // BLOCK
         if blocks > done:
-            last = min(length, BLOCK * blocks + 1 + extra)
+            last = min(length, BLOCK * blocks + 1)
             spans = [(first // BLOCK, -(-final // BLOCK)) for first, final in nodes]
             (x0, x1), (y0, y1), (z0, z1) = _with(spans, axis, (done, blocks))
-            x, y, z = (at // BLOCK for at in _with(low, axis, begin))
             yield Slab(
                 _along(voxels, axis, 0, last - begin),
                 (x0, y0, z0),
                 (x1 - x0, y1 - y0, z1 - z0),
-                (x0 - x, y0 - y, z0 - z),
             )
             done = blocks
-        needed = max(0, BLOCK * done - extra)
+        needed = BLOCK * done
         kept, begin = _along(voxels, axis, needed - begin, end - begin), needed
 
 
@@ -108,14 +94,13 @@ def _axis(source: VoxelSource) -> int:
     return int(np.argmax([n / c for n, c in zip(source.shape, source.chunks, strict=True)]))
 
 
-def _extent(source: VoxelSource, axis: int, memory: int, margin: bool) -> list[int]:
+def _extent(source: VoxelSource, axis: int, memory: int) -> list[int]:
     """Voxels of a slab along each axis: multiples of BLOCK, and of chunks where memory allows."""
     steps = [-(-c // BLOCK) * BLOCK for c in source.chunks]
-    wide = 3 * BLOCK if margin else BLOCK  # what a slab has of its neighbours
 
     def cost(extent: list[int]) -> int:
-        x, y, z = (min(e + wide, n) for e, n in zip(extent, source.shape, strict=True))
-        return COPIES * source.dtype.itemsize * x * y * z + (LAYER * y * z if margin else 0)
+        x, y, z = (min(e + BLOCK, n) for e, n in zip(extent, source.shape, strict=True))
+        return COPIES * source.dtype.itemsize * x * y * z
 
     extent = [-(-n // BLOCK) * BLOCK for n in source.shape]
     thinnest = min(max(steps[axis], 2 * BLOCK), extent[axis])

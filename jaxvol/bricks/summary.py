@@ -1,7 +1,7 @@
 """Which values occur where in a source? Ranges of its blocks, found in one pass over all voxels.
 
-From these, a renderer tells which bricks are empty without reading them, and leaps within the others. They
-are the ranges that `occupancy.Blocks` and `variation.Windows` have of a volume in memory.
+From these, a renderer tells which bricks are empty without reading them. They are the ranges that
+`occupancy.Blocks` has of a volume in memory.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,19 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._util.checks import Arrayable, finite_array, integer
+from .._util.checks import integer
 from .._util.memory import give_back
-from ..occupancy import BLOCK, Blocks, SlopeRanges, over_blocks, widened
-from ..variation import Windows
+from ..occupancy import BLOCK, Blocks, over_blocks, widened
 from ..volume import Volume
 from .sources import Corner, VoxelSource
-from .streaming import Slab, slabs
+from .streaming import slabs
 
 
-VALUES = {"low": np.minimum, "high": np.maximum}
-SLOPES = {"slope_low": np.minimum, "slope_high": np.maximum, "steepest": np.maximum}
-WINDOWS = {"window_low": np.minimum, "window_high": np.maximum, "bend": np.maximum}
-COMBINED = VALUES | SLOPES | WINDOWS
+COMBINED = {"low": np.minimum, "high": np.maximum}
 """Each kind of range, and how those of two blocks are combined."""
 
 Progress = Callable[[int, int], Any]
@@ -38,9 +34,7 @@ class Summary:
 
     - `shape`: of the volume, in voxels.
     - `cell`: cells along the side of a block, a multiple of `occupancy.BLOCK`.
-    - `ranges`: arrays that end in (bx, by, bz). `low`, `high`: least and greatest voxel, in the voxels' type.
-      If they were asked for: `slope_low`, `slope_high`, `steepest`, as in `occupancy.SlopeRanges`, and
-      `window_low`, `window_high`, `bend`, as in `variation.Windows`.
+    - `ranges`: `low`, `high`: least and greatest voxel, in the voxels' type, (bx, by, bz).
     """
 
     shape: tuple[int, int, int]
@@ -51,10 +45,6 @@ class Summary:
     def nbytes(self) -> int:
         """Bytes of all ranges."""
         return sum(each.nbytes for each in self.ranges.values())
-
-    def has(self, kinds: dict[str, Any]) -> bool:
-        """Whether these ranges are known: `VALUES`, `SLOPES`, `WINDOWS`."""
-        return kinds.keys() <= self.ranges.keys()
 
     def range_of(self, low: Corner, high: Corner) -> tuple[float, float]:
         """A range that holds all voxels with `low` <= (x, y, z) < `high`: the range of the blocks that hold
@@ -67,48 +57,26 @@ class Summary:
         )
         return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
 
-    def blocks(
-        self,
-        low: Corner | None = None,
-        high: Corner | None = None,
-        *,
-        spacing: Arrayable = (1.0, 1.0, 1.0),
-    ) -> Blocks:
+    def blocks(self, low: Corner | None = None, high: Corner | None = None) -> Blocks:
         """The `Blocks` of the volume, or of the voxels with `low` <= (x, y, z) < `high` as a volume of their
-        own. They have slopes if the summary has; `spacing` is for these.
+        own. They have no slopes.
 
         They equal those of the voxels in memory if `cell` is `occupancy.BLOCK` and the box is the volume.
         Otherwise each range holds all voxels of its block, and others around it: up to `cell` away."""
-        found = self._of_box(low, high, (VALUES | SLOPES) if self.has(SLOPES) else VALUES)
+        found = self._of_box(low, high)
         least, most = widened(jnp.asarray(found["low"]), jnp.asarray(found["high"]))
-        slopes = None
-        if "steepest" in found:
-            down, up, steepest = (jnp.asarray(found[name]) for name in SLOPES)
-            slopes = SlopeRanges(down, up, steepest, finite_array("spacing", spacing, (3,)))
-        return Blocks(least, most, None, slopes)
+        return Blocks(least, most, None)
 
-    def windows(self, low: Corner | None = None, high: Corner | None = None) -> Windows:
-        """The `Windows` of the volume or of a box, as `blocks` has them.
-
-        **Raises:** `ValueError` if the summary was made without."""
-        if not self.has(WINDOWS):
-            raise ValueError("this summary has no windows; ask for them: summary_of(source, windows=True).")
-        found = self._of_box(low, high, WINDOWS)
-        low_, high_, bend = (jnp.asarray(found[name]) for name in WINDOWS)
-        return Windows(low_, high_, bend)
-
-    def _of_box(
-        self, low: Corner | None, high: Corner | None, kinds: dict[str, Any]
-    ) -> dict[str, np.ndarray]:
+    def _of_box(self, low: Corner | None, high: Corner | None) -> dict[str, np.ndarray]:
         """Ranges of the blocks of BLOCK³ cells of a box of voxels."""
-        found = {name: self.ranges[name] for name in kinds}
+        found = self.ranges
         first, last = (0, 0, 0) if low is None else low, self.shape if high is None else high
         for axis in range(3):
             begin, end, n = int(first[axis]), int(last[axis]), self.shape[axis]
             nodes = range(begin, end - 1, BLOCK)
             touched = [self.touched(node, min(node + BLOCK, end - 1), n) for node in nodes]
             found = {
-                name: over_intervals(part, axis - 3, touched, COMBINED[name]) for name, part in found.items()
+                name: over_intervals(part, axis, touched, COMBINED[name]) for name, part in found.items()
             }
         return found
 
@@ -135,8 +103,6 @@ def scan(
     source: VoxelSource,
     cell: int | Any = BLOCK,
     *,
-    slopes: bool = False,
-    windows: bool = False,
     memory: int = 2**28,
     progress: Progress | None = None,
 ) -> Summary:
@@ -146,8 +112,6 @@ def scan(
 
     - `cell`: cells along the side of a block, a multiple of `occupancy.BLOCK`. A summary takes
       2 / `cell`³ of the voxels' memory.
-    - `slopes`, `windows`: which ranges are wanted beside those of values. In blocks of 4³ cells, each takes
-      more memory than a fifth of the voxels.
     - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk of the source does.
     - `progress`: called after each slab; what it raises ends the pass.
 
@@ -156,38 +120,22 @@ def scan(
     cell = integer("cell", cell, BLOCK)
     if cell % BLOCK:
         raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
-    kinds = VALUES | (SLOPES if slopes else {}) | (WINDOWS if windows else {})
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     ranges: dict[str, np.ndarray] = {}
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
     nx, ny, nz = source.shape
-    for slab in slabs(source, memory, margin=slopes or windows):
-        for name, part in _ranges_of(slab, slopes, windows).items():
-            merged, place = _merged(part, slab.first, cell // BLOCK, kinds[name])
+    for slab in slabs(source, memory):
+        found = map(np.asarray, _extremes(Volume(slab.voxels).data))
+        for (name, combine), part in zip(COMBINED.items(), found, strict=True):
+            merged, place = _merged(part, slab.first, cell // BLOCK, combine)
             if name not in ranges:
-                ranges[name] = np.full(
-                    part.shape[:-3] + blocks, _neutral(part.dtype, kinds[name]), part.dtype
-                )
-            ranges[name][place] = kinds[name](ranges[name][place], merged)
+                ranges[name] = np.full(blocks, _neutral(part.dtype, combine), part.dtype)
+            ranges[name][place] = combine(ranges[name][place], merged)
         done += int(np.prod(slab.blocks))
         if progress is not None:
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
     give_back()
     return Summary(source.shape, cell, ranges)
-
-
-def _ranges_of(slab: Slab, slopes: bool, windows: bool) -> dict[str, np.ndarray]:
-    """Ranges of a slab's blocks of BLOCK³ cells."""
-    volume = Volume(slab.voxels)
-    found = dict(zip(VALUES, _extremes(volume.data), strict=True))
-    if slopes:
-        of = SlopeRanges.of(volume)
-        found |= zip(SLOPES, (of.low, of.high, of.steepest), strict=True)
-    if windows:
-        of = Windows.of(volume)
-        found |= zip(WINDOWS, (of.low, of.high, of.bend), strict=True)
-    own = (..., *(slice(s, s + n) for s, n in zip(slab.skipped, slab.blocks, strict=True)))
-    return {name: np.asarray(part)[own] for name, part in found.items()}
 
 
 @jax.jit
@@ -201,12 +149,12 @@ def _merged(
     """Ranges of blocks that are `several` times as long, as far as `part`, from block `first` on, tells; and
     their place among all."""
     place = []
-    for axis, begin in zip((-3, -2, -1), first, strict=True):
+    for axis, begin in enumerate(first):
         block = np.arange(begin, begin + part.shape[axis]) // several
         starts = np.flatnonzero(np.diff(block, prepend=-1))
         part = combine.reduceat(part, starts, axis)
         place.append(slice(block[0], block[-1] + 1))
-    return part, (..., *place)
+    return part, tuple(place)
 
 
 def _neutral(dtype: np.dtype, combine: np.ufunc) -> Any:

@@ -7,7 +7,7 @@ all, and whoever finds it damaged makes it anew.
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 import warnings
 import zipfile
 from pathlib import Path
@@ -19,10 +19,10 @@ from .._util.checks import described, integer
 from .._util.npy import read_arrays
 from ..occupancy import BLOCK
 from .sources import VoxelSource
-from .summary import COMBINED, SLOPES, VALUES, WINDOWS, Progress, Summary, scan
+from .summary import COMBINED, Progress, Summary, scan
 
 
-VERSION = 1
+VERSION = 2
 """Of the files and of what is in them; others are made anew."""
 
 
@@ -30,8 +30,6 @@ def summary_of(
     source: VoxelSource,
     cell: int | Any = BLOCK,
     *,
-    slopes: bool = False,
-    windows: bool = False,
     memory: int = 2**28,
     cache: Literal["beside"] | str | os.PathLike[str] | Any | None = "beside",
     progress: Progress | None = None,
@@ -40,8 +38,7 @@ def summary_of(
 
     **Arguments:**
 
-    - `cell`, `slopes`, `windows`, `memory`, `progress`: see `summary.scan`. A file with more ranges than are
-      asked for is used; where it has fewer, the pass finds all of both. `progress` is called only in a pass.
+    - `cell`, `memory`, `progress`: see `summary.scan`. `progress` is called only in a pass.
     - `cache`: where files lie. `"beside"`: beside the data, `NAME.jaxvol-summary-CELL.npz`; a folder: in it;
       None: nowhere. Arrays in memory have no files, and neither has a memory map that is open for writing.
 
@@ -51,17 +48,12 @@ def summary_of(
     cell = integer("cell", cell, BLOCK)
     before = None if cache is None or source.beside is None else source.fingerprint()
     if before is None or source.beside is None:
-        return scan(source, cell, slopes=slopes, windows=windows, memory=memory, progress=progress)
+        return scan(source, cell, memory=memory, progress=progress)
     path, about = _path(source.beside, cell, cache), _about(source, before, cell)
     known = _read(path, source, about) if path.is_file() else None
-    wanted = VALUES | (SLOPES if slopes else {}) | (WINDOWS if windows else {})
-    if known is not None and known.has(wanted):
+    if known is not None:
         return known
-    slopes, windows = (
-        asked or (known is not None and known.has(kinds))
-        for asked, kinds in ((slopes, SLOPES), (windows, WINDOWS))
-    )
-    summary = scan(source, cell, slopes=slopes, windows=windows, memory=memory, progress=progress)
+    summary = scan(source, cell, memory=memory, progress=progress)
     if source.fingerprint() != before:
         raise ValueError(f"{source.name} changed while it was read. Open it again once it is complete.")
     try:
@@ -92,16 +84,17 @@ def _about(source: VoxelSource, fingerprint: dict[str, Any], cell: int) -> dict[
 
 
 def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> None:
-    told = np.frombuffer(json.dumps(about | {"ranges": [*ranges]}).encode(), np.uint8)
+    told = np.frombuffer(json.dumps(about).encode(), np.uint8)
     # bfloat16, which NumPy's files do not know, as integers of its bits
     arrays = {
         name: part if part.dtype.kind in "iuf" else part.view(np.uint16) for name, part in ranges.items()
     }
     arrays["about"] = told
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, part = tempfile.mkstemp(prefix=f"{path.name}.", suffix=".part", dir=path.parent)
+    # not by tempfile, whose files nobody else may read
+    part = path.with_name(f"{path.name}.{secrets.token_hex(8)}.part")
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with part.open("xb") as file:
             with zipfile.ZipFile(file, "w") as archive:
                 for name, array in arrays.items():
                     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -110,7 +103,7 @@ def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> 
             os.fsync(file.fileno())
         os.replace(part, path)
     except BaseException:
-        os.unlink(part)
+        part.unlink(missing_ok=True)
         raise
 
 
@@ -120,14 +113,14 @@ def _read(path: Path, source: VoxelSource, about: dict[str, Any]) -> Summary | N
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     try:
         told = json.loads(read_arrays(path, ("about",))["about"].tobytes())
-        if {name: value for name, value in told.items() if name != "ranges"} != about:
+        if told != about:
             return None
-        ranges = read_arrays(path, tuple(told["ranges"]))
+        ranges = read_arrays(path, tuple(COMBINED))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):  # damaged
         return None
     for name, part in ranges.items():
-        if name in VALUES and part.dtype != source.dtype:
+        if part.dtype != source.dtype:
             ranges[name] = part = part.view(source.dtype)
-        if name not in COMBINED or part.shape[-3:] != blocks:
+        if part.shape != blocks:
             return None
     return Summary(source.shape, cell, ranges)

@@ -45,6 +45,9 @@ class ZarrSource(VoxelSource):
     - `cache`: bytes of decoded chunks that are kept, for boxes that share them.
     - `beside`: see `VoxelSource`; by default the array's folder.
 
+    Chunks that change after the array was opened are read as they are then, or as `cache` has them. Images
+    by bricks notice values outside of the ranges that were found before.
+
     **Raises:** `ValueError` for a folder without a Zarr array, and an array of a shape or type that no volume
     has; `ImportError` without tensorstore.
     """

@@ -151,6 +151,9 @@ class _Clipped(Space):
     def point(self, coordinate: Vec3) -> Vec3:
         return self.inner.point(coordinate)
 
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        return self.inner.least_distances(low, high)
+
     def path(self, entry: Vec3, direction: Vec3) -> Path:
         return self.inner.path(entry, direction)
 

@@ -11,6 +11,7 @@ rendered as acquired, without resampling: rays that are straight in the world ar
 """
 
 import math
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -183,6 +184,21 @@ class _Sector(Space):
             for c, ends, n in zip(coordinate, ranges, self.shape, strict=True)
         ]
         return apart(self.probe.to_world(jnp.stack(toroidal)))
+
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        # about the motor's axis ρ = a + (b + γ) sin σ, and about the apex b + γ: the sine is concave where it
+        # is positive, and linear in γ it is least at an end, so that a corner has the least ρ
+        probe = self.probe
+        beta, sigma, gamma = (
+            (ends[1] - ends[0]) / (n - 1)
+            for ends, n in zip(
+                (probe.beta_range, probe.sigma_range, probe.gamma_range), self.shape, strict=True
+            )
+        )
+        depth = [jnp.maximum(probe.b + probe.gamma_range[0] + end[2] * gamma, 0) for end in (low, high)]
+        angle = [jnp.clip(probe.sigma_range[0] + end[1] * sigma, 0, math.pi) for end in (low, high)]
+        rho = [probe.a + d * jnp.sin(s) for d in depth for s in angle]
+        return jnp.maximum(reduce(jnp.minimum, rho), 0) * beta, depth[0] * sigma, gamma
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         """World cells around the sector. A cell is occupied if the sphere around it reaches a visible block:

@@ -7,6 +7,7 @@ import pytest
 import jaxvol as jv
 from jaxvol.bricks.detail import level_for, nearest_pixel, range_error
 from jaxvol.bricks.opening import levels_of
+from jaxvol.bricks.render import _level
 from jaxvol.bricks.sources import ArraySource
 from jaxvol.bricks.summary import scan
 from jaxvol.transfer import Transfer
@@ -233,3 +234,15 @@ def test_arguments_that_miss_are_named():
         level_for(found, camera(5), pixels=0.0)
     with pytest.raises(ValueError, match="levels must have spacing and origin; level 1"):
         level_for([found[0], ArraySource(ball())], camera(5))
+
+
+def test_under_a_toroidal_map_the_level_is_the_finest(tmp_path):
+    """The map's ranges are those of the finest level's nodes."""
+    ome_written(tmp_path, pyramid(ball(20), 3), "0.5", spacing=(1.0, 1.0, 1.0))
+    far, march = camera(1001), jv.March(1.0, (jv.ToroidalMap(10, 20, (1, 2), (1, 2), (0, 60)),))
+    given = levels_of(tmp_path), "auto", far, transfer()
+    assert _level(*given, jv.March(1.0), None, 2**28, None).shape == (16, 16, 16)
+    assert _level(*given, march, None, 2**28, None).shape == (64, 64, 64)
+    assert _level(*given, march, 0.5, 2**28, None).shape == (64, 64, 64)
+    with pytest.raises(ValueError, match=r"level must be 0 under a ToroidalMap.*got 1"):
+        jv.render_bricks(tmp_path, transfer(), far, march, level=1)

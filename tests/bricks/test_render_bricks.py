@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import BrickGrid, VoxelSource, source_of
+from jaxvol.bricks import BrickGrid, VoxelSource, source_of, summary_files
 from jaxvol.bricks.stream import Stream
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 from jaxvol.occupancy import BLOCK
@@ -302,6 +302,25 @@ def test_gradients_through_bricks_are_those_of_the_whole(transforms, lighting):
         assert np.linalg.norm(a - b) <= 1e-5 * max(np.linalg.norm(a), 1e-3)
 
 
+def test_the_second_march_of_a_gradient_has_the_ranges_of_the_first(monkeypatch):
+    data, size, passes = balls(), 16, []
+    camera, march = outside(jv.Volume(data), size), jv.March(1.0, (jv.SpaceLeaping(),))
+    scan = summary_files.scan
+
+    def counted(*given, **more):
+        passes.append(given)
+        return scan(*given, **more)
+
+    monkeypatch.setattr(summary_files, "scan", counted)
+
+    def loss(extinction):
+        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
+        return jnp.sum(jv.render_bricks(data, transfer, camera, march, bricks=(2, 1, 2)).rgba[..., 3])
+
+    assert np.any(jax.grad(loss)(jnp.asarray([0.0, 0.02, 0.5])))
+    assert len(passes) == 1
+
+
 def test_the_gradient_by_an_extinction_agrees_with_differences():
     data, size = balls(), 16
     camera, march = outside(jv.Volume(data), size), jv.March(1.0, (jv.SpaceLeaping(),))
@@ -329,8 +348,7 @@ def test_a_file_is_rendered_within_its_budget(tmp_path):
     assert_same(jv.render(jv.Volume(data), TRANSFER, camera, march), found)
     assert found.bricks.bytes_held <= 200_000
     assert np.prod(found.bricks.counts) > 1
-    assert steps
-    assert steps[-1][0] == found.bricks.loads
+    assert steps == [(done + 1, found.bricks.needed) for done in range(found.bricks.loads)]
     [kept] = tmp_path.glob("*.npz")
     before = kept.stat().st_mtime_ns
     jv.render_bricks(path, TRANSFER, camera, march, memory=200_000)
@@ -362,6 +380,9 @@ LABELLED = jv.LabelTransferFunction({1: TRANSFER})
         ({"memory": -1}, "memory must be an integer of at least 1; got -1"),
         ({"bricks": (2, 2)}, "bricks must be three numbers"),
         ({"bricks": (0, 1, 1)}, "bricks must be an integer of at least 1; got 0"),
+        ({"method": np.array(["overlap", "reload"])}, "method must be one of overlap, reload, naive"),
+        ({"tolerance": "x"}, "tolerance must be"),
+        ({"tolerance": -5.0, "level": 0}, "tolerance must be"),
         ({"method": "fast"}, "method must be one of overlap, reload, naive; got 'fast'"),
         ({"outputs": "depth"}, "outputs must be one of all, rgba"),
         ({"source": "no_such.raw"}, "no_such.raw"),
@@ -399,9 +420,56 @@ def test_under_jit_it_says_what_to_do():
         jax.vmap(image)(TRANSFER.extinction[None])
 
 
-def test_bricks_are_numbered_and_ordered_from_the_eye():
+def test_a_gradient_to_the_source_says_what_to_do():
+    data, camera = balls().astype(np.float32), outside(jv.Volume(balls()), 16)
+
+    def image(source):
+        return jnp.sum(jv.render_bricks(source, TRANSFER, camera, jv.March(1.0)).rgba)
+
+    for given in (image, lambda data: image(jv.Volume(data))):
+        with pytest.raises(ValueError, match=r"source must not be traced.*no gradients to voxels"):
+            jax.grad(given)(jnp.asarray(data))
+    with pytest.raises(ValueError, match=r"source must not be traced.*gradients to spacing"):
+        jax.grad(lambda spacing: image(jv.Volume(data, spacing)))(jnp.ones(3))
+
+
+def test_bricks_are_numbered_along_the_axes():
     grid = BrickGrid((9, 17, 5), (4, 8, 3))
     assert grid.counts == (2, 2, 2)
     assert grid.cells(7) == ((4, 8, 3), (8, 16, 4))
     x, y, z = (jnp.asarray(c) for c in ([0.0, 4.0, 8.0, -1], [7.9, 8.0, 16.0, 99], [2.9, 3.0, 4.0, 0]))
     assert grid.brick_of((x, y, z)).tolist() == [0, 7, 7, 2]
+
+
+DIRECTIONS = [(-1, 0, -1), (0.3, 0, 0.95), (-0.3, 0, -0.95), (0.2, -0.7, 0.4), (1e-3, 1, -1e-3), (0, 0, 1)]
+
+
+@pytest.mark.parametrize("parallel", [True, False])
+@pytest.mark.parametrize("distance", [0.4, 100.0, 3e7])
+@pytest.mark.parametrize("spacing", [1e-6, 1.0, 1e7])
+def test_no_ray_meets_a_brick_after_one_that_is_behind_it(spacing, distance, parallel):
+    """`distance` of the eye from the middle, in voxels. Rays of a parallel camera all run along its axis; of
+    the others, one to each corner of a brick is followed by its brick at 400 points."""
+    volume = jv.Volume(np.zeros((33, 33, 33), np.uint8), (spacing, spacing, 2 * spacing))
+    grid, space = BrickGrid(volume.shape, (16, 11, 20)), jv.March(1.0).locate(volume)
+    middle = np.asarray(volume.center, float)
+    for direction in DIRECTIONS:
+        forward = np.asarray(direction) / np.linalg.norm(direction)
+        eye = middle - distance * spacing * forward
+        scale = {"parallel_scale": 20.0 * spacing} if parallel else {}
+        camera = jv.Camera(eye, middle, (0.1, 1, 0.2), size=(8, 8), **scale)
+        place = np.argsort(grid.order(space, camera))
+        assert sorted(place) == list(range(grid.number))
+        nodes = np.stack(np.meshgrid(*np.linspace(0.5, 31.5, 4)[None].repeat(3, 0)), -1).reshape(-1, 3)
+        if parallel:
+            toward = np.broadcast_to(forward / (1, 1, 2), nodes.shape)
+        else:
+            toward = nodes - eye / (spacing, spacing, 2 * spacing)
+        along = np.linspace(-40, 40, 400)[:, None, None] * toward / np.linalg.norm(toward, axis=-1)[:, None]
+        points = nodes + along
+        ahead = np.sum((points - eye / (spacing, spacing, 2 * spacing)) * toward, -1) > 0
+        inside = np.all((points > 0) & (points < 32), -1) & (ahead | parallel)
+        bricks = np.asarray(grid.brick_of(tuple(jnp.asarray(c) for c in np.moveaxis(points, -1, 0))))
+        for ray in range(len(nodes)):
+            met = place[bricks[inside[:, ray], ray]]
+            assert np.all(np.diff(met) >= 0)

@@ -124,6 +124,19 @@ def test_views_of_memory_maps_are_read_from_the_file(tmp_path):
         assert_reads(source, view(data))
 
 
+@pytest.mark.parametrize("mode", ["r", "r+"])
+def test_a_memory_map_keeps_its_voxels_when_its_file_is_replaced(mode, tmp_path):
+    path, new = tmp_path / "data", tmp_path / "new"
+    path.write_bytes(b"\1" * np.prod(SHAPE))
+    mapped = np.memmap(path, np.uint8, mode, shape=SHAPE)
+    assert isinstance(source_of(mapped), FileSource)
+    new.write_bytes(b"\7" * np.prod(SHAPE))
+    new.replace(path)
+    source = source_of(mapped)
+    np.testing.assert_array_equal(source.read((0, 0, 0), SHAPE), 1)
+    assert source.fingerprint() is None
+
+
 def test_what_is_written_to_a_memory_map_is_read(tmp_path):
     data = voxels("uint8")
     mapped = np.memmap(tmp_path / "data", np.uint8, "w+", shape=SHAPE)

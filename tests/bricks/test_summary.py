@@ -22,7 +22,6 @@ from jaxvol.bricks.streaming import slabs
 from jaxvol.bricks.summary import scan
 from jaxvol.bricks.summary_files import summary_of
 from jaxvol.occupancy import BLOCK, Blocks
-from jaxvol.variation import Windows
 
 from ..scenes import in_float64
 from .test_sources import voxels, x_fastest
@@ -70,25 +69,22 @@ def reads(monkeypatch):
 # ---- slabs ----
 
 
-@pytest.mark.parametrize("margin", [False, True])
 @pytest.mark.parametrize("chunks", [(23, 18, 1), (1, 18, 33), (8, 8, 8), (5, 18, 7), (64, 64, 64)], ids=str)
 @pytest.mark.parametrize("memory", [1, 20_000, 60_000, 10**7])
-def test_each_block_is_in_one_slab_with_its_voxels(memory, chunks, margin):
+def test_each_block_is_in_one_slab_with_its_voxels(memory, chunks):
     data = voxels("uint16", SHAPE)
     source = ArraySource(data)
     x, y, z = (min(c, n) for c, n in zip(chunks, SHAPE, strict=True))
     source.chunks = (x, y, z)
     seen = np.zeros([-(-(n - 1) // BLOCK) for n in SHAPE], int)
-    for slab in slabs(source, memory, margin=margin):
+    for slab in slabs(source, memory):
         seen[tuple(slice(i, i + n) for i, n in zip(slab.first, slab.blocks, strict=True))] += 1
-        start = [BLOCK * (i - s) for i, s in zip(slab.first, slab.skipped, strict=True)]
+        start = [BLOCK * i for i in slab.first]
         place = tuple(slice(at, at + n) for at, n in zip(start, slab.voxels.shape, strict=True))
         np.testing.assert_array_equal(slab.voxels, data[place])
-        extra = BLOCK if margin else 0
         for axis, n in enumerate(SHAPE):
-            first, last = slab.first[axis], slab.first[axis] + slab.blocks[axis]
-            assert start[axis] == max(0, BLOCK * first - extra)
-            assert start[axis] + slab.voxels.shape[axis] == min(n, BLOCK * last + 1 + extra)
+            last = slab.first[axis] + slab.blocks[axis]
+            assert start[axis] + slab.voxels.shape[axis] == min(n, BLOCK * last + 1)
     assert np.all(seen == 1)
 
 
@@ -102,10 +98,9 @@ def test_memory_that_holds_the_volume_reads_it_at_once_and_less_in_many_slabs(re
     assert streaming.COPIES * max(sizes) <= 100_000
 
 
-@pytest.mark.parametrize("margin", [False, True])
-def test_chunks_are_read_once(margin, reads, tmp_path):
+def test_chunks_are_read_once(reads, tmp_path):
     source = source_of(written(tmp_path / "a.zarr", voxels("uint8", (96, 32, 32)), (16, 16, 16)))
-    list(slabs(source, 1_400_000 if margin else 500_000, margin=margin))
+    list(slabs(source, 500_000))
     assert len(reads) > 1
     assert all(low[0] % 16 == 0 and low[1:] == (0, 0) and high[1:] == (32, 32) for low, high in reads)
     assert sum(high[0] - low[0] for low, high in reads) == 96
@@ -122,28 +117,11 @@ def test_blocks_equal_those_of_the_volume_in_memory(dtype, shape):
         assert_equal(scan(source_of(data), memory=memory).blocks(), Blocks.of(jv.Volume(data)))
 
 
-@pytest.mark.parametrize("kind", ["raw", "npy", "zarr"])
-def test_slopes_and_windows_equal_those_of_the_volume_in_memory(kind, tmp_path):
-    shape, spacing = (45, 26, 33), (0.5, 1, 2)
-    data = voxels("int16", shape)
-    if kind == "raw":
-        source = source_of(x_fastest(tmp_path / "a.raw", data), shape=shape, dtype="int16")
-    elif kind == "npy":
-        np.save(tmp_path / "a.npy", data)
-        source = source_of(tmp_path / "a.npy")
-    else:
-        source = source_of(written(tmp_path / "a.zarr", data, (16, 16, 8)))
-    summary = scan(source, slopes=True, windows=True, memory=1_400_000)
-    volume = jv.Volume(data, spacing)
-    assert_equal(summary.blocks(spacing=spacing), Blocks.of(volume, slopes=True))
-    assert_equal(summary.windows(), Windows.of(volume))
-
-
 def test_a_real_volume(real_volume):
     path = real_volume("tooth_103x94x161_uint8.raw")
     volume = jv.load(path)
-    summary = summary_of(source_of(path), slopes=True, memory=2 * 10**7, cache=None)
-    assert_equal(summary.blocks(), Blocks.of(volume, slopes=True))
+    summary = summary_of(source_of(path), memory=2 * 10**7, cache=None)
+    assert_equal(summary.blocks(), Blocks.of(volume))
     for cell in (8, 20):
         coarse = scan(source_of(path), cell, memory=10**6)
         assert coarse.ranges["low"].shape == tuple(-(-(n - 1) // cell) for n in volume.shape)
@@ -182,27 +160,17 @@ def test_range_of_a_box_holds_its_voxels_and_no_more_than_its_blocks(cell):
 def test_blocks_of_a_brick_hold_those_of_the_brick_in_memory(low, cell):
     data = voxels("int16", SHAPE)
     high = (21, 17, 29)
-    summary = scan(source_of(data), cell, slopes=True, windows=True)
+    summary = scan(source_of(data), cell)
     brick = jv.Volume(data[tuple(map(slice, low, high))])
     found, own = summary.blocks(low, high), Blocks.of(brick)
     assert found.low.shape == own.low.shape
     assert jnp.all(found.low <= own.low)
     assert jnp.all(found.high >= own.high)
-    windows, own = summary.windows(low, high), Windows.of(brick)
-    assert jnp.all(windows.low <= own.low)
-    assert jnp.all(windows.high >= own.high)
     if cell == BLOCK and low[0] % 4 == 0:  # except at the brick's end, where blocks reach beyond it
-        exact = Blocks.of(jv.Volume(data), slopes=True)
+        exact = Blocks.of(jv.Volume(data))
         place = tuple(slice(i // 4, i // 4 + n) for i, n in zip(low, found.low.shape, strict=True))
         np.testing.assert_array_equal(found.low, exact.low[place])
-        assert found.slopes is not None
-        assert exact.slopes is not None
-        np.testing.assert_array_equal(found.slopes.high, exact.slopes.high[(slice(None), *place)])
-
-
-def test_windows_are_refused_where_nobody_asked_for_them():
-    with pytest.raises(ValueError, match=r"has no windows.*windows=True"):
-        scan(source_of(voxels("uint8", SHAPE))).windows()
+        np.testing.assert_array_equal(found.high, exact.high[place])
 
 
 @pytest.mark.parametrize("cell", [0, 2, 6, 4.0, None])
@@ -254,16 +222,26 @@ def assert_same(one, other):
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float16", "float32"])
 def test_a_finished_pass_is_not_repeated(dtype, tmp_path, reads):
     source = data_file(tmp_path, voxels(dtype, SHAPE))
-    first = summary_of(source, slopes=True)
+    first = summary_of(source)
     assert summary_files_in(tmp_path) == ["data.raw.jaxvol-summary-4.npz"]
     del reads[:]
     for again in (source, source_of(tmp_path / "data.raw", shape=SHAPE, dtype=dtype)):
-        assert_same(summary_of(again, slopes=True), first)
         assert_same(summary_of(again), first)
     assert reads == []
     summary_of(source, 8)
     assert reads != []
     assert len(summary_files_in(tmp_path)) == 2
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_others_may_read_the_file_as_far_as_they_may_read_new_files(mask, tmp_path):
+    before = os.umask(mask)
+    try:
+        summary_of(data_file(tmp_path, voxels("uint8", SHAPE)))
+    finally:
+        os.umask(before)
+    [path] = tmp_path.glob("*.npz")
+    assert path.stat().st_mode & 0o777 == 0o666 & ~mask
 
 
 def test_bfloat16_survives_the_file(tmp_path, reads):
@@ -278,16 +256,6 @@ def test_bfloat16_survives_the_file(tmp_path, reads):
     assert_same(summary_of(source), first)
     assert first.ranges["low"].dtype == ml_dtypes.bfloat16
     assert reads == []
-
-
-def test_more_ranges_are_added_to_those_that_were_known(tmp_path, reads):
-    source = data_file(tmp_path, voxels("uint8", SHAPE))
-    summary_of(source, slopes=True)
-    summary_of(source, windows=True)
-    del reads[:]
-    both = summary_of(source, slopes=True, windows=True)
-    assert reads == []
-    assert_same(both, scan(source, slopes=True, windows=True))
 
 
 def test_changed_data_get_a_new_summary(tmp_path):
@@ -338,7 +306,7 @@ def test_a_damaged_file_is_made_anew(tmp_path, reads):
 
 @pytest.mark.parametrize(
     "change",
-    [{"version": 0}, {"ranges": ["low"]}, {"ranges": 3}, {"ranges": ["about", "low", "high"]}, {"data": {}}],
+    [{"version": 0}, {"ranges": ["low"]}, {"cell": 8}, {"dtype": "uint16"}, {"data": {}}],
     ids=str,
 )
 def test_a_file_that_says_something_else_is_made_anew(change, tmp_path, reads):
@@ -428,7 +396,7 @@ def test_an_interrupted_pass_leaves_no_file_and_the_old_one_as_it_was(tmp_path, 
     before = file.read_bytes()
     monkeypatch.setattr(os, "replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        summary_of(source, slopes=True)
+        summary_of(data_file(tmp_path, voxels("uint8", SHAPE)[::-1]))
     assert summary_files_in(tmp_path) == [file.name]
     assert file.read_bytes() == before
 
