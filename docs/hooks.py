@@ -23,6 +23,8 @@ DOCS = "docs"
 OUTSIDE = (
     "CONTRIBUTING.md",
     "CITATION.cff",
+    "jaxvol/**/*.py",
+    "experiments/**/*.py",
     "experiments/results/*.md",
     "experiments/results/*.png",
     "experiments/results/*.html",
@@ -34,6 +36,7 @@ OUTSIDE = (
 SECTION = re.compile(r"^<!-- section (\S+): (.+?) -->$", re.MULTILINE)
 TABLE = re.compile(r"^<!-- table (\w+) -->$", re.MULTILINE)
 LINK = re.compile(r"(!?\[((?:[^\[\]]|!\[[^\]]*\]\([^)]*\))*)\])\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+PICTURE = re.compile(r"^(!\[[^\]]*\]\(([^)\s]+)\))$", re.MULTILINE)
 FENCE = re.compile(r"(^ *```.*?^ *```$)", re.DOTALL | re.MULTILINE)
 
 
@@ -51,6 +54,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     names = {file.src_uri for file in files}
     markdown = relinked(markdown, here if outside else f"{DOCS}/{here}", here, names)
     markdown = SECTION.sub(lambda m: relinked(section(m[1], m[2]), m[1], here, names), markdown)
+    markdown = PICTURE.sub(r"[\1](\2)", markdown)  # a click shows it in full size
     return TABLE.sub(lambda m: TABLES[m[1]](), markdown)
 
 
@@ -68,8 +72,8 @@ def section(file: str, heading: str) -> str:
 
 
 def relinked(text: str, source: str, page: str, names: set[str]) -> str:
-    """The text of the file `source` of the repository with its links as the site's `page` needs them. Links to
-    files that are not part of the site become their names; those that lead nowhere stay, and MkDocs says so."""
+    """The text of the file `source` of the repository, with its links as the site's `page` needs them. Links
+    to files that are not part of the site become their names; MkDocs reports those that lead nowhere."""
 
     def link(found: re.Match[str]) -> str:
         shown, label, target, anchor = found[1], found[2], found[3], found[4] or ""
@@ -89,7 +93,7 @@ def relinked(text: str, source: str, page: str, names: set[str]) -> str:
 def failures() -> str:
     """The failure atlas, one row an entry."""
     record = json.loads((ROOT / "experiments/results/stability.json").read_text(encoding="utf-8"))
-    lines = ["| entry | method | question | edge | beyond it |", "|---|---|---|---|---|"]
+    lines = ["| entry | question | edge | beyond it |", "|---|---|---|---|"]
     for name, entry in record["result"]["entries"].items():
         within, beyond = entry["edge"]["within"], entry["edge"]["beyond"]
         if beyond is None:
@@ -99,9 +103,9 @@ def failures() -> str:
         else:
             edge = f"between {within:.4g} and {beyond:.4g}"
         method = entry["method"].replace("jaxvol.", "")
-        cells = name, f"`{method}`", entry["question"], f"{edge} ({entry['regime']})"
+        cells = f"{name}<br>`{method}`", entry["question"], f"{edge} ({entry['regime']})"
         lines.append(f"| {' | '.join(cells)} | *{entry['outcome']}.* {entry['does']} |")
-    return "\n".join(lines).replace("|x|", "&#124;x&#124;")
+    return "\n".join(lines)
 
 
 def references() -> str:
@@ -110,7 +114,9 @@ def references() -> str:
     lines = ["| source | used by |", "|---|---|"]
     for work in cited["references"]:
         people = ", ".join(f"{a['given-names']} {a['family-names']}" for a in work["authors"])
-        parts = [work.get("journal") or work.get("collection-title") or work.get("institution", {}).get("name")]
+        parts = [
+            work.get("journal") or work.get("collection-title") or work.get("institution", {}).get("name")
+        ]
         if "volume" in work:
             issue = f"({work['issue']})" if "issue" in work else ""
             pages = f", {work['start']}–{work['end']}" if "start" in work else ""
