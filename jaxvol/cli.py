@@ -17,6 +17,7 @@ from ._util.checks import output_file
 from .camera import Camera
 from .compositing import Compositing, Over
 from .display import image_file, save_image
+from .figures import add_figures
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
 from .isosurface import Isosurface
@@ -214,6 +215,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     solver.add_argument("--progress", action="store_true", help="show a progress bar")
     fit_command.set_defaults(run=_fit)
+    add_figures(commands, shared)
     return parser
 
 

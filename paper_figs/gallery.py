@@ -103,7 +103,7 @@ def draw(page: Page, row: int, name: str, subject: Subject, paths: int) -> None:
         page.draw(row, column, np.clip(image, 0, 1), name if column == 0 else "", title if row == 0 else "")
 
 
-@figure(__doc__, resolution=128, size=240)
+@figure(__doc__, resolution=128, size=256)
 def main(chosen: Namespace) -> None:
     each = subjects(chosen.data, chosen.resolution, chosen.size)
     page = Page(4, len(each), chosen.size, "Kinds of light")
