@@ -16,6 +16,7 @@ from experiments import (
     lighting,
     minimum_distance,
     record,
+    redraw,
     speed,
     tomography,
 )
@@ -109,6 +110,14 @@ def test_all_figures_are_measured_and_rendered_anew(tmp_path):
     assert "rendered for this page" in page.read_text(encoding="utf-8")
     assert imread(tmp_path / "fig13.png").shape != imread(common.OUTPUT / "fig13.png").shape
     assert (tmp_path / "lee_tables.md").read_text() == (common.OUTPUT / "lee_tables.md").read_text()
+
+
+def test_charts_are_drawn_again_from_their_records(tmp_path):
+    images = {"path_traced", "tomography"}  # which no record holds
+    assert set(redraw.DRAWN) == set(EXPERIMENTS) - images
+    redraw.main(["--only", "speed", "overhead", "--output", str(tmp_path)])
+    for name in ("speed", "overhead"):
+        assert imread(tmp_path / f"{name}.png").shape == imread(record.RESULTS / f"{name}.png").shape
 
 
 def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_path, monkeypatch, capsys):
