@@ -212,11 +212,26 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
     return found
 
 
-def pictures(scene: Scene, templates: int, seed: int, path: Path) -> None:
-    """Save the head without light and with it, side by side."""
+def pictures(templates: int, seed: int, path: Path, size: int, resolution: int) -> None:
+    """Save the head without light and with it, side by side, under skin that nothing shows through."""
+    scene = skin_head(size, resolution)
+    opaque = replace(scene.transfer, extinction=OPAQUE * scene.transfer.extinction)
+    scene = scene._replace(transfer=opaque, step=scene.step / 4)
     lit = ScattererTemplates(FLESH, LIGHTS, templates=templates, blend=True)
-    both = [frame(scene, lighting, seed).image((1.0, 1.0, 1.0)) for lighting in (None, lit)]
-    jv.save_png(path, np.concatenate(both, axis=1))
+    figure, axes = plt.subplots(1, 2, figsize=(2 * size / 90, size / 90 + 0.4), layout="constrained")
+    titles = {
+        "unlit: colours of the transfer function": None,
+        "lit from the left, by scatterer templates": lit,
+    }
+    for panel, (title, lighting) in zip(axes, titles.items(), strict=True):
+        panel.imshow(jv.to_srgb(frame(scene, lighting, seed).image((0.0, 0.0, 0.0))))
+        panel.set_title(title, fontsize=11)
+        panel.axis("off")
+    common.save(figure, path)
+
+
+OPAQUE = 10.0
+"""Times the extinction of the skin that is measured, through which bones shine."""
 
 
 ASIDE = {
@@ -341,7 +356,8 @@ def main(chosen: Namespace) -> common.Answer:
 
     def charts(path: Path) -> None:
         draw(result, path)
-        pictures(scene, many, chosen.seed, path.with_name("lit.png"))
+        lit = (48, 24) if chosen.quick else (512, 192)
+        pictures(many // 2, chosen.seed, path.with_name("lit.png"), *lit)
 
     return result, charts
 

@@ -128,7 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     demo_command.add_argument(
         "--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels"
     )
-    demo_command.add_argument("--resolution", type=int, default=192, help="voxels per axis of the phantom")
+    demo_command.add_argument("--resolution", type=int, default=320, help="voxels per axis of the phantom")
     demo_command.set_defaults(run=_demo)
 
     render_command = commands.add_parser(
@@ -365,7 +365,8 @@ def _demo(options: argparse.Namespace) -> None:
     output_file("--output", options.output / "head.png")
     head = phantom("head", options.resolution)
     camera = Camera.looking_at(head, (0.65, -1, 0.15), size=size).zoom(1.45)
-    march = March(float(head.spacing[0]) / 2, FAST, "midpoint")
+    # steps of half a voxel would leave rings on the crown
+    march = March(float(head.spacing[0]) / 6, FAST, "midpoint")
     look, path = preset("head", unit_distance=0.01), options.output / "head.png"
     _picture(head, look, camera, march, path, lighting=Phong())
 
