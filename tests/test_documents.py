@@ -1,11 +1,9 @@
 """Do the examples in documents and docstrings run, and does the reference hold every public name?"""
 
 import ast
-import importlib
 import inspect
 import re
 import textwrap
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -13,8 +11,8 @@ import pytest
 
 import jaxvol as jv
 
+from .reference import ROOT, entries
 
-ROOT = Path(__file__).parent.parent
 
 BLOCK = re.compile(r"^( *)```python\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
@@ -125,18 +123,7 @@ def public(module):
 
 
 def test_the_reference_holds_every_public_name_once():
-    entries = [
-        line.removeprefix("::: ")
-        for page in PAGES
-        if page.startswith("docs/api/")
-        for line in (ROOT / page).read_text(encoding="utf-8").splitlines()
-        if line.startswith("::: ")
-    ]
-    assert len(set(entries)) == len(entries)
-    shown = []
-    for entry in entries:
-        module, _, name = entry.rpartition(".")
-        shown.append(getattr(importlib.import_module(module), name))
+    shown = list(entries().values())
     for module in (jv, jv.lighting, jv.bricks, jv.metrics):
         for name, value in public(module).items():
             count = sum(value is each for each in shown)
