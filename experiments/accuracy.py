@@ -232,15 +232,22 @@ def draw(result: dict[str, Any], path: Path) -> None:
         for panel in (times, errors):
             panel.set_xscale("log")
             panel.set_yscale("log")
-            panel.tick_params(labelsize=7, which="both")
+            panel.tick_params(labelsize=8, which="both")
         times.set_title(name, fontsize=9)
-        times.set_xlabel("RMSE", fontsize=8)
+        times.set_xlabel("RMSE of the image", fontsize=8)
         errors.set_xscale("log", base=2)
         errors.set_xticks(STEPS, [f"{s:g}" for s in STEPS])
         errors.set_xlabel("step, voxels", fontsize=8)
-        errors.set_title(f"{name}: narrow peak", fontsize=9)
+        errors.set_title(f"{name}, narrow peak", fontsize=9)
+        common.plain_numbers(times)
+        common.plain_numbers(errors)
+    figure.suptitle(
+        "Above: each point is a length of steps, the shorter the slower; below and to the left is better. "
+        "Below: a transfer function whose peak is 1 % of the range of values",
+        fontsize=9,
+    )
     axes[0, 0].set_ylabel(f"time of a frame of {result['pixels']}² pixels, ms", fontsize=8)
-    axes[1, 0].set_ylabel("RMSE", fontsize=8)
+    axes[1, 0].set_ylabel("RMSE of the image", fontsize=8)
     figure.legend(
         *axes[0, 0].get_legend_handles_labels(),
         loc="outside lower center",

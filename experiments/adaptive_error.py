@@ -135,16 +135,23 @@ def draw(result: dict[str, Any], path: Path) -> None:
     pixels.set_xscale("log")
     pixels.set_yscale("log")
     limits = pixels.get_xlim()
-    pixels.plot(limits, limits, "k-", linewidth=0.8)
+    pixels.plot(limits, limits, "k-", linewidth=0.8, label="as estimated")
+    pixels.legend(fontsize=7, loc="upper left")
     pixels.set_xlim(limits)
-    pixels.set_xlabel("estimated error of a pixel")
-    pixels.set_ylabel("true error (root mean square of a quarter of the pixels)")
+    pixels.set_xlabel("estimated error of a pixel (Rendering.error)")
+    pixels.set_ylabel("true error, root mean square")
+    pixels.set_title(
+        "below the line: estimates on the safe side (a point: a quarter of an image)", fontsize=9
+    )
+    images.set_title("below 1: within the tolerance", fontsize=9)
     images.axhline(1, color="k", linewidth=0.8)
     images.set_xscale("log")
     images.set_xlabel("tolerance")
     images.set_ylabel("RMSE of the image / tolerance")
     images.set_ylim(0, 1.5)
     images.legend(fontsize=7, ncols=2)
+    for panel in (pixels, images):
+        common.plain_numbers(panel)
     common.save(figure, path)
 
 

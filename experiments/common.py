@@ -20,6 +20,7 @@ from .scenes import Scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import NullFormatter
 
 
 FINER = 8
@@ -110,6 +111,21 @@ def row(seconds: list[float], base: list[float], error: float) -> dict[str, Any]
 
 def geometric_mean(values: Iterable[float]) -> float:
     return round(math.exp(np.mean(np.log(list(values)))), 4)
+
+
+def plain_numbers(panel: Any) -> None:
+    """Label logarithmic axes by numbers such as 0.002 and 20, not by powers of ten; on axes of few decades
+    also between these."""
+    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+        if axis.get_scale() == "log" and low > 0:
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(_few if high / low < 30 else NullFormatter())
+
+
+def _few(value: float, _: Any) -> str:
+    """Labels at 2 and 5 between powers of ten."""
+    lead = value / 10 ** math.floor(math.log10(value))
+    return f"{value:g}" if round(lead, 6) in (2, 5) else ""
 
 
 def save(figure: Any, path: Path) -> None:

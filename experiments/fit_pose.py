@@ -82,12 +82,14 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
             left.semilogy(range(1, len(losses) + 1), losses, color=color, alpha=0.5, label=label)
         degrees, shift = ([row[key] for row in rows] for key in GOALS)
         right.loglog(degrees, shift, "o", color=color, alpha=0.6)
-    left.set(xlabel="step, those of all stages together", ylabel="loss (of blurred images, if blurred)")
+    left.set(xlabel="step, those of all stages together", ylabel="mean squared difference of the images")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     right.plot(ANGLE, SHIFT, "k*", markersize=10)
     right.axvline(GOALS["degrees"], color="k", linestyle=":", linewidth=0.8)
     right.axhline(GOALS["shift"], color="k", linestyle=":", linewidth=0.8)
-    right.set(xlabel="rotation left, degrees (star: the start)", ylabel="shift left, part of the distance")
+    right.set(xlabel="rotation left, degrees", ylabel="shift left / distance to focal point")
+    right.set_title("after the last step; star: the start, dotted: what counts as led back", fontsize=8)
+    left.set_title("a line for each of the starts", fontsize=8)
     common.save(figure, path)
 
 

@@ -116,6 +116,10 @@ def measure(scene: Scene, size: int) -> dict[str, Any]:
     return {"truth": {k: np.asarray(getattr(truth, k)).tolist() for k in ("values", "extinction")}, **rows}
 
 
+UNDER: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 8}
+"""Where the text of a line stands."""
+
+
 def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
     figure, axes = plt.subplots(
         len(result), 2, figsize=(9, 3 * len(result)), squeeze=False, layout="constrained"
@@ -130,8 +134,9 @@ def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
             )
             right.plot(row["values"], row["extinction"], style, label=f"{name}: held out ≥ {least:.1f} dB")
         left.axhline(GOAL, color="k", linestyle=":", linewidth=0.8)
-        left.set(xlabel="step", ylabel=f"{scene}\nPSNR of the views seen, dB")
-        right.set(xlabel="value", ylabel="extinction (grey: the truth)")
+        left.text(0.99, GOAL, f"goal, {GOAL:g} dB", transform=left.get_yaxis_transform(), **UNDER)
+        left.set(xlabel="step of the fit", ylabel=f"{scene}\nPSNR of the views seen, dB")
+        right.set(xlabel="value", ylabel="extinction, 1/length (grey: the truth)")
         right.legend(fontsize=8)
     common.save(figure, path)
 

@@ -176,7 +176,7 @@ def measure(scene: Scene, methods: Sequence[str], size: int, seed: int) -> dict[
 
 
 def draw(scenes: dict[str, Any], path: Path) -> None:
-    figure, axes = plt.subplots(figsize=(7, 0.5 * len(scenes) + 1.8), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7, 0.5 * len(scenes) + 2.2), layout="constrained")
     for number, rows in enumerate(scenes.values()):
         for shift, (method, row) in enumerate(rows.items()):
             values, y = list(row["from forward"].values()), number + 0.14 * (shift - 2)
@@ -186,8 +186,12 @@ def draw(scenes: dict[str, Any], path: Path) -> None:
     axes.set_xscale("log")
     axes.set_yticks(range(len(scenes)), list(scenes))
     axes.invert_yaxis()
-    axes.set_xlabel("|g·d - slope| / |g|, a point for each leaf; dotted: the goal", fontsize=9)
-    figure.legend(loc="outside upper center", ncols=5, fontsize=8)
+    axes.set_xlabel(
+        "difference of the derivatives by replay and by forward mode along a random direction,\n"
+        "relative to the length of the gradient; a point for each leaf (colours, voxels, …);\ndotted: goal",
+        fontsize=8,
+    )
+    figure.legend(loc="outside upper center", ncols=5, fontsize=8, title="method of SpaceLeaping")
     common.save(figure, path)
 
 

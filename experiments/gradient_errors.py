@@ -187,8 +187,12 @@ def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path)
             panel.set_xticks(range(len(leaves)), leaves, rotation=40, ha="right", fontsize=8)
             panel.set_yticks(range(len(names)), names, fontsize=8)
     bar = figure.colorbar(axes.flat[-1].images[0], ax=axes, shrink=0.6, pad=0.01)
-    bar.set_label(f"|sum of gradients - change| / larger of both; in numbers from {WRONG:g} on", fontsize=8)
-    figure.suptitle(NOTE, fontsize=9)
+    bar.set_label(f"what the gradient misses of the change; as a number from {WRONG:g} on", fontsize=8)
+    figure.suptitle(
+        "How far the change of an image, as a leaf moves by so much, differs from the sum of its gradients: "
+        f"|sum - change| / the larger one.\n{NOTE}",
+        fontsize=9,
+    )
     common.save(figure, path)
 
 

@@ -96,7 +96,7 @@ def draw(sweeps: dict[str, Any], path: Path) -> None:
             times = np.array([row["seconds"] for row in found["sizes"].values()])
             spread = np.array([np.quantile(row["all seconds"], (0, 1)) for row in found["sizes"].values()])
             bars = np.abs(spread.T - times)
-            label = f"{method}: size^{found['slope']:.2f}"
+            label = f"{method}: time as size$^{{{found['slope']:.2f}}}$"
             panel.errorbar(sizes, times, bars, fmt=style, markersize=4, capsize=2, label=label)
             upper = np.array(sizes[-3:], float)
             middle = np.exp(np.mean(np.log(times[-3:])) - found["slope"] * np.mean(np.log(upper)))
@@ -109,7 +109,9 @@ def draw(sweeps: dict[str, Any], path: Path) -> None:
         panel.tick_params(labelsize=8)
         panel.legend(fontsize=8)
         panel.grid(alpha=0.3)
-    axes[0].set_ylabel("seconds a frame (median; least to most)", fontsize=9)
+    axes[0].set_ylabel("time of a frame, seconds", fontsize=9)
+    figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes", fontsize=9)
+    axes[0].yaxis.set_major_formatter("{x:g}")
     common.save(figure, path)
 
 

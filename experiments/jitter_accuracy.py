@@ -32,8 +32,8 @@ nodes, or between them, which has an error of its own that jitter would seem to 
 SLOPE = 0.35  # depth that the inclined plane gains per world length to the right
 NOTE = "Jitter turns structure into noise; the size of the error stays about what it was."
 PANELS = {
-    "wood grain": "wood grain energy (none ≤ 0 shown)",
-    "boundary noise": "noise on the cut face (none ≤ 0 shown)",
+    "wood grain": "wood grain energy (where above 0)",
+    "boundary noise": "noise on the cut face (where above 0)",
     "rmse off the face": "RMSE off the cut face",
     "time": "time / ray casting",
 }
@@ -146,7 +146,8 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
             if key != "time":
                 panel.set_yscale("log", nonpositive="mask")
             panel.set_xlabel("step, voxels", fontsize=8)
-            panel.tick_params(labelsize=7)
+            panel.tick_params(labelsize=7, which="both")
+            panel.xaxis.set_major_formatter("{x:g}")
         line[0].set_ylabel(scene, fontsize=9)
     figure.suptitle(f"{NOTE} {compared(result)}", fontsize=9)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)

@@ -191,6 +191,14 @@ def draw(result: dict[str, Any], path: Path) -> None:
         row[0].set_ylabel("speed-up over neither", fontsize=9)
     for panel in axes[0]:
         panel.axhline(GOAL, color="k", linewidth=0.8, linestyle=":")
+        panel.text(
+            0.01, GOAL, f"goal, {GOAL:g}", transform=panel.get_yaxis_transform(), va="bottom", fontsize=8
+        )
+    figure.suptitle(
+        "Early ray termination (ERT) and empty-space skipping (ESS) under two transfer functions (tf); "
+        "thin bars: 95 % intervals",
+        fontsize=9,
+    )
     figure.legend(*axes[1][0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
     common.save(figure, path)
 

@@ -212,22 +212,48 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
     return found
 
 
-def pictures(scene: Scene, templates: int, seed: int, path: Path) -> None:
-    """Save the head without light and with it, side by side."""
+def pictures(templates: int, seed: int, path: Path, size: int, resolution: int) -> None:
+    """Save the head without light and with it, side by side, under skin that nothing shows through."""
+    scene = skin_head(size, resolution)
+    opaque = replace(scene.transfer, extinction=OPAQUE * scene.transfer.extinction)
+    scene = scene._replace(transfer=opaque, step=scene.step / 4)
     lit = ScattererTemplates(FLESH, LIGHTS, templates=templates, blend=True)
-    both = [frame(scene, lighting, seed).image((1.0, 1.0, 1.0)) for lighting in (None, lit)]
-    jv.save_png(path, np.concatenate(both, axis=1))
+    figure, axes = plt.subplots(1, 2, figsize=(2 * size / 90, size / 90 + 0.4), layout="constrained")
+    titles = {
+        "unlit: colours of the transfer function": None,
+        "lit from the left, by scatterer templates": lit,
+    }
+    for panel, (title, lighting) in zip(axes, titles.items(), strict=True):
+        panel.imshow(jv.to_srgb(frame(scene, lighting, seed).image((0.0, 0.0, 0.0))))
+        panel.set_title(title, fontsize=11)
+        panel.axis("off")
+    common.save(figure, path)
+
+
+OPAQUE = 10.0
+"""Times the extinction of the skin that is measured, through which bones shine."""
+
+
+ASIDE = {
+    ("photons, deferred", 4): (-9, -9),
+    ("photons, deferred", 8): (5, 1),
+    ("baked, deferred", 128): (-18, 3),
+    ("one for each material", 34): (-16, -9),
+}
+"""Where numbers would overlap."""
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8.5), layout="constrained")
+    figure, axes = plt.subplots(2, 2, figsize=(11, 9), layout="constrained")
     cost, deferred, spread, energy = axes.flat
     for kind, rows in result["frames"].items():
         style = STYLES[kind]
         error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
         cost.plot(error, ratio, style, label=kind)
         for row, x, y in zip(rows, error, ratio, strict=True):
-            cost.annotate(str(row["number"]), (x, y), (4, 4), textcoords="offset points", fontsize=7)
+            if row["number"]:
+                shift = ASIDE.get((kind, row["number"]), (4, 4))
+                cost.annotate(str(row["number"]), (x, y), shift, textcoords="offset points", fontsize=7)
     for name, goal in GOALS.items():
         cost.axhline(goal, color="k", linewidth=0.8, linestyle=":")
         cost.text(
@@ -239,11 +265,20 @@ def draw(result: dict[str, Any], path: Path) -> None:
             va="bottom",
             transform=cost.get_yaxis_transform(),
         )
-    cost.set(xscale="log", yscale="log", xlabel="RMSE against many templates blended", ylabel="time / unlit")
+    cost.set(
+        xscale="log",
+        yscale="log",
+        xlabel="RMSE against many templates blended",
+        ylabel="time / that of an unlit frame",
+    )
+    cost.set_title("numbers: photons of a template, templates blended, or nodes baked", fontsize=9)
+    cost.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    cost.yaxis.set_major_formatter("{x:g}")
+    cost.yaxis.set_minor_formatter(NullFormatter())
     cost.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
     cost.xaxis.set_major_formatter("{x:g}")
     cost.xaxis.set_minor_formatter(NullFormatter())
-    cost.legend(fontsize=8)
+    figure.legend(*cost.get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8)
 
     rows = result["deferring"]
     for key, label, style in (("rmse", "deferred", "C4o--"), ("rmse of no light", "no light", "ko-")):
@@ -252,6 +287,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     deferred.set(ylabel="RMSE against light on all samples")
     for axis in (deferred.xaxis, deferred.yaxis):
         axis.set_major_formatter("{x:g}")
+    deferred.set_title("light once for each ray, from translucent to opaque skin", fontsize=9)
     deferred.legend(fontsize=8)
 
     rows = result["noise"]["blended"]
@@ -262,7 +298,9 @@ def draw(result: dict[str, Any], path: Path) -> None:
         result["noise"]["one for each pixel"], color="C0", label="one for each pixel, between pixels"
     )
     spread.set_xscale("log", base=2)
-    spread.set(yscale="log", xlabel="templates", ylabel="deviation / mean, on a flat face")
+    spread.xaxis.set_major_formatter("{x:g}")
+    spread.set_title("noise on a flat face", fontsize=9)
+    spread.set(yscale="log", xlabel="templates blended", ylabel="standard deviation / mean of the brightness")
     spread.yaxis.set_major_formatter("{x:g}")
     spread.yaxis.set_minor_formatter("{x:g}")
     spread.legend(fontsize=8)
@@ -272,7 +310,9 @@ def draw(result: dict[str, Any], path: Path) -> None:
         energy.plot(alpha, found, style, label=name)
     energy.plot(alpha, alpha / (1 - alpha), "k:", label="α / (1 - α)")
     energy.axhline(1, color="k", linewidth=0.8)
-    energy.set(yscale="log", xlabel="opacity α", ylabel="energy of a template")
+    energy.set(yscale="log", xlabel="opacity α of the material", ylabel="energy of a template (of 1)")
+    energy.set_title("sum of a template's intensities, by the form of the equations", fontsize=9)
+    energy.yaxis.set_major_formatter("{x:g}")
     energy.legend(fontsize=8)
     common.save(figure, path)
 
@@ -316,7 +356,8 @@ def main(chosen: Namespace) -> common.Answer:
 
     def charts(path: Path) -> None:
         draw(result, path)
-        pictures(scene, many, chosen.seed, path.with_name("lit.png"))
+        lit = (48, 24) if chosen.quick else (512, 192)
+        pictures(many // 2, chosen.seed, path.with_name("lit.png"), *lit)
 
     return result, charts
 

@@ -116,16 +116,19 @@ def draw(result: dict[str, Any], path: Path) -> None:
             times.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
             errors.axhline(rows[method]["rmse"], color=color, linestyle=line)
         for panel, label in (
-            (times, "time / distance map"),
+            (times, "time / that by the distance map"),
             (wrongs, "wrong pixels (> 1/255), %"),
-            (errors, "RMSE"),
+            (errors, "RMSE of the image"),
         ):
             panel.set_xscale("log", base=2)
             panel.set_xticks(cells, cells)
-            panel.set_xlabel("R, pixels", fontsize=8)
+            panel.set_xlabel("R, side of the grid's cells, pixels", fontsize=8)
             panel.set_title(f"{scene}: {label}", fontsize=9)
             panel.tick_params(labelsize=8)
             panel.set_ylim(0, 1.1 * panel.get_ylim()[1])
+        if not any(rows[named(method, cell)]["wrong"] for method in (PUBLISHED, OF_VOXELS) for cell in cells):
+            wrongs.set_ylim(0, 1)
+            wrongs.text(0.5, 0.5, "none, at any R", ha="center", fontsize=9, transform=wrongs.transAxes)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     common.save(figure, path)
 

@@ -175,7 +175,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
                 axis.plot(losses, f"{color}-", linewidth=0.8, alpha=0.6)
                 axis.plot(at, losses[at], f"{color}o" if at == trial["truth"] else f"{color}X", markersize=6)
             axis.set(yscale="log", xticks=range(len(numbers)), xticklabels=problem["labels"])
-            axis.set(xlabel=name, ylabel="held-out loss", title=f"noise {noise}")
+            axis.set(xlabel=name, ylabel="held-out loss", title=f"images with noise of {noise}")
         for truth, label in enumerate(problem["labels"][:TRUTHS]):
             left.plot([], [], f"C{truth}o-", label=f"truth {label}")
         left.legend(fontsize=7, title="marker: chosen", title_fontsize=7)
@@ -188,7 +188,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
             more = [c["more"] for c in counts.values()]
             truths = [c["truth"] for c in counts.values()]
             right.bar(places, more, width, truths, color="none", edgecolor=f"C{shift + 4}", hatch="////")
-        right.set(xticks=range(len(RULES)), ylabel="trials", title="filled: truth, hatched: more chosen")
+        right.set(xticks=range(len(RULES)), ylabel="trials")
+        right.set_title("filled: truth chosen; hatched: more", fontsize=9)
         right.set_xticklabels(["choose", "BIC", "least held-out loss"], fontsize=8)
         right.set_ylim(0, 1.25 * right.get_ylim()[1])
         right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)

@@ -80,10 +80,12 @@ def draw(conditions: dict[str, Any], sizes: Sequence[int], path: Path) -> None:
                 panel.plot(ratio["median"], y, "o", color=color, label=label)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(goal, color="k", linewidth=0.8, linestyle=":")
-        panel.set_title(f"{condition}, {pixels} x {pixels} pixels; dotted: {goal}", fontsize=9)
+        panel.set_title(f"{condition}, {pixels} x {pixels} pixels; dotted: goal, {goal}", fontsize=9)
         panel.set_yticks(range(volumes), list(measured))
     axes[0, 0].invert_yaxis()
-    figure.supxlabel("time of a frame / ray casting: median of paired ratios, 95 % interval", fontsize=9)
+    figure.supxlabel(
+        "time of a frame / that of ray casting: median of paired ratios, 95 % interval", fontsize=9
+    )
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
     common.save(figure, path)
 

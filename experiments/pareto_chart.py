@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter
 
 from . import common
 from .accuracy import DRJIT, VTK
@@ -66,6 +65,11 @@ def draw(result: dict[str, Any], path: Path) -> None:
         Line2D([], [], color="k", linewidth=1.2, label="jaxvol's front"),
         Line2D([], [], color="k", linewidth=0.8, linestyle=":", label="error of the reference"),
     ]
+    figure.suptitle(
+        "Each point is a method with its settings: the time of a frame against the error of its image; below "
+        "and to the left is better",
+        fontsize=11,
+    )
     figure.legend(handles=[*marks, *lines], loc="outside lower center", ncols=min(9, 3 * columns), fontsize=9)
     common.save(figure, path)
 
@@ -86,13 +90,5 @@ def _panel(panel: Any, name: str, scene: dict[str, Any]) -> None:
     panel.set(xscale="log", yscale="log", xlabel="RMSE")
     panel.set_title(f"{name}, {scene['pixels']}²", fontsize=10)
     panel.tick_params(labelsize=8, which="both")
-    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(_few if high / low < 30 else NullFormatter())
+    common.plain_numbers(panel)
     panel.grid(which="major", linewidth=0.3)
-
-
-def _few(value: float, _: Any) -> str:
-    """Labels at 2 and 5 between powers of ten."""
-    lead = value / 10 ** math.floor(math.log10(value))
-    return f"{value:g}" if round(lead, 6) in (2, 5) else ""

@@ -91,9 +91,12 @@ def measure(
 
 
 def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
-    figure, axes = plt.subplots(1, len(images), figsize=(2 * len(images), 2.7), layout="constrained")
+    columns = (len(images) + 1) // 2
+    figure, axes = plt.subplots(2, columns, figsize=(3 * columns, 7.4), layout="constrained")
+    for axis in axes.flat[len(images) :]:
+        axis.set_axis_off()
     white = np.quantile(images[TRACED], 0.995)  # shown as white in all images
-    for axis, (name, image) in zip(axes, images.items(), strict=True):
+    for axis, (name, image) in zip(axes.flat, images.items(), strict=False):
         axis.imshow(jv.to_srgb(np.clip(image / white, 0, 1)))
         row = rows[name]
         caption = (

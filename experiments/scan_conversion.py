@@ -114,9 +114,15 @@ def draw(result: dict[str, Any], path: Path) -> None:
     for panel, label in zip(axes, panels.values(), strict=True):
         panel.set_xscale("log", base=2)
         panel.set_yscale("log")
-        panel.set_xlabel("spacing / distance between samples", fontsize=8)
+        panel.set_xlabel("spacing of the grid / distance between samples", fontsize=8)
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.tick_params(labelsize=8, which="both")
+        panel.yaxis.set_major_formatter("{x:g}")
         panel.set_title(label, fontsize=9)
-    figure.suptitle("scan-converted (solid), as acquired (dashed)", fontsize=9)
+    figure.suptitle(
+        "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid",
+        fontsize=9,
+    )
     axes[0].legend(fontsize=7)
     common.save(figure, path)
 

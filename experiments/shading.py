@@ -85,6 +85,7 @@ def draw(scenes: dict[str, Any], path: Path) -> None:
         panel.set_xticks(range(len(bars)), labels, fontsize=8)
         panel.set_title(name, fontsize=9)
     axes[0][0].set_ylabel("time of a frame, ms", fontsize=9)
+    figure.suptitle("Frames shaded by the gradient (RMSE: of the shaded image), and unshaded", fontsize=9)
     common.save(figure, path)
 
 

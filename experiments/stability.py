@@ -57,7 +57,9 @@ def chart(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     panel.set_title(entry.name, fontsize=9)
     panel.set_xlabel(entry.regime, fontsize=7)
     panel.set_ylabel(textwrap.fill(entry.metric, 36), fontsize=7)
-    panel.tick_params(labelsize=7)
+    panel.tick_params(labelsize=7, which="both")
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.get_offset_text().set_size(7)
     panel.legend(fontsize=6, framealpha=0.7)
 
 
@@ -89,6 +91,14 @@ def _scale(panel: Any, name: Literal["x", "y"], scale: str, values: Sequence[flo
 
 def draw(result: dict[str, Any], pictures: dict[str, Pictures], path: Path) -> None:
     """The chart of all entries, and the page beside it."""
+    draw_chart(result, path)
+    entries = result["entries"]
+    families = {family: [e for e in row if e.name in entries] for family, row in FAMILIES.items()}
+    path.with_suffix(".html").write_text(page(families, entries, pictures, chart), encoding="utf-8")
+
+
+def draw_chart(result: dict[str, Any], path: Path) -> None:
+    """The chart of all entries, a panel each."""
     entries = result["entries"]
     rows = -(-len(entries) // COLUMNS)
     figure, axes = plt.subplots(
@@ -102,11 +112,11 @@ def draw(result: dict[str, Any], pictures: dict[str, Pictures], path: Path) -> N
     labels = [f"edge; beyond it: {outcome}" for outcome in OUTCOMES if outcome != "bounded"]
     figure.legend(handles[1:], labels, loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(
-        "Black: the curve that finds the edge. Dashed: the limit. Crosses: not finite.", fontsize=9
+        "From left to right a regime becomes harmful; upwards: an error. Black: the curve that finds the "
+        "edge. Dashed: the limit. Crosses: not finite.",
+        fontsize=9,
     )
     common.save(figure, path)
-    families = {family: [e for e in row if e.name in entries] for family, row in FAMILIES.items()}
-    path.with_suffix(".html").write_text(page(families, entries, pictures, chart), encoding="utf-8")
 
 
 @common.experiment(

@@ -194,9 +194,9 @@ def measure(truth: Density, views: int, photons: float | None, setting: Setting,
 
 def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
-    size = (10, 2.75 * len(result) + 3.2)
+    size = (12.4, 3.3 * len(result) + 3.2)
     figure = plt.figure(figsize=size, layout=ConstrainedLayoutEngine(h_pad=0.08))
-    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(2.75 * len(result), 3))
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(3.3 * len(result), 3))
     shown = upper.subplots(len(result), 1 + len(METHODS), squeeze=False)
     for number, (line, (photons, rows)) in enumerate(zip(shown, result.items(), strict=True)):
         pictures = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}

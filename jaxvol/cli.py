@@ -17,6 +17,7 @@ from ._util.checks import output_file
 from .camera import Camera
 from .compositing import Compositing, Over
 from .display import image_file, save_image
+from .figures import add_figures
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
 from .formats import load
 from .isosurface import Isosurface
@@ -127,7 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     demo_command.add_argument(
         "--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels"
     )
-    demo_command.add_argument("--resolution", type=int, default=192, help="voxels per axis of the phantom")
+    demo_command.add_argument("--resolution", type=int, default=320, help="voxels per axis of the phantom")
     demo_command.set_defaults(run=_demo)
 
     render_command = commands.add_parser(
@@ -214,6 +215,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     solver.add_argument("--progress", action="store_true", help="show a progress bar")
     fit_command.set_defaults(run=_fit)
+    add_figures(commands, shared)
     return parser
 
 
@@ -363,7 +365,8 @@ def _demo(options: argparse.Namespace) -> None:
     output_file("--output", options.output / "head.png")
     head = phantom("head", options.resolution)
     camera = Camera.looking_at(head, (0.65, -1, 0.15), size=size).zoom(1.45)
-    march = March(float(head.spacing[0]) / 2, FAST, "midpoint")
+    # steps of half a voxel would leave rings on the crown
+    march = March(float(head.spacing[0]) / 6, FAST, "midpoint")
     look, path = preset("head", unit_distance=0.01), options.output / "head.png"
     _picture(head, look, camera, march, path, lighting=Phong())
 

@@ -11,14 +11,28 @@ from ._util.checks import Arrayable, described, output_file
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
-    """Linear colour to sRGB display values, both in [0, 1]; values outside are clipped."""
+    """Linear colour to sRGB display values, both in [0, 1]; values outside are clipped.
+
+    **Arguments:** `linear`: colours, of any shape.
+
+    **Returns:** the values, of the same shape.
+
+    Source: IEC 61966-2-1.
+    """
     linear = jnp.clip(jnp.asarray(linear), 0, 1)
     curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
-    """sRGB display values (as of a matplotlib colormap) to linear colour, both in [0, 1]."""
+    """sRGB display values (as of a matplotlib colormap) to linear colour, both in [0, 1].
+
+    **Arguments:** `display`: values, of any shape.
+
+    **Returns:** the colours, of the same shape.
+
+    Source: IEC 61966-2-1.
+    """
     display = jnp.clip(jnp.asarray(display), 0, 1)
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
@@ -35,6 +49,7 @@ def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
 
     **Arguments:**
 
+    - `path`: of the file.
     - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
       (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
       may be infinite. 8-bit formats clip to [0, 1].
@@ -77,7 +92,12 @@ def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
 def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     """`save_image` for a path that must end in `.png`.
 
-    Writes linear RGB (height, width, 3) as 8-bit sRGB, premultiplied RGBA (height, width, 4) with alpha.
+    **Arguments:** `path`: of the file. `linear`: RGB (height, width, 3), which is written as 8-bit sRGB, or
+    premultiplied RGBA (height, width, 4), which is written with alpha.
+
+    **Returns:** the path.
+
+    **Raises:** `ValueError` as `save_image` does, and for another ending.
     """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")

@@ -28,6 +28,10 @@ PEAKS = 16
 def rmse(image: Any, reference: Any) -> float:
     """Root-mean-square difference over pixels and channels.
 
+    **Arguments:** `image`, `reference`: (height, width) or (height, width, channels), of one shape.
+
+    **Returns:** the difference, in the unit of the images.
+
     **Raises:** `ValueError` for NaN or infinity, shapes that differ, and input that is not an image.
     """
     image, reference = _pair(image, reference)
@@ -36,6 +40,10 @@ def rmse(image: Any, reference: Any) -> float:
 
 def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Peak signal-to-noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
+
+    **Arguments:** `image`, `reference`: as for `rmse`. `data_range`: the greatest value of an image, > 0.
+
+    **Returns:** the ratio, dB.
 
     **Raises:** as `rmse`, and `ValueError` for a `data_range` that is not positive.
     """
@@ -49,6 +57,10 @@ def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
 
 def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Mean structural similarity over windows of 7 x 7 pixels, then over channels; 1 for equal images.
+
+    **Arguments:** `image`, `reference`, `data_range`: as for `psnr`.
+
+    **Returns:** the similarity, at most 1.
 
     **Raises:** as `psnr`, and `ValueError` for an image with fewer than 7 pixels along a side.
 
@@ -68,9 +80,13 @@ def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: fl
 
     The plane's depth grows by one step, and the rings repeat, every `step / (pixel_size depth_slope)` pixels.
 
+    **Arguments:**
+
     - `step`: distance between samples, world length, > 0.
     - `depth_slope`: world depth gained per world length to the right and downwards in the image.
     - `pixel_size`: world length of a pixel, > 0.
+
+    **Returns:** the frequency to the right and downwards, cycles per pixel, as `wood_grain_energy` takes it.
 
     **Raises:** `ValueError` for a step or pixel size that is not positive, and slopes that are not finite.
     """
@@ -106,6 +122,14 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
     0). Noise added to waves lowers the result by up to 0.13 of its own energy, since it also raises the part
     attributed to chance. An edge counts as structure, a single pixel does not.
 
+    **Arguments:**
+
+    - `error`: an image minus its reference, (height, width) or (height, width, channels).
+    - `frequency`: to the right and downwards, cycles per pixel; None where it is not known.
+    - `harmonics`: how many are summed, with `frequency`.
+
+    **Returns:** the energy, in squared units of the error.
+
     **Raises:** `ValueError` for NaN or infinity, input that is not an image, an image smaller than a block,
     harmonics < 1, and a fundamental that cannot be separated from 0 or from its mirror image.
     """
@@ -126,8 +150,12 @@ def boundary_noise(image: Any, region: Any) -> float:
     the row and a function of the column gives 0, as does any quadratic; other smooth shading leaves its
     ∂⁴/∂x²∂y².
 
-    - `image`: an image, or an error.
+    **Arguments:**
+
+    - `image`: an image, or an error, (height, width) or (height, width, channels).
     - `region`: (height, width) booleans, for example where the bounds cut through material.
+
+    **Returns:** the variance, in squared units of the image.
 
     **Raises:** `ValueError` for NaN or infinity, input that is not an image, a region of another shape, and
     one that holds no 3 x 3 pixels.
@@ -155,6 +183,10 @@ def low_frequency_energy(error: Any, below: float = 1 / 16) -> float:
     """Energy of an error under `below` cycles per pixel, with its mean removed and a Hann window applied.
 
     Mean square per pixel, summed over channels. The default is the lowest eighth of what an image can hold.
+
+    **Arguments:** `error`: as for `wood_grain_energy`. `below`: in cycles per pixel.
+
+    **Returns:** the energy, in squared units of the error.
 
     **Raises:** `ValueError` for NaN or infinity, and input that is not an image.
     """

@@ -144,6 +144,8 @@ def preset(
       For example, CT stored as Hounsfield units + 1000 needs `clim=(0, 4000)`.
     - `unit_distance`: world length to which the preset's opacities refer; they are designed for 1 mm.
 
+    **Returns:** the `TransferFunction`, its colours linear.
+
     **Raises:** `ValueError` for an unknown name, and a `clim` that does not increase.
     """
     if not isinstance(name, str) or name not in PRESETS:
@@ -175,6 +177,8 @@ def colormap(
       to 10 over the range. An array in [0, 1]: opacities evenly spaced over the range.
     - `unit_distance`: thickness, in world length, of a layer that has these opacities.
     - `n_colors`: number of control points, at least 2.
+
+    **Returns:** the `TransferFunction`, its colours linear.
 
     **Raises:** `ValueError` for an unknown colormap, colour or opacity, opacities outside [0, 1], and a
     `clim` that does not increase.

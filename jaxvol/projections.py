@@ -103,6 +103,10 @@ class Minimum(Extreme):
     All else is as in `Maximum`, with less for greater: rays leap over blocks in which neither the values nor
     any that are greater are visible.
 
+    **Arguments:** `thickness`: as for `Maximum`.
+
+    **Raises:** `ValueError` for a thickness that is not a positive finite number.
+
     Source: VTK's MINIMUM_INTENSITY_BLEND.
     """
 

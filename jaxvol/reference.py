@@ -337,6 +337,7 @@ def render_ray_reference(
 
     **Arguments:**
 
+    - `volume`, `transfer`, `march`: what is there, how it looks, and where it is sampled.
     - `origin`, `direction`: world point and unit direction of the ray.
     - `pixel`: (column, row), which keys random numbers.
     - `compositing`: how cells become a pixel.

@@ -129,7 +129,9 @@ def render_rays(
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
-    """Renders arbitrary rays. As `render`, except:
+    """Renders arbitrary rays.
+
+    **Arguments:** as for `render`, except:
 
     - `origins`, `directions`: (*rays, 3) world points, and directions of any length but 0. Distances
       are measured in world length whatever the length of a direction.

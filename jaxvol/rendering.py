@@ -110,7 +110,9 @@ class Rendering(eqx.Module):
         return value
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
-        """Linear RGB over a background: one colour (3,), or an image of the same shape."""
+        """Linear RGB over a background: one colour (3,), or an image of the same shape.
+
+        **Raises:** `ValueError` for a background of another shape, or that is not finite."""
         background = self._background(background)
         if background.shape not in ((3,), (*self.rgba.shape[:-1], 3)):
             raise ValueError(

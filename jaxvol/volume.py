@@ -139,6 +139,8 @@ class Volume(eqx.Module):
           the grid are one-sided: continuous, with an error of O(spacing²) relative to the gradient of the
           sampled field. From the second node to the last but one, it equals the difference of the values one
           node to either side; for a `field`, it is that difference everywhere, over the part inside.
+
+        **Raises:** `ValueError` for another method.
         """
         if method == "trilinear":
             slopes = self._trilinear_slopes(coordinate)
@@ -151,7 +153,9 @@ class Volume(eqx.Module):
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
-        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one."""
+        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one.
+
+        **Raises:** `ValueError` for a volume without labels."""
         if self.labels is None:
             raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
         i, j, k = (
@@ -162,7 +166,9 @@ class Volume(eqx.Module):
         return fetched(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
-        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
+        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others.
+
+        **Raises:** `ValueError` for a volume without labels."""
         if self.labels is None:
             raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
         share = jnp.zeros_like(coordinate[0])

@@ -19,7 +19,7 @@ from .common import BLACK, Page, figure
 
 
 CELLS = (8, 16, 32, 64)
-WHOLE = 512 / 184  # size of the image over that of the part that is shown
+WHOLE = 2  # size of the image over that of the part that is shown
 MIDDLE = 0.38, 0.52
 GREEN = (0.0, 0.7, 0.05)
 

@@ -77,7 +77,7 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
 
 
 def figure(
-    about: str | None, resolution: int = 160, size: int = 184
+    about: str | None, resolution: int = 160, size: int = 256
 ) -> Callable[[Callable[[Namespace], None]], Main]:
     """Decorator that makes the `main` of a script that draws scenes of a function of its options.
 

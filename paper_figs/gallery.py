@@ -58,6 +58,11 @@ def frog(folder: Path, size: int) -> Subject:
     return matter(scene, 0.3, 3, (0.7, 0.6, 0.7))
 
 
+def upright(scene: Scene) -> Scene:
+    """The same view with up and down exchanged."""
+    return scene._replace(camera=replace(scene.camera, view_up=-scene.camera.view_up))
+
+
 def subjects(folder: Path | None, resolution: int, size: int) -> dict[str, Callable[[], Subject]]:
     if folder is None:
         return {
@@ -66,7 +71,7 @@ def subjects(folder: Path | None, resolution: int, size: int) -> dict[str, Calla
         }
     return {
         "an engine (CT)": lambda: matter(SCENES["engine"](folder, size), 0.3, 2, (-0.3, 0.9, 0.8)),
-        "a bonsai (CT)": lambda: matter(SCENES["bonsai"](folder, size), 0.3, 2, (0.6, -0.9, -0.7)),
+        "a bonsai (CT)": lambda: matter(upright(SCENES["bonsai"](folder, size)), 0.3, 2, (0.6, -0.9, -0.7)),
         "a head (CT)": lambda: lee_fig6.real(folder, size),
         "a chest (CT)": lambda: matter(SCENES["lidc0314_airway"](folder, size), 0.3, 2, (0.6, 0.9, -0.7)),
         "a frog (labels)": lambda: frog(folder, size),
@@ -103,7 +108,7 @@ def draw(page: Page, row: int, name: str, subject: Subject, paths: int) -> None:
         page.draw(row, column, np.clip(image, 0, 1), name if column == 0 else "", title if row == 0 else "")
 
 
-@figure(__doc__, resolution=128, size=240)
+@figure(__doc__, resolution=128, size=256)
 def main(chosen: Namespace) -> None:
     each = subjects(chosen.data, chosen.resolution, chosen.size)
     page = Page(4, len(each), chosen.size, "Kinds of light")

@@ -16,7 +16,10 @@ from .common import BLACK, Page, figure
 def main(chosen: Namespace) -> None:
     makers, more = (REAL, {}) if chosen.data else (PHANTOMS, {"resolution": chosen.resolution})
     page = Page(
-        2, len(makers), chosen.size, "KISTI report, Fig. V-1: early termination and empty-space skipping"
+        2,
+        len(makers),
+        chosen.size,
+        "KISTI report, Fig. V-1: a head and an engine under two transfer functions",
     )
     for row, (name, make) in enumerate(makers.items()):
         scene = make(chosen.data, chosen.size, **more)
@@ -24,7 +27,13 @@ def main(chosen: Namespace) -> None:
             march = jv.March(scene.step / 2, (*METHODS[NEITHER], jv.AlphaCorrection()), "midpoint")
             rendering = jv.render(*look[:3], march, lighting=Phong(), outputs="rgba")
             title = ("low values translucent", "all visible values opaque")[column]
-            page.draw(row, column, rendering.image(BLACK), f"{name}{column + 1}", title if row == 0 else "")
+            page.draw(
+                row,
+                column,
+                rendering.image(BLACK),
+                f"{name}, transfer function {column + 1}",
+                title if row == 0 else "",
+            )
     page.save(chosen.output / "kisti_fig.png")
 
 

@@ -51,6 +51,7 @@ ORDER = [
     "bricks",
     "fitting",
     "unseen",
+    "figures",
     "cli",
     "__main__",
     "__init__",

@@ -1,17 +1,18 @@
-"""Do the examples in documents and docstrings run, and are their results finite?"""
+"""Do the examples in documents and docstrings run, and does the reference hold every public name?"""
 
 import ast
 import inspect
 import re
 import textwrap
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+import jaxvol as jv
 
-ROOT = Path(__file__).parent.parent
+from .reference import ROOT, entries
+
 
 BLOCK = re.compile(r"^( *)```python\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
@@ -30,10 +31,14 @@ def docstrings(module):
     return [ast.get_docstring(node) or "" for node in nodes if isinstance(node, kinds)]
 
 
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
+
+
 def documents():
     """Name and examples of every document that has some. A document's examples share one namespace."""
-    for name in ("README.md", "CONTRIBUTING.md"):
-        yield name, examples((ROOT / name).read_text(encoding="utf-8"))
+    for name in ("README.md", "CONTRIBUTING.md", *PAGES):
+        if found := examples((ROOT / name).read_text(encoding="utf-8")):
+            yield name, found
     for module in sorted((ROOT / "jaxvol").rglob("*.py")):
         for text in docstrings(module):
             if found := examples(text):
@@ -102,6 +107,37 @@ def test_examples_are_found_wherever_they_stand():
 
 
 def test_every_link_to_a_file_leads_somewhere():
-    for document in ROOT.glob("*.md"):
+    for document in [*ROOT.glob("*.md"), *(ROOT / name for name in PAGES)]:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text(encoding="utf-8")):
-            assert (ROOT / target).exists(), f"{document.name} -> {target}"
+            assert (document.parent / target).exists(), f"{document.name} -> {target}"
+
+
+def public(module):
+    """What users may name of a module: its own objects, neither submodules nor what it imports."""
+    return {
+        name: value
+        for name, value in vars(module).items()
+        if name == "PRESETS"
+        or (getattr(value, "__module__", "").startswith("jaxvol") and not name.startswith("_"))
+    }
+
+
+def test_the_reference_holds_every_public_name_once():
+    shown = list(entries().values())
+    for module in (jv, jv.lighting, jv.bricks, jv.metrics):
+        for name, value in public(module).items():
+            count = sum(value is each for each in shown)
+            assert count == 1, f"{module.__name__}.{name} is {count} times in docs/api"
+
+
+def test_every_page_is_in_the_contents_of_the_documentation():
+    contents = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in PAGES:
+        assert f": {page.removeprefix('docs/')}\n" in contents, page
+
+
+def test_sections_that_the_documentation_takes_from_other_documents_exist():
+    for page in PAGES:
+        for file, heading in re.findall(r"<!-- section (\S+): (.+?) -->", (ROOT / page).read_text("utf-8")):
+            text = (ROOT / file).read_text(encoding="utf-8")
+            assert re.search(rf"^#+ {re.escape(heading)}$", text, re.MULTILINE), (page, file, heading)

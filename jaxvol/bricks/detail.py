@@ -40,10 +40,13 @@ def level_for(
     **Arguments:**
 
     - `levels`: of the same volume, finest first, all with spacing and origin (`levels_of`).
+    - `camera`: the view.
     - `transfer`, `summaries`: the transfer function, and the summary of each level (with `tolerance`) or at
       least of the finest. Without them, every point of the volume may be visible.
     - `pixels`: how many pixels a voxel may cover.
     - `tolerance`: an opacity, in (0, 1).
+
+    **Returns:** the index, 0 for the finest.
 
     **Raises:** `ValueError` for several levels of which one has no place in the world, and for a tolerance
     without transfer function and summaries.
@@ -117,6 +120,14 @@ def range_error(
     difference of two images. Ranges of blocks that only overlap a block count as its own, which forgives
     displacements of up to a block. 1 for a transfer function that reads the gradient, of which ranges of
     values tell nothing, and where it tells nothing of its variation.
+
+    **Arguments:**
+
+    - `levels`, `summaries`: of the same volume, finest first, and the summary of each.
+    - `level`: the index of the one that is compared with the finest.
+    - `transfer`: the transfer function.
+
+    **Returns:** the opacity.
     """
     fine, coarse = ((levels[k], summaries[k]) for k in (0, level))
     if level == 0 or transfer.reads_gradient:

@@ -178,6 +178,10 @@ def raw(
 ) -> FileSource:
     """A `.raw` file, x fastest. Shape and type, and spacing and origin, are found as by `jv.load`.
 
+    **Arguments:** `path`: of the file. `shape`, `dtype`, `spacing`, `origin`: as for `jv.load`.
+
+    **Returns:** the source. Nothing is read before it is asked for.
+
     **Raises:** `ValueError` for a compressed file, and one whose size is not what shape and type say."""
     if path.name.lower().endswith(".gz"):
         raise ValueError(
@@ -200,6 +204,10 @@ def npy(
     origin: tuple[float, float, float] | None = None,
 ) -> FileSource:
     """A `.npy` file, data[x, y, z].
+
+    **Arguments:** `path`: of the file. `spacing`, `origin`: as in `Volume`; by default unknown.
+
+    **Returns:** the source. Nothing but the header is read before it is asked for.
 
     **Raises:** `ValueError` for a damaged header, and a size that is not what it says."""
     size = file_size(path)

@@ -22,7 +22,14 @@ OF_RAW, OF_ZARR = ("shape", "dtype"), ("axes", "index", "missing")
 
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:
-    """The finest level of what `levels_of` opens, with the same options."""
+    """The finest level of what `levels_of` opens.
+
+    **Arguments:** `thing`, `options`: as for `levels_of`.
+
+    **Returns:** the source.
+
+    **Raises:** as `levels_of`.
+    """
     return levels_of(thing, **options)[0]
 
 
@@ -56,6 +63,8 @@ def levels_of(
     - `spacing`, `origin`: as in `Volume`, of the finest level; by default what the source says.
     - `shape`, `dtype`: of a raw file, as in `jv.load`.
     - `axes`, `index`, `missing`: of Zarr; see `zarr.ZarrSource`. OME-Zarr has its own axes.
+
+    **Returns:** a source for each level.
 
     **Raises:** `ValueError` for anything else, for options that do not belong to it, for a file that is
     missing, damaged, or larger or smaller than it says, and for shapes and types that no volume has;

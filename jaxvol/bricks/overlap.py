@@ -33,7 +33,17 @@ def heights(a: float, b: float, ranges: np.ndarray, grid: BrickGrid) -> list[flo
 
 
 def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
-    """K* of each face between two bricks along γ, in voxels, for a probe's grid."""
+    """By how much bricks must overlap at their curved faces along γ, so that each ray meets each brick once.
+
+    At a face at the distance l from the apex, K = l - l cos(θ/2), where θ is the angle of a brick's fan;
+    along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger counts.
+
+    **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
+
+    **Returns:** K* of each face between two bricks, from the probe outwards, voxels.
+
+    Source: Kim, Kwon and Shin 2008, section 3.2.
+    """
     ranges = np.array(
         [np.asarray(r, float) for r in (probe.beta_range, probe.sigma_range, probe.gamma_range)]
     )
@@ -41,7 +51,12 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
 
 
 def share(found: list[float], nodes: int) -> float:
-    """What the overlap adds to a volume of so many nodes along γ: whole layers at each face."""
+    """What the overlap adds to a volume: whole layers at each face.
+
+    **Arguments:** `found`: the overlap of each face, from `overlap_of`. `nodes`: of the volume along γ.
+
+    **Returns:** the part of the volume that is read twice.
+    """
     return sum(math.ceil(k) for k in found) / nodes
 
 

@@ -112,6 +112,8 @@ class VoxelSource(ABC):
 class ArraySource(VoxelSource):
     """Voxels of an array in memory, data[x, y, z], of any memory layout. It is not copied.
 
+    **Arguments:** `data`: the array. `spacing`, `origin`: as in `Volume`; by default unknown.
+
     **Raises:** `ValueError` for arrays of a shape or type that no volume has, and for traced ones.
     """
 

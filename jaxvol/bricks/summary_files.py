@@ -38,9 +38,12 @@ def summary_of(
 
     **Arguments:**
 
+    - `source`: the voxels.
     - `cell`, `memory`, `progress`: see `summary.scan`. `progress` is called only in a pass.
     - `cache`: where files lie. `"beside"`: beside the data, `NAME.jaxvol-summary-CELL.npz`; a folder: in it;
       None: nowhere. Arrays in memory have no files, and neither has a memory map that is open for writing.
+
+    **Returns:** the summary.
 
     **Raises:** `ValueError` as `summary.scan` does, and if the source changes during the pass. A file that
     cannot be written is a warning. A pass that is interrupted leaves files as they were.

@@ -45,7 +45,10 @@ def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
 
     **Arguments:**
 
+    - `transfer`: the transfer function.
     - `points`: their number, at least that of `transfer`.
+
+    **Returns:** a `TransferFunction` that shows the same.
 
     **Raises:** `ValueError` for fewer points, and where the float type has no values left between two.
     """
@@ -91,6 +94,8 @@ def nested_points(
     - `points`: increasing numbers of control points. Each candidate has those of the one before, and others
       between.
     - `of_each`: other fields of each `Candidate`, such as `constraints`.
+
+    **Returns:** the candidates, for `choose`, from the fewest points to the most.
 
     **Raises:** `ValueError` for numbers that do not increase, or fewer than `start` has.
     """
@@ -151,6 +156,8 @@ def nested_materials(
       the mean free path of a `Material`, and all of anything else. What is not shared stays as in `parts`.
     - `constraints`, `where`: as for `fit`, of one part. The default fits what the default of `fit` does: the
       mean free path, or colours and extinction.
+
+    **Returns:** the candidates, for `choose`, in the order of `partitions`.
 
     **Raises:** `ValueError` for no parts, and for partitions that do not match these or are not nested.
     """

@@ -34,6 +34,8 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
       `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`, as
       `Camera` takes them.
 
+    **Returns:** a pair for each image: its `Camera`, and the picture, linear RGB.
+
     **Raises:** `ValueError`, naming the file, if it is missing or holds anything else.
     """
     entries = _json(cameras)
@@ -53,6 +55,10 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
 def read_transfer(path: File) -> TransferFunction:
     """Read a transfer function from a JSON file with the fields `values`, `colors` and `extinction`.
 
+    **Arguments:** `path`: of the file.
+
+    **Returns:** the `TransferFunction`.
+
     **Raises:** `ValueError`, naming the file, if it is missing or holds anything else."""
     fields = _fields(str(path), _json(path), TRANSFER, TRANSFER)
     try:
@@ -63,6 +69,10 @@ def read_transfer(path: File) -> TransferFunction:
 
 def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
     """Write a transfer function in the format that `read_transfer` reads.
+
+    **Arguments:** `path`: of the file. `transfer`: a `TransferFunction`.
+
+    **Returns:** the path.
 
     **Raises:** `ValueError` for other kinds of them, which that format does not hold."""
     if not isinstance(transfer, TransferFunction):

@@ -19,6 +19,8 @@ def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = No
     - `points`: number of control points, at least 2, evenly spaced.
     - `clim`: their range (low, high), in value units; by default that of the volume's values.
 
+    **Returns:** the `TransferFunction`, of colours 0.5.
+
     **Raises:** `ValueError` for fewer than two points, and for a range that does not increase.
     """
     points = integer("points", points, 2)

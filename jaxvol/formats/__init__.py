@@ -143,6 +143,8 @@ def register(ending: str, reader: Reader) -> None:
     - `reader`: `reader(path, header)` returns a dict of arguments of `Volume`: `data`, and those of
       `spacing`, `origin` and `labels` that the file holds. A reader of files that contain their shape and
       type calls `header.refuse(path)`. `path` exists, and may be a directory.
+
+    **Raises:** `ValueError` for an ending without a dot.
     """
     if not ending.startswith("."):
         raise ValueError(f'ending must start with a dot, such as ".vti"; got {ending!r}.')

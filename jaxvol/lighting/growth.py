@@ -55,6 +55,7 @@ def scatterer_template(
 
     **Arguments:**
 
+    - `material`: its opacity, mean free path λ and refractive index.
     - `key`: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.
     - `packets`: how many packets share the light, of energy 1, at the origin. Their directions are spread
       evenly and rotated at random. One packet makes a lopsided template.
@@ -72,6 +73,7 @@ def scatterer_template(
       `"printed"`: the paper's equations (1) to (3) as printed, although misprinted: I' = α I, after I is
       multiplied by exp(-Δx / λ) cos θ, where θ is the angle of incidence and its cosine is drawn uniformly.
       The energy is not 1; without these factors (`flights=False`) it is α / (1 - α), above 1 for α > ½.
+    - `flights`: with printed energy, whether each flight weakens a packet by the factor of equation (1).
     - `critical_angle`: degrees, in (0, 90]. By default that of total reflection between the material and
       air: arcsin of 1/n, or of n if n is below 1.
     - `merge`: photons closer than this fraction of λ are merged, and their intensities added. The photons in
@@ -117,7 +119,8 @@ def scatterer_templates(
 ) -> ScattererTemplate:
     """Several templates for each of several materials, grown at once.
 
-    **Arguments:** as for `scatterer_template`, and `count`: templates per material.
+    **Arguments:** `materials`: one or several. `count`: templates per material. The others, `how` among them,
+    are as for `scatterer_template`.
 
     **Returns:** a `ScattererTemplate` with leading axes (materials, count). The draws are keyed by the index
     of the material and that of the template.

@@ -128,8 +128,11 @@ def material(name: str, *, millimetre: float = 1.0, **where: Arrayable) -> Mater
 
     **Arguments:**
 
+    - `name`: of the material.
     - `millimetre`: length of 1 mm in world units, if these are not mm.
-    - `values` or `label`: as for `Material`.
+    - `where`: `values` or `label`, as for `Material`.
+
+    **Returns:** the `Material`, its mean free path in world length.
 
     **Raises:** `ValueError` for any other name, and as `Material` does.
     """

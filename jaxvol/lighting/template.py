@@ -54,7 +54,9 @@ class ScattererTemplate(eqx.Module):
         return ScattererTemplate(offset, intensity).sorted()
 
     def save(self, path: str | Path) -> None:
-        """Write the template to a NumPy file, `.npz`."""
+        """Write the template to a NumPy file, `.npz`.
+
+        **Raises:** `ValueError` for another ending; `OSError` for a path that cannot be written."""
         path = Path(path)
         if path.suffix != ".npz":
             raise ValueError(f"path must end in .npz; got {path}.")
@@ -62,7 +64,9 @@ class ScattererTemplate(eqx.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "ScattererTemplate":
-        """Read a template written by `save`. **Raises** `ValueError` naming what is wrong with the file."""
+        """Read a template written by `save`.
+
+        **Raises:** `ValueError` naming what is wrong with the file."""
         arrays = read_arrays(Path(path), ("offset", "intensity"))
         offset, intensity = arrays["offset"], arrays["intensity"]
         if offset.shape != (*intensity.shape, 3) or intensity.ndim < 1:

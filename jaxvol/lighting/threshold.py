@@ -133,6 +133,13 @@ def template_capacity(
     energy: Energy | Any = "conserving",
 ) -> int:
     """Number of photons that a template has room for: a tree of as many levels as may hold a photon above
-    the threshold, and no more than energy 1 could fill. Arguments as for `scatterer_template`."""
+    the threshold, and no more than energy 1 could fill.
+
+    **Arguments:** `material`, `packets`, `threshold`, `threshold_on`, `energy`: as for `scatterer_template`.
+
+    **Returns:** the number, before photons are merged.
+
+    **Raises:** `ValueError` as `scatterer_template` does, and for a traced opacity.
+    """
     ends = Threshold.checked(packets, threshold, threshold_on, energy)
     return ends.capacity(ends.levels(material))

@@ -108,6 +108,8 @@ def path_trace(
       is that of all paths at once, up to rounding.
     - `lanes`: paths that are traced side by side. Memory grows with it; the result does not change.
 
+    **Returns:** a `PathTraced` of leading shape (height, width), with the standard error of each pixel.
+
     **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function without
     a majorant, labels where the volume has none, `onto` of another size or key, and lanes or paths that do
     not fit into memory; `RuntimeError` if it is differentiated (grad or jvp) with respect to any of its

@@ -61,6 +61,11 @@ along +z | none |
     | `sphere` | float32 | 1 / (1 + exp((r - 0.5) / 0.008)) | none |
     | `constant`, `linear`, `gaussian` | float32 | 1; (x + 1) / 2; exp(-r² / (2 · 0.3²)) | none |
 
+    **Arguments:** `name`: of the table. `resolution`: nodes along each axis, at least 8. `seed`: of what the
+    table's last column names.
+
+    **Returns:** the `Volume`; that of `labels` has labels.
+
     **Raises:** `ValueError` for an unknown name, a resolution that is not an integer of at least 8,
     and a seed that is not a non-negative integer.
     """

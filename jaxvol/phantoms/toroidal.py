@@ -52,6 +52,7 @@ spheres; wires 255 |
 
     **Arguments:**
 
+    - `name`: of the table.
     - `shape`: nodes along (β, σ, γ), at least 8 each. The data are stored as acquired, `data[β, σ, γ]`,
       depth fastest in memory.
     - `probe`: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.

@@ -116,6 +116,8 @@ class EmptySpaceJitter(Transform):
 
     Where it fails, and where not: `experiments/stability.py`, "wood grain without empty samples".
 
+    **Raises:** `ValueError` for an invalid seed or pattern.
+
     Source: Kye 2013, section 3.1.
     """
 

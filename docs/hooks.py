@@ -1,0 +1,140 @@
+"""What the documentation takes from the rest of the repository, so that nothing is written twice.
+
+- Documents and pictures outside `docs/` become part of the site, at their own paths. Links work in both
+  places: a page of `docs/` names `../paper_figs/README.md`, as it must where the repository is read.
+- `<!-- section FILE: HEADING -->` is replaced by the text under that heading of a Markdown file.
+- `<!-- table failures -->` and `<!-- table references -->` are replaced by tables made from the record of the
+  failure atlas and from CITATION.cff.
+"""
+
+import json
+import os
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mkdocs.structure.files import File
+
+
+ROOT = Path(__file__).parent.parent
+DOCS = "docs"
+OUTSIDE = (
+    "CONTRIBUTING.md",
+    "CITATION.cff",
+    "jaxvol/**/*.py",
+    "experiments/**/*.py",
+    "experiments/results/*.md",
+    "experiments/results/*.png",
+    "experiments/results/*.html",
+    "paper_figs/README.md",
+    "paper_figs/output/*.png",
+)
+"""Files outside `docs/` that become part of the site."""
+
+SECTION = re.compile(r"^<!-- section (\S+): (.+?) -->$", re.MULTILINE)
+TABLE = re.compile(r"^<!-- table (\w+) -->$", re.MULTILINE)
+LINK = re.compile(r"(!?\[((?:[^\[\]]|!\[[^\]]*\]\([^)]*\))*)\])\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+PICTURE = re.compile(r"^(!\[[^\]]*\]\(([^)\s]+)\))$", re.MULTILINE)
+FENCE = re.compile(r"(^ *```.*?^ *```$)", re.DOTALL | re.MULTILINE)
+
+
+def on_files(files: Any, config: Any) -> Any:
+    for pattern in OUTSIDE:
+        for path in sorted(ROOT.glob(pattern)):
+            name = path.relative_to(ROOT).as_posix()
+            files.append(File.generated(config, name, abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    here = page.file.src_uri
+    outside = not (ROOT / DOCS / here).is_file()
+    names = {file.src_uri for file in files}
+    markdown = relinked(markdown, here if outside else f"{DOCS}/{here}", here, names)
+    markdown = SECTION.sub(lambda m: relinked(section(m[1], m[2]), m[1], here, names), markdown)
+    markdown = PICTURE.sub(r"[\1](\2)", markdown)  # a click shows it in full size
+    return TABLE.sub(lambda m: TABLES[m[1]](), markdown)
+
+
+def section(file: str, heading: str) -> str:
+    """The text under a heading of a Markdown file, up to the next heading of its level or above."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    found = re.search(rf"^(#+) {re.escape(heading)}\n", text, re.MULTILINE)
+    if found is None:
+        raise ValueError(f"{file} has no heading {heading!r}.")
+    code = [match.span() for match in FENCE.finditer(text)]
+    for end in re.finditer(rf"^#{{1,{len(found[1])}}} ", text, re.MULTILINE):
+        if end.start() >= found.end() and not any(a <= end.start() < b for a, b in code):
+            return text[found.end() : end.start()].strip()
+    return text[found.end() :].strip()
+
+
+def relinked(text: str, source: str, page: str, names: set[str]) -> str:
+    """The text of the file `source` of the repository, with its links as the site's `page` needs them. Links
+    to files that are not part of the site become their names; MkDocs reports those that lead nowhere."""
+
+    def link(found: re.Match[str]) -> str:
+        shown, label, target, anchor = found[1], found[2], found[3], found[4] or ""
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
+        name = path.removeprefix(f"{DOCS}/")
+        if name in names:
+            return f"{shown}({posixpath.relpath(name, posixpath.dirname(page) or '.')}{anchor})"
+        if not (ROOT / path).exists():
+            return found[0]
+        return label if label.strip("`") == path else f"{label} (`{path}`)"
+
+    parts = FENCE.split(text)
+    parts[::2] = [LINK.sub(link, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def failures() -> str:
+    """The failure atlas, one row an entry."""
+    record = json.loads((ROOT / "experiments/results/stability.json").read_text(encoding="utf-8"))
+    lines = ["| entry | question | edge | beyond it |", "|---|---|---|---|"]
+    for name, entry in record["result"]["entries"].items():
+        within, beyond = entry["edge"]["within"], entry["edge"]["beyond"]
+        if beyond is None:
+            edge = "none in the sweep"
+        elif within is None:
+            edge = f"before {beyond:.4g}"
+        else:
+            edge = f"between {within:.4g} and {beyond:.4g}"
+        method = entry["method"].replace("jaxvol.", "")
+        cells = f"{name}<br>`{method}`", entry["question"], f"{edge} ({entry['regime']})"
+        lines.append(f"| {' | '.join(cells)} | *{entry['outcome']}.* {entry['does']} |")
+    return "\n".join(lines)
+
+
+def references() -> str:
+    """The papers of CITATION.cff."""
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    lines = ["| source | used by |", "|---|---|"]
+    for work in cited["references"]:
+        people = ", ".join(f"{a['given-names']} {a['family-names']}" for a in work["authors"])
+        parts = [
+            work.get("journal") or work.get("collection-title") or work.get("institution", {}).get("name")
+        ]
+        if "volume" in work:
+            issue = f"({work['issue']})" if "issue" in work else ""
+            pages = f", {work['start']}–{work['end']}" if "start" in work else ""
+            parts.append(f"{work['volume']}{issue}{pages}")
+        parts.append(str(work["year"]) if "year" in work else None)
+        url = f"https://doi.org/{work['doi']}" if "doi" in work else work.get("url")
+        title = f"[{work['title']}]({url})" if url else work["title"]
+        place = ", ".join(part for part in parts if part)
+        lines.append(f"| {people}: {title}. {place} | {work['notes']} |")
+    return "\n".join(lines)
+
+
+TABLES = {"failures": failures, "references": references}
+
+
+def on_post_build(config: Any) -> None:
+    """The site needs no list of its pages for search engines, whose dates differ from build to build."""
+    for name in ("sitemap.xml", "sitemap.xml.gz"):
+        path = Path(config["site_dir"]) / name
+        if path.exists():
+            os.remove(path)

@@ -1,0 +1,85 @@
+"""Draws charts again from their records; nothing is measured.
+
+`python -m experiments.redraw` draws all, `--only speed kisti` some. `path_traced.png`, `tomography.png`,
+`lit.png` and `stability.html` show images that no record holds: their experiments alone draw them.
+"""
+
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from . import (
+    accuracy,
+    adaptive_error,
+    common,
+    fit_pose,
+    fit_transfer,
+    gradient_agreement,
+    gradient_errors,
+    growth,
+    jitter_accuracy,
+    kisti,
+    lighting,
+    mean_free_path,
+    minimum_distance,
+    model_choice,
+    overhead,
+    pareto_chart,
+    planning,
+    record,
+    scan_conversion,
+    shading,
+    speed,
+    stability,
+)
+from .command import command
+
+
+DRAWN: dict[str, Callable[[Any, Path], None]] = {
+    "accuracy": accuracy.draw,
+    "adaptive_error": adaptive_error.draw,
+    "fit_pose": lambda result, path: fit_pose.draw(result["starts"], path),
+    "fit_transfer": lambda result, path: fit_transfer.draw(result["scenes"], path),
+    "gradient_agreement": lambda result, path: gradient_agreement.draw(result["scenes"], path),
+    "gradient_errors": lambda result, path: gradient_errors.draw(
+        result["relative errors"], result["widths"], path
+    ),
+    "growth": lambda result, path: growth.draw(result["sweeps"], path),
+    "jitter_accuracy": lambda result, path: jitter_accuracy.draw(
+        {scene: rows for scene, rows in result.items() if scene != "note"}, path
+    ),
+    "kisti": kisti.draw,
+    "lighting": lighting.draw,
+    "mean_free_path": mean_free_path.draw,
+    "minimum_distance": minimum_distance.draw,
+    "model_choice": model_choice.draw,
+    "overhead": lambda result, path: overhead.draw(result["conditions"], result["sizes"], path),
+    "pareto": pareto_chart.draw,
+    "planning": planning.draw,
+    "planning_seed_1": planning.draw,
+    "scan_conversion": scan_conversion.draw,
+    "shading": lambda result, path: shading.draw(result["scenes"], path),
+    "speed": speed.draw,
+    "stability": stability.draw_chart,
+}
+"""By the name of a record, what draws its result."""
+
+
+@command(
+    __doc__,
+    record.RESULTS,
+    results={"type": Path, "default": record.RESULTS, "metavar": "FOLDER", "help": "that of the records"},
+    only=common.some_of(DRAWN, "NAME"),
+)
+def main(chosen: Namespace) -> None:
+    for name in chosen.only:
+        file = chosen.results / f"{name}.json"
+        if not file.is_file():
+            raise ValueError(f"--results must hold the record {name}.json; {chosen.results} does not.")
+        DRAWN[name](record.read(file)["result"], chosen.output / f"{name}.png")
+        print(chosen.output / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,237 @@
+"""Which figures and tables there are: what each paper shows and reports, and how ours is made.
+
+`index.py` makes a page of these. A new script of this folder needs an entry here.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+PAPERS = {
+    "kye": "Kye 2013: empty-space jittering and sampling alignment",
+    "chae": "Chae and Shin: space leaping with a minimum-distance grid",
+    "kim": "Kim, Kwon and Shin 2008: bricking of large ultrasound volumes",
+    "kisti": "KISTI report 2005: early ray termination and empty-space skipping",
+    "lee": "Lee, Kwon and Shin 2016: scatterer templates",
+    "own": "Not from a paper",
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A figure or table of a paper.
+
+    - `name`: of the script, and of what it writes.
+    - `paper`: a key of `PAPERS`. `title`: what the paper calls it, and what it is about.
+    - `reported`: what the paper shows and reports. `ours`: what to look at in ours.
+    - `source`: `"record"`: drawn from the record `record` of an experiment; `"formula"`: computed in seconds;
+      `"scene"`: a scene is rendered, which takes minutes, so that the kept picture is its record.
+    - `data`: whether the kept picture shows real volumes (`--data`).
+    """
+
+    name: str
+    paper: str
+    title: str
+    reported: str
+    ours: str
+    source: Literal["record", "formula", "scene"] = "scene"
+    record: str | None = None
+    data: bool = False
+
+    @property
+    def file(self) -> str:
+        """Name of the file that the script writes."""
+        return f"{self.name}.{'md' if self.name in TABLES else 'png'}"
+
+
+TABLES = "table1", "kim_table1", "kisti_table", "lee_tables"
+"""Scripts that write a table, in Markdown."""
+
+ENTRIES = (
+    Entry(
+        "fig01",
+        "kye",
+        "Fig. 1: wood grain, and the noise of jitter",
+        "CT of a head: rings on the skin under ray casting; jittered sampling removes them and makes the "
+        "faces noisy that the bounds of the volume cut.",
+        "A phantom stands in for the CT. The energy of the wood grain falls, the noise on the cut face "
+        "rises, and the RMSE stays: jitter turns structure into noise.",
+    ),
+    Entry(
+        "fig09",
+        "kye",
+        "Fig. 9: the head",
+        "Empty-space jittering removes the rings and leaves the cut face smooth.",
+        "The boundary noise of the third column is that of the first; that of the second is far above.",
+    ),
+    Entry(
+        "fig10",
+        "kye",
+        "Fig. 10: the heart",
+        "As Fig. 9, on CT of a heart.",
+        "An engine, cut open, in place of the heart.",
+    ),
+    Entry(
+        "fig11",
+        "kye",
+        "Fig. 11: the kidney",
+        "As Fig. 9, on CT of a kidney.",
+        "Soft tissue with a colon, cut across, in place of the kidney.",
+    ),
+    Entry(
+        "fig12",
+        "kye",
+        "Fig. 12: sampling alignment",
+        "Where rays leave the volume through vessels, the back face is bumpy without alignment and smooth "
+        "with it.",
+        "Terraces under ray casting, noise under jitter, and neither with alignment (last column).",
+    ),
+    Entry(
+        "fig13",
+        "kye",
+        "Fig. 13: the pixels that alignment changes",
+        "A mask: only rays that reach a back face that is not transparent are changed.",
+        "The same mask, in green.",
+    ),
+    Entry(
+        "table1",
+        "kye",
+        "Table 1: time of a frame",
+        "Seconds at 1024 x 1024 pixels on the four cores of a laptop, head / heart / kidney / vessels: ray "
+        "casting 0.767 / 3.728 / 1.768 / 1.192; jittered 0.771 / 3.741 / 1.765 / 1.196; empty-space "
+        "jittered 0.775 / 3.739 / 1.771 / 1.199; aligned as well 0.775 / 3.745 / 1.772 / 1.216. The text "
+        "says that the overhead is below 1 %; the rows of head and vessels have 1.0 and 2.0 %.",
+        "Ratios to ray casting, with their 95 % intervals, and the paper's as rows of the same table.",
+        "record",
+        "overhead",
+    ),
+    Entry(
+        "chae_fig5",
+        "chae",
+        "Fig. 5: time against the size of the grid's cells",
+        "At R = 8, 53 % less time than with the distance map alone, in CT of a colon of 512 x 512 x 541 "
+        "voxels. Larger and smaller cells gain less.",
+        "The cross is the paper's number. Ours, off a distance map of voxels (orange points against the "
+        "orange line), gains nothing: that map alone leaves little to gain.",
+        "record",
+        "minimum_distance",
+    ),
+    Entry(
+        "chae_fig6",
+        "chae",
+        "Fig. 6: images against the size of the grid's cells",
+        "R = 8 and 16 look like the reference; R = 32 distorts visibly.",
+        "Wrong pixels are green. At R = 32 and 64 parts of folds are missing: the method is not "
+        "conservative.",
+    ),
+    Entry(
+        "kim_table1",
+        "kim",
+        "Table 1: overlap and rates by split",
+        "1280 x 490 x 325 voxels on a card of 768 MB, 375 x 375 pixels: 22.87 frames a second with overlap and "
+        "20.88 by reloading at the best split, 2,4,2, where 0.63 % is overlap. Rule: keep that below 3 %.",
+        "The formula gives the paper's overlap column, up to a unit that is not explained. Rates follow the "
+        "number of loads, not the overlap.",
+        "record",
+        "bricks",
+    ),
+    Entry(
+        "kim_fig6",
+        "kim",
+        "Fig. 6: the order of bricks",
+        "Bricks are rendered in the order of the depth of their centres.",
+        "The numbers are our order; the red ray leaves a brick through its curved face and comes back.",
+    ),
+    Entry(
+        "kim_fig8",
+        "kim",
+        "Fig. 8: samples in the wrong order",
+        "A fetus with wrong colours where bricks without overlap are blended, and without them.",
+        "A phantom; the difference stands beside the images, since it is up to 0.1 along the curved faces.",
+    ),
+    Entry(
+        "kim_fig9",
+        "kim",
+        "Fig. 9: rate against the size of bricks",
+        "The best rates lie between 4 and 64 bricks; some splits are 10 times slower than their neighbours.",
+        "The paper's rates above, ours below, on the same splits.",
+        "record",
+        "bricks",
+    ),
+    Entry(
+        "kisti_fig",
+        "kisti",
+        "Fig. V-1: two volumes under two transfer functions",
+        "CT of an engine (256 x 256 x 110) and of a head (256 x 256 x 225). Transfer function 1: low values "
+        "translucent, high ones opaque; 2: all visible values opaque.",
+        "Open CT of a head and an engine. The report gives neither its transfer functions nor its views.",
+        data=True,
+    ),
+    Entry(
+        "kisti_table",
+        "kisti",
+        "The table of speed-ups",
+        "At 256 x 256 / 512 x 512, ERT + ESS: 2.60 / 3.48 and 3.14 / 4.55 (head), 2.38 / 3.22 and 2.78 / "
+        "4.08 (engine). Early termination is tested every 16 slices.",
+        "The first table is shaded, as in the report, the second unshaded; the third gives the speed-up "
+        "(and the time) by how many samples lie between two tests. The report's numbers are rows of the "
+        "tables.",
+        "record",
+        "kisti",
+    ),
+    Entry(
+        "lee_fig1",
+        "lee",
+        "Fig. 1: one packet, and four",
+        "A template grown from one packet of light is lopsided; four packets spread it.",
+        "The centre of light lies farther from the sample (the cross) with one packet.",
+    ),
+    Entry(
+        "lee_tables",
+        "lee",
+        "Tables 1 to 3: the photons of templates",
+        "Intensities of the brightest photons (last column). First photons are α/4 of four packets; some "
+        "are brighter, where light landed on another photon. 0.00945, 0.48284 and 0.48282 lack a zero.",
+        "Other random draws, so that only the first rows of each table need agree.",
+        "formula",
+    ),
+    Entry(
+        "lee_fig_steps",
+        "lee",
+        "The six steps of shading",
+        "The lit side; occlusion; brightness; the colour from inside; other materials; the cut-off.",
+        "One column for each step: a scene above, and what one change makes of it below.",
+    ),
+    Entry(
+        "lee_fig4",
+        "lee",
+        "Fig. 4: an ear before a head",
+        "A thin part before a thick one shines though no light reaches it, unless photons are tested at "
+        "multiples of their distance as well.",
+        "The brightness of the ear falls with the second test.",
+    ),
+    Entry(
+        "lee_fig5",
+        "lee",
+        "Fig. 5: thin parts",
+        "Thin parts shade one another and let light through.",
+        "A hand of our own, beside Phong's shading, which has no shadows.",
+    ),
+    Entry(
+        "lee_fig6",
+        "lee",
+        "Fig. 6: without and with templates",
+        "Photographs of a body (Visible Korean), unlit and lit: 42 to 56 frames a second without, 20 to 24 "
+        "with templates, about 2.2 times the time of a frame.",
+        "Two phantoms. The noise of the middle column comes from one template for each pixel; blending "
+        "removes it. Time, from the record of `experiments/lighting.py`: 2.2 times a Phong-lit frame.",
+    ),
+    Entry(
+        "gallery",
+        "own",
+        "All kinds of light",
+        "",
+        "Rows: five scenes. Columns: emission, Phong, scatterer templates, path tracing.",
+        data=True,
+    ),
+)

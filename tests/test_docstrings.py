@@ -1,0 +1,106 @@
+"""Do the docstrings of public names say what goes in, what comes out, and which errors are raised?"""
+
+import ast
+import inspect
+import re
+import textwrap
+from typing import Any
+
+import pytest
+
+from jaxvol import arguments
+from jaxvol._util import checks
+
+from .reference import entries
+
+
+ENTRIES = {
+    path: thing for path, thing in entries().items() if inspect.isclass(thing) or inspect.isfunction(thing)
+}
+CHECKS = {
+    name
+    for module in (checks, arguments)
+    for name, value in vars(module).items()
+    if inspect.isfunction(value) and re.search(r"\braise\b", inspect.getsource(value))
+}
+"""Functions that raise for bad input."""
+SECTIONS = "Arguments", "Returns", "Raises"
+
+
+def tree(thing) -> Any:
+    return ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
+
+
+def raises(function):
+    """Whether a function's own code raises, or calls a check of arguments that does."""
+    nodes = list(ast.walk(function))
+    called = {
+        node.func.id for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+    return any(isinstance(node, ast.Raise) for node in nodes) or bool(called & CHECKS)
+
+
+def parameters(function):
+    given = function.args
+    every = [*given.posonlyargs, *given.args, *given.kwonlyargs]
+    every += [each for each in (given.vararg, given.kwarg) if each is not None]
+    return [each.arg for each in every if each.arg not in ("self", "cls")]
+
+
+def text(thing):
+    """A docstring, and those of public names that it refers to: "as for `render`", "as `rmse`"."""
+    own = inspect.getdoc(thing) or ""
+    names = re.findall(r"\b[Aa]s (?:for|in) `(?:jv\.)?(\w+)`", own)
+    return own + "".join(
+        inspect.getdoc(other) or "" for path, other in ENTRIES.items() if path.rpartition(".")[2] in names
+    )
+
+
+def lacks(thing):
+    """What the docstring of a public name lacks."""
+    doc, node = inspect.getdoc(thing) or "", tree(thing)
+    found = [] if len(doc) > 20 else ["a docstring"]
+    made = node
+    if inspect.isclass(thing):
+        own = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+        made = own.get("__init__")
+        for name, method in own.items():
+            shown = ast.get_docstring(method)
+            if shown and not name.startswith("_") and any(isinstance(n, ast.Raise) for n in ast.walk(method)):
+                found += [] if "**Raises:**" in shown + doc else [f"Raises of {name}"]
+    elif not (
+        node.returns is None or (isinstance(node.returns, ast.Constant) and node.returns.value is None)
+    ):
+        found += [] if "**Returns:**" in doc else ["Returns"]
+    if made is not None:
+        found += [] if "**Raises:**" in doc or not raises(made) else ["Raises"]
+        if names := parameters(made):
+            found += [] if "**Arguments:**" in doc else ["Arguments"]
+            found += [f"`{name}`" for name in names if f"`{name}`" not in text(thing)]
+    return found
+
+
+@pytest.mark.parametrize("path", ENTRIES)
+def test_a_public_docstring_says_what_goes_in_what_comes_out_and_what_is_raised(path):
+    assert lacks(ENTRIES[path]) == []
+
+
+@pytest.mark.parametrize("path", ENTRIES)
+def test_sections_are_written_alike(path):
+    """So that the reference shows them alike: in bold, in this order, with a colon."""
+    doc = inspect.getdoc(ENTRIES[path]) or ""
+    at = [doc.find(f"**{name}:**") for name in SECTIONS if f"**{name}:**" in doc]
+    assert at == sorted(at)
+    for name in SECTIONS:
+        assert doc.count(f"**{name}:**") <= 1
+        assert not re.search(rf"^\s*{name}:|\*\*{name}\*\*", doc, re.MULTILINE)
+
+
+def test_a_gap_is_found():
+    def function(step: float, size: int) -> float:
+        """Something that is said about `step`, and nothing else."""
+        if step < 0:
+            raise ValueError
+        return step * size
+
+    assert lacks(function) == ["Returns", "Raises", "Arguments", "`size`"]
