@@ -106,7 +106,7 @@ def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]
 def draw(result: dict[str, Any], path: Path) -> None:
     """Time and memory against the size."""
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
-    sizes = result["sizes"]
+    sizes, at = result["sizes"], [int(size) for size in result["resident"]]
     for kind, color in zip(FORMATS, ("C0", "C1"), strict=True):
         rows = [result["bricks"][kind][str(size)] for size in sizes]
         for panel, name in zip(axes, SCENES, strict=False):
@@ -114,7 +114,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
         axes[2].plot(sizes, [peak(row) for row in rows], f"{color}o-")
         axes[2].axhline(allowed(result, kind), color=color, linestyle=":")
     for panel, name in zip(axes, SCENES, strict=False):
-        at = [int(size) for size in result["resident"]]
         panel.plot(at, [seconds(row[name]) for row in result["resident"].values()], "ks--", label="in memory")
         panel.set_title(f"{name}: seconds for an image", fontsize=9)
     axes[2].plot(at, [peak(row) for row in result["resident"].values()], "ks--")

@@ -52,6 +52,7 @@ def measure(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[st
     raw = {"shape": (voxels,) * 3, "dtype": "uint8"} if path.suffix == ".raw" else {}
     jax.block_until_ready(camera.position + 1)  # JAX is up
     found: dict[str, Any] = {"before": round(peak(), 1)}
+    volume = None
     if memory is None:
         begun = time.perf_counter()
         data = np.fromfile(path, np.uint8).reshape((voxels,) * 3).T
@@ -60,7 +61,7 @@ def measure(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[st
         found["seconds to read"] = round(time.perf_counter() - begun, 3)
 
     def image(transfer: jv.TransferFunction) -> jv.Rendering:
-        if memory is None:
+        if volume is not None:
             return jv.render(volume, transfer, camera, march, outputs="rgba")
         where = {"spacing": spacing, "origin": origin, "memory": memory}
         return jv.render_bricks(path, transfer, camera, march, outputs="rgba", **where, **raw)
@@ -70,14 +71,14 @@ def measure(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[st
         begun = time.perf_counter()
         rendering = jax.block_until_ready(image(transfer))
         row["first seconds"] = round(time.perf_counter() - begun, 3)
-        row["seconds"] = []
+        row["seconds"], before = [], read()
         for _ in range(REPETITIONS):
             begun, before = time.perf_counter(), read()
             rendering = jax.block_until_ready(image(transfer))
             row["seconds"].append(round(time.perf_counter() - begun, 3))
         row["peak"] = round(peak() - found["before"], 1)
         row["mean"] = np.mean(np.asarray(rendering.rgba, np.float64), (0, 1)).tolist()
-        if memory is None:
+        if volume is not None:
             samples = jv.render(volume, transfer, camera, march).samples
             row["samples"] = int(np.sum(np.asarray(samples), dtype=np.int64))
         else:
