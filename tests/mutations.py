@@ -152,8 +152,8 @@ MUTATIONS = [
     Mutation(
         "files: the gap between rows is not stepped over",
         "bricks/files.py",
-        "between = row_stride if whole_rows else row * size",
-        "between = row * size",
+        "(rows, row), self._type, run, 0, (row_stride, size)",
+        "(rows, row), self._type, run, 0, (row * size, size)",
         ("bricks/test_sources.py::test_raw_files_are_read_in_rows_and_in_planes[uint8-16384-4194304]",),
     ),
     Mutation(
@@ -197,6 +197,54 @@ MUTATIONS = [
         "np.argsort(depth, ",
         "np.argsort(-depth, ",
         ("bricks/test_render_bricks.py::test_bricks_of_a_real_volume_look_like_the_whole",),
+    ),
+    Mutation(
+        "bricks: of parallel rays, a slow one along an axis counts as none",
+        "bricks/grid.py",
+        "np.sign(rate)",
+        "np.sign(np.where(np.abs(rate) < 1e-6, 0, rate))",
+        (
+            "bricks/test_render_bricks.py::"
+            "test_no_ray_meets_a_brick_after_one_that_is_behind_it[10000000.0-100.0-True]",
+        ),
+    ),
+    Mutation(
+        "bricks: cells of curved rays are looked for behind their last sample",
+        "bricks/ranges.py",
+        " & (index < march.most_samples)",
+        "",
+        ("bricks/test_split.py::test_no_cells_are_looked_for_behind_the_last_sample_of_a_ray",),
+    ),
+    Mutation(
+        "bricks: nodes are as far apart near a box as in it",
+        "bricks/split.py",
+        "_distances(space, low - nodes, high + nodes)",
+        "_distances(space, low, high)",
+        (
+            "bricks/test_split.py::"
+            "test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes[near apex-12.0]",
+        ),
+    ),
+    Mutation(
+        "bricks: one may have more voxels than a volume",
+        "bricks/split.py",
+        "math.prod(stored) <= MOST_VOXELS and ",
+        "",
+        ("bricks/test_split.py::test_a_brick_has_fewer_voxels_than_a_volume_may_have",),
+    ),
+    Mutation(
+        "bricks: voxels outside of the ranges found before are rendered",
+        "bricks/stream.py",
+        "if float(voxels.min()) < least or float(voxels.max()) > most:",
+        "if False:",
+        ("bricks/test_split.py::test_voxels_outside_of_the_ranges_found_before_are_refused[250]",),
+    ),
+    Mutation(
+        "files: another file under the name of a memory map is taken for it",
+        "bricks/files.py",
+        "return source if source.holds(array) else None",
+        "return source",
+        ("bricks/test_sources.py::test_a_memory_map_keeps_its_voxels_when_its_file_is_replaced[r]",),
     ),
     Mutation(
         "bricks: nothing is read around them but what interpolation needs",
@@ -1366,8 +1414,8 @@ MUTATIONS = [
     Mutation(
         "scan conversion: integers are cut, not rounded",
         "scan_conversion.py",
-        'value = jnp.rint(value) if dtype.kind in "ui" else value',
-        "value = 1 * value",
+        "jnp.clip(jnp.rint(value), ",
+        "jnp.clip(value, ",
         ("test_scan_conversion.py::test_the_type_may_be_another_and_integers_are_rounded_not_cut",),
     ),
     Mutation(

@@ -69,6 +69,7 @@ class Margin:
     def of_box(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> Node:
         """Nodes along each axis that are read around the cells that begin in a box."""
         far = nodes_within(space, shape, low, high, self.length)
+        low, high = np.maximum(low - far, 0), np.minimum(high + far, np.asarray(shape) - 1)
         x, y, z = far + self.of_points(space, shape, low, high) + (0 if is_straight(space) else 1)
         return int(x), int(y), int(z)
 

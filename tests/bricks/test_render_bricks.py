@@ -82,6 +82,7 @@ def test_bricks_of_a_real_volume_look_like_the_whole(engine, bricks):
     found = jv.render_bricks(volume, TRANSFER, camera, march, bricks=bricks)
     assert_same(whole, found)
     assert found.bricks.counts == bricks
+    assert np.any(np.less(found.bricks.stored, volume.shape))
     assert found.bricks.loads <= found.bricks.needed
     assert found.bricks.reloads == 0
     np.testing.assert_array_equal(found.aligned, whole.aligned)
@@ -126,6 +127,7 @@ def test_every_way_to_render_bricks_looks_like_the_whole(engine, way):
     whole = jv.render(volume, transfer, camera, march, **options)
     found = jv.render_bricks(volume, transfer, camera, march, bricks=(2, 3, 2), **options)
     assert_same(whole, found)
+    assert np.all(np.less(found.bricks.stored, volume.shape)[:2])  # or no margin would be seen
     if way == "isosurface":
         np.testing.assert_allclose(found.normal, whole.normal, atol=1e-4)
 
@@ -171,6 +173,7 @@ def test_bricks_of_a_curved_grid_are_read_once_each(bricks):
 def test_without_overlap_bricks_are_read_again(bricks):
     found = of_fog("reload", bricks)
     assert_same(whole_fog(), found)
+    assert bricks != (1, 1, 4) or found.bricks.stored[2] < 64  # or no margin would be seen
     assert found.bricks.loads > found.bricks.needed
     assert found.bricks.reloads == found.bricks.loads - found.bricks.needed
 
@@ -348,6 +351,7 @@ def test_a_file_is_rendered_within_its_budget(tmp_path):
     assert_same(jv.render(jv.Volume(data), TRANSFER, camera, march), found)
     assert found.bricks.bytes_held <= 200_000
     assert np.prod(found.bricks.counts) > 1
+    assert np.any(np.less(found.bricks.stored, data.shape))
     assert steps == [(done + 1, found.bricks.needed) for done in range(found.bricks.loads)]
     [kept] = tmp_path.glob("*.npz")
     before = kept.stat().st_mtime_ns
