@@ -64,7 +64,7 @@ def render_bricks(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     level: int | Literal["auto"] | Any = "auto",
-    tolerance: float | None = None,
+    tolerance: float | Any | None = None,
     cache: Literal["beside"] | str | Any | None = "beside",
     progress: Callable[[int, int], Any] | None = None,
     devices: Devices | Any | None = None,
@@ -186,7 +186,7 @@ def bricks_of(
     march: March,
     *,
     memory: int,
-    compositing: Mode | Compositing[Any] = "over",
+    compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | None = None,
     cache: Any = "beside",
 ) -> Stream:
@@ -205,7 +205,7 @@ def _scene_of(
     transfer: Transfer,
     camera: Camera,
     march: March,
-    compositing: Mode | Compositing[Any],
+    compositing: Mode | Compositing[Any] | Any,
     lighting: Lighting | None,
 ) -> Scene:
     """The scene of a source, without its voxels. `place`: its spacing and origin."""
