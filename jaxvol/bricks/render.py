@@ -64,7 +64,7 @@ def render_bricks(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     level: int | Literal["auto"] | Any = "auto",
-    tolerance: float | None = None,
+    tolerance: float | Any | None = None,
     cache: Literal["beside"] | str | Any | None = "beside",
     progress: Callable[[int, int], Any] | None = None,
     devices: Devices | Any | None = None,

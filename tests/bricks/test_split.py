@@ -3,7 +3,7 @@
 import math
 from functools import cache
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from jaxvol.engine.parts import set_out
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import ScattererTemplates
 
-from ..scenes import in_float64
+from ..scenes import in_float64, to_float64
 from .test_render_bricks import SIDE, SUN, TRANSFER, assert_same, fog
 
 
@@ -97,8 +97,8 @@ def test_light_is_looked_for_among_more_nodes_near_the_apex():
     )
     assert apex[0] >= SHAPE[0]
     assert apex[1] >= SHAPE[1]
-    across = margin.light / (1.8 / 47 * (62 - 8))  # world distance of beams, 8 mm nearer to the apex
-    assert far[1] <= math.ceil(across) + 3
+    depth = 2 + 60 * 60 / 63 - margin.light  # of what is read nearest to the apex, up to a node
+    assert far[1] <= math.ceil(margin.light / (1.8 / 47 * (depth - 1))) + margin.around < SHAPE[1]
 
 
 # ---- within memory ----
@@ -177,31 +177,32 @@ def test_voxels_outside_of_the_ranges_found_before_are_refused(value, tmp_path, 
 # ---- cells of curved rays ----
 
 
-def cells_of_fog(march, brick=0):
-    """The cells of an image's rays in a brick of the fog, at the beginning of a march."""
+def scene_of_fog(march):
     volume, _, transfer = fog()
-    place = np.ones(3, volume.spacing.dtype), np.zeros(3, volume.spacing.dtype)
-    options = RenderOptions("all", Tiling.of_backend(None))
-    scene = _scene_of(source_of(np.asarray(volume.data)), place, transfer, SIDE, march, "over", None)
-    underway = set_out(scene, options)
-    grid, empty = BrickGrid(volume.shape, (39, 47, 16)), jnp.zeros(5, bool).at[4].set(True)
+    place = np.ones(3, np.float32), np.zeros(3, np.float32)
+    return _scene_of(source_of(np.asarray(volume.data)), place, transfer, SIDE, march, "over", None)
+
+
+def cells_of(scene, brick=0):
+    """The cells of an image's rays in a brick of the fog, at the beginning of a march."""
+    underway = set_out(scene, RenderOptions("all", Tiling.of_backend(None)))
+    grid, empty = BrickGrid(SHAPE, (39, 47, 16)), jnp.zeros(5, bool).at[4].set(True)
     turn = Turn(jnp.asarray(brick, jnp.int32), empty, empty.at[brick].set(True), empty)
     reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
-    return _curved(None, grid, 11, march, underway.rays, underway.at, reached, turn)
+    return _curved(None, grid, 11, scene.march, underway.rays, underway.at, reached, turn)
 
 
 def test_cells_of_curved_rays_are_found_under_64_bits():
     """Traced only: a loop whose state changes its type is an error then."""
+    scene = scene_of_fog(jv.March(1.0, (fog()[1],)))
     with in_float64():
-        _, probe, _ = fog()
-        found = jax.eval_shape(lambda step: cells_of_fog(jv.March(step, (probe,))), jnp.ones(()))
+        found = eqx.filter_eval_shape(cells_of, to_float64(scene))
     assert found.cells.until.dtype == np.int32
     assert found.low.dtype == np.float64
 
 
 def test_no_cells_are_looked_for_behind_the_last_sample_of_a_ray():
     """A ray of 10**6 steps has 16 samples at the most, which end in the first few bricks."""
-    _, probe, _ = fog()
-    found = cells_of_fog(jv.March(1e-4, (probe,), max_samples=16), brick=3)
+    found = cells_of(scene_of_fog(jv.March(1e-4, (fog()[1],), max_samples=16)), brick=3)
     assert bool(found.any)
     assert 1 <= int(jnp.max(found.cells.until)) <= 16
