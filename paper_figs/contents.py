@@ -129,7 +129,7 @@ ENTRIES = (
         "kim",
         "Table 1: overlap and rates by split",
         "1280 x 490 x 325 voxels on a card of 768 MB, 375 x 375 pixels: 22.87 frames a second with overlap "
-        "and 20.88 by reloading at the best split, 2,4,2, where 0.63 % is overlap. Rule: keep that below 3 %.",
+        "and 20.88 by reloading at the best split, 2,4,2, with 0.63 % of overlap. Rule: keep that below 3 %.",
         "The formula gives the paper's overlap column, up to a unit that is not explained. Rates follow the "
         "number of loads, not the overlap.",
         "record",
