@@ -38,10 +38,11 @@ from ..transforms import SpaceLeaping, ToroidalMap
 from ..volume import Volume, part_of
 from .detail import level_for
 from .grid import is_straight
-from .opening import levels_of
+from .opening import OF_RAW, OF_ZARR, levels_of
 from .owned import render_owned
 from .sources import VoxelSource
 from .stream import CELL, Method, Stream
+from .summary import Summary
 from .summary_files import summary_of
 
 
@@ -66,7 +67,7 @@ def render_bricks(
     level: int | Literal["auto"] | Any = "auto",
     tolerance: float | Any | None = None,
     cache: Literal["beside"] | str | Any | None = "beside",
-    progress: Callable[[int, int], Any] | None = None,
+    progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
     own: Own | Any = "rays",
     **options: Any,
@@ -147,9 +148,15 @@ def render_bricks(
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     _check(march, transfer, lighting, method, outputs, own)
+    if unknown := sorted(options.keys() - {*OF_RAW, *OF_ZARR}):
+        raise TypeError(f"render_bricks has no arguments {', '.join(unknown)}; see its docstring.")
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     if tolerance is not None:
         number("tolerance", tolerance, above=0, below=1)
     mesh = mesh_of(devices)
+    if own == "bricks" and mesh is None:
+        raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
     room = budget(memory)
@@ -247,11 +254,13 @@ class _Job:
 
     def stream(self, marched: Scene, shown: Scene, options: RenderOptions) -> Stream:
         """The bricks of a scene, as rays are marched, and as they are shown."""
-        if self.streams:  # the second march of a gradient
-            summary = self.streams[0].summary
-        else:
+
+        def summary() -> Summary:
+            if self.streams:  # the second march of a gradient
+                return self.streams[0].summary
             cell = CELL if min(self.source.shape) > CELL else 4
-            summary = summary_of(self.source, cell, memory=self.memory, cache=self.cache)
+            return summary_of(self.source, cell, memory=self.memory, cache=self.cache)
+
         where = self.memory, self.counts, self.method, self.progress
         least = number_of(self.devices) if self.owned else 1
         stream = Stream.of(self.source, summary, marched, shown, options, *where, least)

@@ -87,7 +87,7 @@ class Stream:
     def of(
         cls,
         source: VoxelSource,
-        summary: Summary,
+        summary_of: Callable[[], Summary],
         marched: Scene,
         shown: Scene,
         options: RenderOptions,
@@ -97,8 +97,10 @@ class Stream:
         progress: Callable[[int, int], Any] | None,
         least: int = 1,
     ) -> "Stream":
-        """The bricks of a scene: as its rays are marched, and as it is `shown`. `counts`: along each axis, in
-        place of as few as fit into `memory`, and at least `least`."""
+        """The bricks of a scene: as its rays are marched, and as it is `shown`.
+
+        - `summary_of`: called once it is known that bricks fit, since it may read the whole source.
+        - `counts`: along each axis, in place of as few as fit into `memory`, and at least `least`."""
         march = marched.march
         space = march.locate(marched.volume)
         straight = is_straight(space)
@@ -117,6 +119,7 @@ class Stream:
             typical = replace(margin, cells=margin.of_box(space, source.shape, middle, middle))
             stored = stored_of(grid, typical, probe if method == "overlap" else None)
         assert isinstance(marched.source, Camera)
+        summary = summary_of()
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
         return cls(
             *(

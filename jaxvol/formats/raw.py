@@ -46,8 +46,8 @@ def raw_header(
     fields = _name_header(path) | _json_header(path) | given
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
-            f"path: the shape and dtype of {path} are unknown. Use load(path, shape=(nx, ny, nz), "
-            f'dtype="uint8"), or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
+            f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
+            f'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
             '{"size": [nx, ny, nz], "type": "uint8"}.'
         )
     return _raw_shape(path, fields.pop("shape"), bits), _raw_dtype(path, fields.pop("dtype")), fields

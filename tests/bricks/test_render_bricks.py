@@ -10,6 +10,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, VoxelSource, source_of, summary_files
+from jaxvol.bricks.sources import ArraySource
 from jaxvol.bricks.stream import Stream
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 from jaxvol.occupancy import BLOCK
@@ -397,6 +398,8 @@ LABELLED = jv.LabelTransferFunction({1: TRANSFER})
         ({"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), SUN, baked=True)}, "farthest_read"),
         ({"compositing": "over!"}, "compositing must be one of"),
         ({"level": 1}, "level must be"),
+        ({"progress": 5}, "progress must be a function"),
+        ({"own": "bricks"}, "devices="),
     ],
 )
 def test_bad_arguments_are_named(changes, message):
@@ -409,6 +412,16 @@ def test_bad_arguments_are_named(changes, message):
             given.pop("march"),
             **given,
         )
+
+
+def test_too_little_memory_is_named_before_anything_is_read():
+    class Unread(ArraySource):
+        def read(self, *args, **kwargs):
+            raise AssertionError("read")
+
+    camera = outside(jv.Volume(balls()), 16)
+    with pytest.raises(ValueError, match="memory must be at least"):
+        jv.render_bricks(Unread(balls()), TRANSFER, camera, jv.March(1.0), memory=1000)
 
 
 def test_under_jit_it_says_what_to_do():

@@ -119,7 +119,7 @@ def test_bricks_that_are_too_large_for_a_volume_are_named():
     nothing = np.zeros((1, 1, 1), np.uint8)
     summary = Summary(source.shape, 1600, {"low": nothing, "high": nothing})
     scene = _scene_of(source, ((1, 1, 1), (0, 0, 0)), TRANSFER, SIDE, jv.March(1.0), "over", None)
-    given = source, summary, scene, scene, RenderOptions("all", Tiling.of_backend(None)), 2**35
+    given = source, lambda: summary, scene, scene, RenderOptions("all", Tiling.of_backend(None)), 2**35
     with pytest.raises(
         ValueError, match=r"bricks must be so many.*fewer than 2\*\*31 voxels; got 1600 x 1600"
     ):
