@@ -5,7 +5,7 @@ it. A volume gives values, a transfer function maps them to colour and extinctio
 composited front to back into a `Rendering`.
 """
 
-from . import bricks as bricks, lighting as lighting, metrics as metrics
+from . import bricks as bricks, datasets as datasets, lighting as lighting, metrics as metrics
 from .bricks import render_bricks as render_bricks
 from .camera import Camera as Camera
 from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
