@@ -124,7 +124,8 @@ def render_bricks(
             part if name in known else given
             for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
         )
-    volume = part_of(Volume(nothing, *place), jnp.zeros(3, jnp.int32), chosen.shape)
+    direction = source.direction if isinstance(source, Volume) else None
+    volume = part_of(Volume(nothing, *place, direction=direction), jnp.zeros(3, jnp.int32), chosen.shape)
     how = compositing_of(compositing)
     scene = strong(Scene(volume, transfer, camera, march.divided(), how, lighting))
     memory = memory_of_device() // 4 if memory is None else integer("memory", memory, 1)

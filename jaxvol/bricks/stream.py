@@ -147,7 +147,7 @@ class Stream:
     def _part(self, load: Load) -> Volume:
         """A part of the volume, once it is read."""
         volume = self.scene.volume
-        part = Volume(load.voxels.result(), volume.spacing, volume.origin)
+        part = Volume(load.voxels.result(), volume.spacing, volume.origin, direction=volume.direction)
         return part_of(part, jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:
