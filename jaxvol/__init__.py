@@ -36,7 +36,7 @@ from .fitting import (
     refined as refined,
     write_transfer as write_transfer,
 )
-from .formats import load as load, load_ultrasound as load_ultrasound
+from .formats import load as load, load_ultrasound as load_ultrasound, save as save
 from .isosurface import Isosurface as Isosurface
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .lighting import (

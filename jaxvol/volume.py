@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from ._util.checks import Arrayable, described, finite_array, is_traced, require
+from ._util.named_axes import along_xyz, is_named
 from ._util.vec3 import Scalar, Vec3
 from ._util.voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by
 from ._util.voxels import label_array, voxel_array
@@ -43,8 +44,12 @@ class Volume(eqx.Module):
       device; a voxel is converted after it is fetched. float64 is kept if JAX's 64-bit types are enabled,
       and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
       int8, uint16, int16 and float32 that holds every value exactly.
-    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT).
-    - `origin`: world position of node (0, 0, 0).
+      Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
+      evenly spaced, give spacing and origin. For an image stack of scikit-image, [plane, row, column], pass
+      `stack.T`: x then runs along the rows, y from row to row, z from plane to plane.
+    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT). By default
+      that of the data's coordinates, or 1.
+    - `origin`: world position of node (0, 0, 0). By default that of the data's coordinates, or 0.
     - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
       ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
       and for the identity, the data's axes are the world's, and the field is None.
@@ -77,14 +82,17 @@ class Volume(eqx.Module):
     def __init__(
         self,
         data: Arrayable,
-        spacing: Arrayable = (1.0, 1.0, 1.0),
-        origin: Arrayable = (0.0, 0.0, 0.0),
+        spacing: Arrayable | None = None,
+        origin: Arrayable | None = None,
         labels: Arrayable | None = None,
         *,
         direction: Arrayable | None = None,
         field: Field | Any | None = None,
     ):
+        data, place = along_xyz(data) if is_named(data) else (data, {})
         self.data = voxel_array(data)
+        spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
+        origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin
         spacing = finite_array("spacing", spacing, (3,))
         self.spacing = require(
             spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}."

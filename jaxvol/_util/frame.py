@@ -35,7 +35,5 @@ class Frame(eqx.Module):
     def point(self, coordinates: Vec3) -> Vec3:
         """World point of coordinates."""
         a, b, c = coordinates
-        x, y, z = (
-            o + (a * i + b * j + c * k) for o, i, j, k in zip(self.origin, *self.axes, strict=True)
-        )
+        x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(self.origin, *self.axes, strict=True))
         return x, y, z

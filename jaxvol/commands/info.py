@@ -42,6 +42,7 @@ def described_volume(volume: Volume) -> str:
         ("type", f"{data.dtype}, {data.nbytes / 1e6:.3g} MB of memory"),
         ("spacing", _numbers(volume.spacing)),
         ("origin", _numbers(volume.origin)),
+        ("direction", _direction(volume)),
         (
             "bounds",
             "x {} to {}, y {} to {}, z {} to {}".format(*(f"{e:g}" for e in np.asarray(volume.bounds))),
@@ -55,6 +56,13 @@ def described_volume(volume: Volume) -> str:
         found = np.unique(np.asarray(volume.labels))
         rows.append(("labels", f"{found.size}, from {found[0]} to {found[-1]}"))
     return "\n".join(f"{name:12} {text}" for name, text in rows)
+
+
+def _direction(volume: Volume) -> str:
+    if volume.direction is None:
+        return "along the axes of the world"
+    columns = zip("xyz", np.asarray(volume.direction).T, strict=True)
+    return "; ".join(f"{name} along ({', '.join(f'{c:.4f}' for c in column)})" for name, column in columns)
 
 
 def _percentiles(data: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._util.files import MOST_VOXELS, Header, decoding
+from .medical import simple_itk
 from .orientation import toward_axes
 
 
@@ -44,7 +45,7 @@ PLACE = 0.01
 """Part of the distance between slices by which a slice may be away from its place."""
 
 MOST_COMPRESSED = 2000
-"""Greatest number of bytes of pixels for one of a compressed file. A header that says more is not believed."""
+"""Bytes of pixels per byte of a compressed file, at most. A header that says more is not believed."""
 
 META_BYTES = 2**16
 """Where the transfer syntax must be found: files begin with some hundred bytes of meta information."""
@@ -107,7 +108,7 @@ def read_dicom(path: Path, header: Header) -> dict[str, Any]:
 
 
 def _slice(path: Path) -> Slice:
-    import_sitk(path)
+    simple_itk(path)
     syntax = _transfer_syntax(path)
     if syntax not in READABLE:
         raise ValueError(
@@ -121,8 +122,8 @@ def _slice(path: Path) -> Slice:
         parts = reader.GetNumberOfComponents()
     if parts != 1 or depth not in ([], [1]):
         raise ValueError(
-            f"path: {path} must hold one slice of one value per pixel; got size {reader.GetSize()} and {parts} "
-            "values. Files of several frames are not supported: save it as NRRD or NIfTI."
+            f"path: {path} must hold one slice of one value per pixel; got size {reader.GetSize()} and "
+            f"{parts} values. Files of several frames are not supported: save it as NRRD or NIfTI."
         )
     _check_backed(path, width * height * _bytes_per_pixel(reader), compressed="1.2.4" in syntax)
     position, turn = _numbers(path, reader, "0020|0032", 3), _numbers(path, reader, "0020|0037", 6)
@@ -145,12 +146,14 @@ def _volume(path: Path, slices: list[Slice]) -> dict[str, Any]:
                     "one of them an overview image?"
                 )
     if len(slices) < 2:
-        raise ValueError(f"path: {path} must hold at least 2 slices of a series; got {first.path.name} alone.")
+        raise ValueError(
+            f"path: {path} must hold at least 2 slices of a series; got {first.path.name} alone."
+        )
     axes = np.stack([first.across, first.down])
     if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-3):
         raise ValueError(
-            f"path: {path}: directions of rows and columns must be orthogonal and of length 1; {first.path.name} "
-            f"has {_plain(first.across)} and {_plain(first.down)}."
+            f"path: {path}: directions of rows and columns must be orthogonal and of length 1; "
+            f"{first.path.name} has {_plain(first.across)} and {_plain(first.down)}."
         )
     normal = np.cross(first.across, first.down)
     normal /= np.linalg.norm(normal)
@@ -177,34 +180,34 @@ def _check_places(path: Path, slices: list[Slice], normal: np.ndarray) -> float:
     if same.size:
         pairs = ", ".join(f"{names[i]} and {names[i + 1]}" for i in same[:3])
         raise ValueError(
-            f"path: {path} holds {same.size} slices that lie where another one does: {pairs}. They are copies, "
-            "or of different times; remove all but one of each."
+            f"path: {path} holds {same.size} slices that lie where another one does: {pairs}. They are "
+            "copies, or of different times; remove all but one of each."
         )
     # to a tenth of a voxel over all slices: lengths in DICOM files are rounded
     wide = np.flatnonzero(np.abs(gaps - step) > 0.1 * step)
     if wide.size:
         i = int(wide[0])
         raise ValueError(
-            f"path: {path} has unevenly spaced slices, or some are missing: most are {step:g} apart, and "
-            f"{names[i]} and {names[i + 1]} are {gaps[i]:g} ({wide.size} such gaps among {len(slices)} slices)."
+            f"path: {path} has unevenly spaced slices, or some are missing: most are {step:g} apart, "
+            f"and {names[i]} and {names[i + 1]} are {gaps[i]:g} ({wide.size} such gaps among {len(slices)} "
+            "slices)."
         )
     sideways = positions - positions[0] - np.outer(heights - heights[0], normal)
     if np.abs(sideways).max() > 0.1 * min(slices[0].spacing):
         raise ValueError(
-            f"path: {path} has slices that are shifted sideways by up to {np.abs(sideways).max():.4g}, as by a "
-            "tilted gantry. Resample it on a rectangular grid."
+            f"path: {path} has slices that are shifted sideways by up to {np.abs(sideways).max():.4g}, as by "
+            "a tilted gantry. Resample it on a rectangular grid."
         )
     return float(heights[-1] - heights[0]) / (len(slices) - 1)
 
 
 def _pixels(slices: list[Slice]) -> np.ndarray:
     """Rescaled values [x, y, z], of a type that holds those of all slices: each may have its own scale."""
-    import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
-
+    sitk = simple_itk(slices[0].path)
     data: np.ndarray | None = None
     for z, each in enumerate(slices):
         with decoding(each.path):
-            image = sitk.GetArrayViewFromImage(_reader(each.path).Execute())
+            image = sitk.GetArrayFromImage(_reader(each.path).Execute())
             values = image.reshape(image.shape[-2:]).T
             if values.dtype == np.float64:
                 values = values.astype(np.float32)
@@ -237,9 +240,7 @@ def _bytes_per_pixel(reader: Any) -> int:
 
 
 def _reader(path: Path) -> Any:
-    import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
-
-    reader = sitk.ImageFileReader()
+    reader = simple_itk(path).ImageFileReader()
     reader.SetImageIO("GDCMImageIO")
     reader.SetFileName(str(path))
     return reader
@@ -257,14 +258,14 @@ def _numbers(path: Path, reader: Any, tag: str, count: int) -> np.ndarray:
         numbers = np.array([])
     if numbers.shape != (count,) or not np.all(np.isfinite(numbers)):
         raise ValueError(
-            f"path: {path} must say where it lies: element ({tag.replace('|', ',')}) must be {count} numbers; "
-            f"got {text[:80]!r}."
+            f"path: {path} must say where it lies: element ({tag.replace('|', ',')}) must be {count} "
+            f"numbers; got {text[:80]!r}."
         )
     return numbers
 
 
 def _transfer_syntax(path: Path) -> str:
-    """How the data are encoded, from the file's meta information, which is always explicit and little-endian."""
+    """How the data are encoded, from the meta information at the file's begin, which always is so in one way."""
     with path.open("rb") as stream:
         content = stream.read(META_BYTES)
     at = content.find(b"\x02\x00\x10\x00UI", 132)
@@ -276,11 +277,3 @@ def _transfer_syntax(path: Path) -> str:
 
 def _plain(values: Any) -> list[float]:
     return [round(float(value), 4) for value in values]
-
-
-def import_sitk(path: Path) -> None:
-    """**Raises** `ImportError` that says what to install for reading `path`."""
-    try:
-        import SimpleITK  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except ImportError as fault:
-        raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault

@@ -1,4 +1,4 @@
-"""Reads medical images with SimpleITK, as volumes along the axes of the patient.
+"""Reads medical images with SimpleITK, as volumes along the axes of the patient, or askew to them.
 
 Uncompressed MetaImage and NRRD files are left to SimpleITK, which trusts their headers.
 """
@@ -12,16 +12,23 @@ from typing import Any
 import numpy as np
 
 from .._util.files import MOST_VOXELS, Header, as_array, check_size, chunks, decoding, file_size
+from .orientation import toward_axes
+
+
+def simple_itk(path: Path) -> Any:
+    """The module SimpleITK. **Raises** `ImportError` that says what to install for reading `path`."""
+    try:
+        import SimpleITK  # pyright: ignore[reportMissingImports]
+    except ImportError as fault:
+        raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault
+    return SimpleITK
 
 
 def read_medical(path: Path, header: Header) -> dict[str, Any]:
     """Reader for `.nii`, `.nii.gz`, `.mha`, `.mhd` and `.nrrd`."""
     header.refuse(path)
     n_bytes = file_size(path)
-    try:
-        import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
-    except ImportError as fault:
-        raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault
+    sitk = simple_itk(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     with decoding(path):
@@ -36,18 +43,11 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
         if path.name.lower().endswith((".nii", ".nii.gz")):
             _check_nifti(path, reader, n_bytes)
         image = _inflated_metaimage(path, reader) or reader.Execute()
-    image = sitk.DICOMOrient(image, "LPS")
-    direction = np.reshape(image.GetDirection(), (3, 3))
-    if not np.allclose(direction, np.eye(3), rtol=0, atol=1e-3):
-        raise ValueError(
-            f"path: {path} is oblique, which is not supported: its axes, reoriented as close to LPS as "
-            f"possible, are {direction.round(3).tolist()}. Resample it on a grid along the patient's axes."
-        )
-    # copied, because the view is invalid once the image is freed
-    data = np.array(sitk.GetArrayViewFromImage(image).T, order="C")
+    # copied by this, since the view is invalid once the image is freed
+    data = np.array(sitk.GetArrayViewFromImage(image).T)
     if data.dtype == np.float64:
         data = data.astype(np.float32)
-    return {"data": data, "spacing": image.GetSpacing(), "origin": image.GetOrigin()}
+    return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
 
 
 def _check_nifti(path: Path, reader: Any, n_bytes: int) -> None:

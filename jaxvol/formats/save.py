@@ -34,16 +34,18 @@ def save(volume: Volume | Any, path: str | os.PathLike[str]) -> Path:
 
     **Returns:** the path.
 
-    **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type of
-    voxels that the format cannot hold, and a file that cannot be written. `ImportError` if the format needs
-    SimpleITK, and it is missing.
+    **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
+    of voxels that the format cannot hold, and a file that cannot be written. `ImportError` if the format
+    needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a Volume; got {described(volume)}.")
     if is_traced(volume):
         raise ValueError("volume must not be traced: save it outside of jit and grad.")
     if volume.field is not None:
-        raise ValueError("volume must have voxels; got one with a field. Save an array of the field's values.")
+        raise ValueError(
+            "volume must have voxels; got one with a field. Save an array of the field's values."
+        )
     path = Path(path)
     ending = max((e for e in WRITERS if path.name.lower().endswith(e)), key=len, default=None)
     if ending is None:
@@ -77,8 +79,8 @@ def _write_medical(volume: Volume, path: Path) -> None:
         raise ImportError(f"writing {path.name} needs SimpleITK: pip install jaxvol[io]") from fault
     if volume.labels is not None:
         raise ValueError(
-            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels and voxels as "
-            "two volumes, and read them by load(path, labels=...)."
+            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels and voxels "
+            "as two volumes, and read them by load(path, labels=...)."
         )
     data = np.asarray(volume.data)
     if data.dtype.name in ("float16", "bfloat16"):

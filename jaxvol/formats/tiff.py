@@ -13,9 +13,18 @@ from .._util.files import MOST_VOXELS, Header, file_size
 ENDINGS = (".tif", ".tiff")
 
 MOST_COMPRESSED = 2000
-"""Greatest number of bytes of pixels for one of a compressed file. A header that says more is not believed."""
+"""Bytes of pixels per byte of a compressed file, at most. A header that says more is not believed."""
 
-LENGTHS = {"mm": 1.0, "millimeter": 1.0, "cm": 10.0, "inch": 25.4, "µm": 1e-3, "um": 1e-3, "micron": 1e-3, "nm": 1e-6}
+LENGTHS = {
+    "mm": 1.0,
+    "millimeter": 1.0,
+    "cm": 10.0,
+    "inch": 25.4,
+    "µm": 1e-3,
+    "um": 1e-3,
+    "micron": 1e-3,
+    "nm": 1e-6,
+}
 """Units of length that ImageJ and OME write, in mm."""
 
 
@@ -25,8 +34,8 @@ def read_tiff(path: Path, header: Header) -> dict[str, Any]:
     pages, spacing = _pages(path)
     if len(pages) < 2:
         raise ValueError(
-            f"path: {path} must hold at least 2 images; got {len(pages)}. For a folder of images, give the path of "
-            "the folder."
+            f"path: {path} must hold at least 2 images; got {len(pages)}. For a folder of images, give the "
+            "path of the folder."
         )
     # [z][y][x], as pages, rows and columns come
     return {"data": np.stack(pages).transpose(2, 1, 0)} | spacing
@@ -70,7 +79,7 @@ def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
 
 
 def _check_numbers(folder: Path, files: list[Path]) -> None:
-    """**Raises** `ValueError` if the files' names differ in one number, and some of its values are missing."""
+    """**Raises** `ValueError` if files' names differ in one number, and some of its values are missing."""
     last = [re.findall(r"[0-9]+", file.stem) for file in files]
     numbers = [int(found[-1]) for found in last if found]
     if len(files) < 2:
