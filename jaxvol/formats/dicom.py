@@ -265,7 +265,7 @@ def _numbers(path: Path, reader: Any, tag: str, count: int) -> np.ndarray:
 
 
 def _transfer_syntax(path: Path) -> str:
-    """How the data are encoded, from the meta information at the file's begin, which always is so in one way."""
+    """How the data are encoded, from the meta information with which the file begins."""
     with path.open("rb") as stream:
         content = stream.read(META_BYTES)
     at = content.find(b"\x02\x00\x10\x00UI", 132)

@@ -79,8 +79,8 @@ def _write_medical(volume: Volume, path: Path) -> None:
         raise ImportError(f"writing {path.name} needs SimpleITK: pip install jaxvol[io]") from fault
     if volume.labels is not None:
         raise ValueError(
-            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels and voxels "
-            "as two volumes, and read them by load(path, labels=...)."
+            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
+            "and voxels as two volumes, and read them by load(path, labels=...)."
         )
     data = np.asarray(volume.data)
     if data.dtype.name in ("float16", "bfloat16"):

@@ -125,7 +125,8 @@ def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
                 if (page.shape, page.dtype) != (first.shape, first.dtype):
                     raise ValueError(
                         f"path: the images in {path} must have the same size and type; the first has "
-                        f"{first.shape} of {first.dtype}, and number {number + 1} {page.shape} of {page.dtype}."
+                        f"{first.shape} of {first.dtype}, and number {number + 1} {page.shape} of "
+                        f"{page.dtype}."
                     )
                 images.append(page.asarray())
             return images, _spacing(file, first)
@@ -145,12 +146,13 @@ def _check_backed(path: Path, n_bytes: int, shape: tuple[int, ...], page: Any) -
     packed = page.compression != 1 or page.bitspersample < 8 * page.dtype.itemsize
     if n_bytes * (MOST_COMPRESSED if packed else 1) < expected:
         raise ValueError(
-            f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces {expected} of voxels."
+            f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces {expected} bytes of "
+            "voxels."
         )
 
 
 def _spacing(file: Any, page: Any) -> dict[str, Any]:
-    """Spacing (x, y, z) in mm, or in ImageJ's own unit if that is none of length, where all of it is known."""
+    """Spacing (x, y, z) as ImageJ wrote it, in mm, or in its own unit if that is none of length."""
     found = file.imagej_metadata or {}
     if "spacing" not in found:
         return {}

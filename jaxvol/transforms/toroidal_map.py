@@ -142,7 +142,8 @@ class ToroidalMap(Transform):
     def locate(self, space: Space, volume: Volume) -> Space:
         if volume.direction is not None:
             raise ValueError(
-                "volume has a direction, and ToroidalMap places its voxels by the probe: pass a Volume without."
+                "volume has a direction, and ToroidalMap places its voxels by the probe: pass a Volume without "
+                "one."
             )
         return _Sector(self, volume.shape)
 

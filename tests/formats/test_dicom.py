@@ -104,11 +104,12 @@ def test_slope_and_intercept_are_those_of_the_file(tmp_path):
 
 def test_each_slice_has_its_own_scale(tmp_path):
     paths = write_series(tmp_path / "a")
-    position = np.array(ORIGIN) + (0, 0, 4 * SPACING[2])
-    write_slice(paths[4], DATA[:, :, 4], position, np.eye(3), {"0028|1053": "0.25", "0028|1052": "0.5"})
+    content = paths[4].read_bytes()
+    at = content.index(b"\x28\x00\x53\x10DS\x02\x00") + 8
+    paths[4].write_bytes(content[:at] + b".5" + content[at + 2 :])
     data = np.asarray(jv.load(tmp_path / "a").data)
     stored = np.frombuffer(paths[4].read_bytes()[-2 * 7 * 6 :], "<i2").reshape(6, 7).T
-    np.testing.assert_array_equal(data[:, :, 4], stored * 0.25 + 0.5)
+    np.testing.assert_array_equal(data[:, :, 4], stored * 0.5 - 1024)
     np.testing.assert_array_equal(data[:, :, :4], read(paths[:4]))
 
 
