@@ -146,8 +146,8 @@ def _check_backed(path: Path, n_bytes: int, shape: tuple[int, ...], page: Any) -
     packed = page.compression != 1 or page.bitspersample < 8 * page.dtype.itemsize
     if n_bytes * (MOST_COMPRESSED if packed else 1) < expected:
         raise ValueError(
-            f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces {expected} bytes of "
-            "voxels."
+            f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces voxels of "
+            f"{expected}."
         )
 
 

@@ -142,8 +142,7 @@ class ToroidalMap(Transform):
     def locate(self, space: Space, volume: Volume) -> Space:
         if volume.direction is not None:
             raise ValueError(
-                "volume has a direction, and ToroidalMap places its voxels by the probe: pass a Volume without "
-                "one."
+                "volume has a direction, and ToroidalMap places its voxels by the probe: pass one without."
             )
         return _Sector(self, volume.shape)
 
