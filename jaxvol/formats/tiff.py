@@ -2,6 +2,7 @@
 
 import math
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,7 @@ def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
                 pages = list(file.pages)
                 shape = (len(pages), *pages[0].shape)
             first = pages[0].aspage()
+            _check_last(path, file)
             if len(shape) not in (2, 3) or first.samplesperpixel != 1:
                 raise ValueError(
                     f"path: {path} must hold images of one value per pixel, in one stack; got shape {shape}, "
@@ -136,6 +138,18 @@ def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
         if isinstance(fault, ValueError) and str(fault).startswith("path:"):
             raise
         raise ValueError(f"path: {path} cannot be read: corrupt, cut short, or {fault}") from fault
+
+
+def _check_last(path: Path, file: Any) -> None:
+    """**Raises** `ValueError` if the pages that were found are followed by others. tifffile leaves out what
+    lies beyond the end of the file."""
+    format, handle = file.tiff, file.filehandle
+    handle.seek(file.pages[-1].aspage().offset)
+    (tags,) = struct.unpack(format.tagnoformat, handle.read(format.tagnosize))
+    handle.seek(tags * format.tagsize, 1)
+    following = handle.read(format.offsetsize)
+    if len(following) < format.offsetsize or any(following):
+        raise ValueError(f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
 
 
 def _check_backed(path: Path, n_bytes: int, shape: tuple[int, ...], page: Any) -> None:

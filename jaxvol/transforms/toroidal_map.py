@@ -36,10 +36,10 @@ class ToroidalMap(Transform):
 
     The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
     coordinates are the probe's, with the origin on the motor axis. The world is empty outside the swept
-    sector. A ray may leave the sector and re-enter it, as through its hollow near side. Of such gaps two are found; what a third one hides is
-    taken for material. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside,
-    and so may one that runs along a face at less than 1e-5 of it. `AlphaCorrection` cuts cells at both ends
-    of gaps.
+    sector. A ray may leave the sector and re-enter it, as through its hollow near side. Of such gaps two are
+    found; what a third one hides is taken for material. A ray that is nowhere farther outside than 2e-6 of
+    the probe's size counts as inside, and so may one that runs along a face at less than 1e-5 of it.
+    `AlphaCorrection` cuts cells at both ends of gaps.
 
     **Arguments:**
 
