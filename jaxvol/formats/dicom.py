@@ -125,7 +125,7 @@ def _slice(path: Path) -> Slice:
             f"path: {path} must hold one slice of one value per pixel; got size {reader.GetSize()} and "
             f"{parts} values. Files of several frames are not supported: save it as NRRD or NIfTI."
         )
-    _check_backed(path, width * height * _bytes_per_pixel(reader), compressed="1.2.4" in syntax)
+    _check_backed(path, width * height * _bytes_per_pixel(reader), syntax)
     position, turn = _numbers(path, reader, "0020|0032", 3), _numbers(path, reader, "0020|0037", 6)
     down, across = _numbers(path, reader, "0028|0030", 2)  # between rows, then between columns
     if min(down, across) <= 0:
@@ -227,10 +227,11 @@ def _common(a: np.dtype, b: np.dtype) -> np.dtype:
     return np.dtype(np.float32) if both == np.float64 else both
 
 
-def _check_backed(path: Path, nbytes: int, compressed: bool) -> None:
-    """**Raises** `ValueError` if a file is far too short for the pixels that its header announces."""
+def _check_backed(path: Path, nbytes: int, syntax: str) -> None:
+    """**Raises** `ValueError` if a file is too short for the pixels that its header announces."""
     size = path.stat().st_size
-    if size * (MOST_COMPRESSED if compressed else 128) < nbytes:
+    plain = READABLE[syntax].startswith(("implicit", "explicit"))
+    if size * (1 if plain else MOST_COMPRESSED) < nbytes:
         raise ValueError(f"path: {path} is cut short: it has {size} bytes, and its pixels {nbytes}.")
 
 
