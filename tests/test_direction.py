@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, DirectionalLight, Phong
+from jaxvol.lighting import ConstantLight, DirectionalLight, Phong, PointLight
+from jaxvol.path_tracing.walks import WalkScene
 from jaxvol.space import Affine, world_gradient
 
 from .scenes import SIZE, anisotropic_noise, in_float64, slow, soft_transfer, to_float64
@@ -223,6 +224,19 @@ def test_paths_are_traced_in_the_world():
     np.testing.assert_allclose(alpha[1], alpha[0], atol=0.02)
     mean = [np.asarray(image.rgba)[..., :3].mean((0, 1)) for image in images]
     np.testing.assert_allclose(mean[1], mean[0], rtol=0.05)
+
+
+def test_light_arrives_at_the_world_point():
+    """A lamp's irradiance by the distance from where NumPy puts the node."""
+    _, volume = pair()
+    lamp = PointLight((1.5, -2.0, 2.0), (1.0, 4.0, 2.0))
+    scene = WalkScene(volume, None, None, (lamp,), jnp.float32(0), jnp.int32(1))  # pyright: ignore
+    node = np.array([5.0, 17.0, 2.0])
+    point = np.asarray(volume.origin) + R @ (node * np.asarray(volume.spacing))
+    arriving = scene.light(tuple(jnp.float32(c) for c in node), jnp.float32(0.5))
+    away = np.array([1.5, -2.0, 2.0]) - point
+    assert float(arriving.distance) == pytest.approx(np.linalg.norm(away), rel=1e-5)
+    np.testing.assert_allclose(np.array(arriving.toward), away / np.linalg.norm(away), atol=1e-5)
 
 
 def test_bricks_keep_the_direction():

@@ -32,7 +32,7 @@ SECONDS = 2
 """Of computing time, for a file of at most some kB."""
 
 SLACK = 2**25
-"""Bytes that may be taken beyond twice the file's: what libraries allocate once, and buffers of fixed size."""
+"""Bytes that may be taken beyond twice the file's: buffers of fixed size, and what is allocated once."""
 
 PATIENCE = 120
 """Seconds without an answer, on a busy machine, after which a reader hangs."""
