@@ -133,7 +133,9 @@ class Volume(eqx.Module):
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """World positions of the first and the last node."""
         if self.direction is not None:
-            return self.origin, self.origin + self.direction @ (self._steps * self.spacing)
+            # not by a matrix product, which some GPUs round to 10 bits
+            along = self.direction * (self._steps * self.spacing)[None, :]
+            return self.origin, self.origin + jnp.sum(along, axis=1)
         return self.origin, self.origin + self._steps * self.spacing
 
     @property

@@ -49,8 +49,9 @@ def moved(point, volume):
 def views(volume, inside=False):
     """A camera for the volume along the axes, and the one that sees the turned volume in the same way."""
     low, high = (np.asarray(corner) for corner in volume.corners)
-    position = low + 0.4 * (high - low) if inside else volume.center + np.array([1.5, -2.5, 1.6])
-    focus, up, how = volume.center + np.array([0.1, 0.2, 0]), np.array([0.1, 0.2, 1]), {"size": SIZE}
+    center = (low + high) / 2
+    position = low + 0.4 * (high - low) if inside else center + np.array([1.5, -2.5, 1.6])
+    focus, up, how = center + np.array([0.1, 0.2, 0]), np.array([0.1, 0.2, 1]), {"size": SIZE}
     return (
         jv.Camera(position, focus, up, 50.0, **how),
         jv.Camera(moved(position, volume), moved(focus, volume), R @ up, 50.0, **how),
@@ -137,18 +138,19 @@ def test_gradients_are_those_of_the_volume_along_the_axes():
 
 def test_the_reference_in_float64_and_the_derivative_along_a_turn():
     """In float64, by `jax.vmap` over the angles of a turn and `jax.jit`, to central differences."""
-    march = jv.March(0.05, (jv.AlphaCorrection(),), "midpoint")
-    ray = (-0.9, -2.5, 2.0), (0.5, 0.6, -0.3)
+    march = jv.March(0.05, (jv.AlphaCorrection(),), "midpoint", max_samples=80)
+    straight = anisotropic_noise()
+    target = moved(np.asarray(straight.center) + (0.1, 0.05, -0.1), straight)
+    toward = np.array([[1.0, 1.4, -1.9]]) / np.linalg.norm((1.0, 1.4, -1.9))
+    rays = target[None] - 3 * toward, toward
     with in_float64():
-        volume, transfer = to_float64((anisotropic_noise(), soft_transfer(0.5)))
+        volume, transfer = to_float64((straight, soft_transfer(0.5)))
 
         @jax.jit
         def color(angles):
             turned = jv.Volume(volume.data, volume.spacing, volume.origin, direction=turn(angles))
             return jv.render_rays(turned, transfer, *rays, march, adjoint="direct").rgba[0]
 
-        rays = tuple(np.array([part]) for part in ray)
-        rays = rays[0], rays[1] / np.linalg.norm(rays[1])
         angles = np.array(ANGLES)
         derivative = np.asarray(jax.jacrev(color)(angles))
         assert np.abs(derivative).max() > 1e-3
@@ -156,7 +158,7 @@ def test_the_reference_in_float64_and_the_derivative_along_a_turn():
         ends = np.asarray(jax.vmap(color)(np.concatenate([angles + steps, angles - steps])))
         np.testing.assert_allclose(derivative.T, (ends[:3] - ends[3:]) / 2e-6, rtol=1e-5, atol=1e-7)
         whole = np.asarray(color(angles))
-    turned = jv.Volume(volume.data, volume.spacing, volume.origin, direction=R)
+    _, turned = pair()
     fast = jv.render_rays(turned, soft_transfer(0.5), *(np.float32(part) for part in rays), march)
     np.testing.assert_allclose(fast.rgba[0], whole, rtol=0, atol=2e-5)
 
