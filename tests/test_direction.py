@@ -215,7 +215,7 @@ def test_a_clip_box_is_one_of_the_world():
 
 
 def test_paths_are_traced_in_the_world():
-    """Up to the first collision, walks are the same; what scatters, into other directions, is so on average."""
+    """Up to the first collision, walks are the same. What scatters, to other sides, is so on average."""
     straight, turned = pair()
     sun = np.array([0.5, 1.0, -0.7])
     images = []

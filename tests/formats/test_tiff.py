@@ -62,7 +62,7 @@ def test_bad_stacks_are_refused_with_their_reason(tmp_path):
         jv.load(tmp_path / "rgb.tif")
     tifffile.imwrite(tmp_path / "a.tif", DATA.T, photometric="minisblack")
     content = (tmp_path / "a.tif").read_bytes()
-    for length in (4, 100, len(content) // 2, len(content) - 1):
+    for length in (4, 100, len(content) // 2, len(content) - 20):
         (tmp_path / "cut.tif").write_bytes(content[:length])
         with pytest.raises(ValueError, match=r"cut\.tif"):
             jv.load(tmp_path / "cut.tif")
