@@ -81,7 +81,7 @@ def march_pair(name, volume):
 
 SPARSE = jv.TransferFunction.from_points(
     [(0.0, (0, 0, 0), 0.0), (0.6, (0.9, 0.4, 0.1), 0.0), (0.8, (0.2, 0.9, 0.3), 0.5), (1.0, (1, 1, 1), 0.8)],
-    0.1,
+    0.2,
 )
 
 
@@ -92,13 +92,10 @@ SPARSE = jv.TransferFunction.from_points(
 def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):
     straight, turned = pair()
     first, second = views(straight, inside)
-    for march, volume, camera in zip(
-        march_pair(name, straight), (straight, turned), (first, second), strict=True
-    ):
-        assert volume.direction is None or np.array_equal(volume.direction, R)
-        rendering = jv.render(volume, SPARSE, camera, march, lighting=Phong())
-        if volume is straight:
-            expected = rendering
+    scenes = zip(march_pair(name, straight), (straight, turned), (first, second), strict=True)
+    expected, rendering = (
+        jv.render(volume, SPARSE, camera, march, lighting=Phong()) for march, volume, camera in scenes
+    )
     assert np.asarray(expected.rgba)[..., 3].max() > 0.5
     assert (np.asarray(expected.rgba)[..., 3] == 0).any() or inside
     np.testing.assert_allclose(rendering.rgba, expected.rgba, rtol=0, atol=2e-5)
@@ -133,7 +130,7 @@ def test_gradients_are_those_of_the_volume_along_the_axes():
         found.append(jax.grad(loss)((volume.data, volume.spacing, SPARSE.extinction), volume, camera))
     for one, other in zip(*found, strict=True):
         assert np.linalg.norm(one) > 0
-        np.testing.assert_allclose(other, one, rtol=0, atol=2e-4 * np.linalg.norm(one))
+        np.testing.assert_allclose(other, one, rtol=0, atol=2e-4 * float(np.linalg.norm(one)))
 
 
 def test_the_reference_in_float64_and_the_derivative_along_a_turn():
@@ -149,7 +146,7 @@ def test_the_reference_in_float64_and_the_derivative_along_a_turn():
         @jax.jit
         def color(angles):
             turned = jv.Volume(volume.data, volume.spacing, volume.origin, direction=turn(angles))
-            return jv.render_rays(turned, transfer, *rays, march, adjoint="direct").rgba[0]
+            return jv.render_rays(turned, transfer, rays[0], rays[1], march, adjoint="direct").rgba[0]
 
         angles = np.array(ANGLES)
         derivative = np.asarray(jax.jacrev(color)(angles))
@@ -159,7 +156,7 @@ def test_the_reference_in_float64_and_the_derivative_along_a_turn():
         np.testing.assert_allclose(derivative.T, (ends[:3] - ends[3:]) / 2e-6, rtol=1e-5, atol=1e-7)
         whole = np.asarray(color(angles))
     _, turned = pair()
-    fast = jv.render_rays(turned, soft_transfer(0.5), *(np.float32(part) for part in rays), march)
+    fast = jv.render_rays(turned, soft_transfer(0.5), rays[0], rays[1], march)
     np.testing.assert_allclose(fast.rgba[0], whole, rtol=0, atol=2e-5)
 
 
@@ -208,8 +205,8 @@ def test_a_clip_box_is_one_of_the_world():
     opaque = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [1e4, 1e4])
     march = jv.March(0.5, (jv.Clip(box), jv.SpaceLeaping(), jv.AlphaCorrection()))
     origins = center + np.array([[0.3, -0.2, -20], [-20, 0.5, 0.4], [1.1, 0, -20]])
-    rays = np.float32(origins), np.float32([(0, 0, 1), (1, 0, 0), (0, 0, 1)])
-    rendering = jv.render_rays(volume, opaque, *rays, march)
+    rays = origins, np.array([(0.0, 0, 1), (1, 0, 0), (0, 0, 1)])
+    rendering = jv.render_rays(volume, opaque, rays[0], rays[1], march)
     np.testing.assert_allclose(rendering.rgba[:, 3], (1, 1, 0), atol=1e-6)
     np.testing.assert_allclose(rendering.depth[:2], (19, 19), atol=1e-2)
 

@@ -69,7 +69,7 @@ def _write_npz(volume: Volume, path: Path) -> None:
     if volume.data.dtype == "bfloat16":
         raise ValueError("volume has voxels of bfloat16, which .npz cannot hold; convert them to float32.")
     with path.open("wb") as stream:
-        np.savez_compressed(stream, **{name: np.asarray(array) for name, array in arrays.items()})
+        np.savez_compressed(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
 
 
 def _write_medical(volume: Volume, path: Path) -> None:

@@ -11,6 +11,8 @@ import time
 import tracemalloc
 from pathlib import Path
 
+import numpy as np
+
 import jaxvol as jv
 from jaxvol import bricks
 
@@ -27,7 +29,7 @@ def read(how, path):
         total = 0
         for source in bricks.levels_of(path):
             high = tuple(min(n, 16) for n in source.shape)
-            total += source.read((0, 0, 0), high).result().size
+            total += np.asarray(source.read((0, 0, 0), high)).size
         return total
     return jv.load(path).data.size
 
@@ -55,7 +57,7 @@ def main():
         how, path = json.loads(line)
         if how == "limit":
             used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-            resource.setrlimit(resource.RLIMIT_AS, (used + ROOM,) * 2)
+            resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, used + ROOM))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             tracemalloc.start()
             reply = {"limit": used + ROOM}

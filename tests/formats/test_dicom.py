@@ -118,7 +118,7 @@ def test_an_oblique_series_lies_where_it_was_scanned(tmp_path, angles):
     direction = turned(*angles)
     paths = write_series(tmp_path / "a", direction)
     volume = jv.load(tmp_path / "a")
-    np.testing.assert_allclose(volume.direction, direction, atol=1e-6)
+    np.testing.assert_allclose(np.array(volume.direction), direction, atol=1e-6)
     np.testing.assert_array_equal(volume.data, read(paths))
     np.testing.assert_allclose(volume.origin, ORIGIN, rtol=1e-6)
 

@@ -382,13 +382,13 @@ def test_an_oblique_image_keeps_its_voxels_and_its_direction(sitk, tmp_path, end
     path = write_itk(sitk, tmp_path / f"a{ending}", ramp("int16"), (1, 2, 3), (4, 5, 6), turn)
     volume = load(path)
     assert same(volume, ramp("int16"), (1, 2, 3), (4, 5, 6))
-    np.testing.assert_allclose(volume.direction, turn, atol=1e-6)
+    np.testing.assert_allclose(np.array(volume.direction), turn, atol=1e-6)
     # turned by nearly a right angle as well, about z: the first axis to the back, the second to the right
     quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     volume = load(write_itk(sitk, path, ramp("int16"), (1, 2, 3), (4, 5, 6), turn @ quarter))
     corner = np.array([4, 5, 6]) + turn @ quarter @ (0, 3 * 2, 0)
     assert same(volume, ramp("int16").transpose(1, 0, 2)[::-1], (2, 1, 3), corner)
-    np.testing.assert_allclose(volume.direction, turn, atol=1e-6)
+    np.testing.assert_allclose(np.array(volume.direction), turn, atol=1e-6)
 
 
 def test_nifti_values_are_scaled(sitk, tmp_path):
