@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from itertools import combinations
 from typing import Any, ClassVar, get_args
 
@@ -155,7 +156,9 @@ FEW = [
 @contextmanager
 def in_float64() -> Iterator[None]:
     """Enable 64-bit types in JAX. Create float64 arrays inside the context, or cast with `to_float64`."""
-    with jax.enable_x64(True):
+    # named so since jax 0.8
+    home: Any = jax if hasattr(jax, "enable_x64") else import_module("jax.experimental")
+    with home.enable_x64(True):
         yield
 
 

@@ -10,6 +10,8 @@ from scipy.ndimage import map_coordinates
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
 
+from .scenes import in_float64
+
 
 DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32"]
 SHAPE = (5, 7, 6)
@@ -113,7 +115,7 @@ def test_bounds_span_from_the_first_node_to_the_last():
 
 def test_float64_data_follow_jax():
     assert jv.Volume(np.zeros(SHAPE)).data.dtype == jnp.float32
-    with jax.enable_x64(True):
+    with in_float64():
         assert jv.Volume(np.zeros(SHAPE)).data.dtype == jnp.float64
 
 

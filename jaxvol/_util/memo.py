@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .checks import is_traced
+from .xla import computed_now
 
 
 T = TypeVar("T")
@@ -28,8 +29,7 @@ def memoized(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
         return _of_batch(compute)(jax.lax.stop_gradient(array))
     key = id(array), compute
     if key not in _MEMORY:
-        with jax.ensure_compile_time_eval():
-            _MEMORY[key] = compute(array)
+        _MEMORY[key] = computed_now(compute, array)
         weakref.finalize(array, _MEMORY.pop, key, None)
     return _MEMORY[key]
 

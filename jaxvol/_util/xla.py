@@ -49,6 +49,15 @@ def compiled(function: Callable[..., Any], *, has_jvp: bool = False) -> Callable
     return run
 
 
+def computed_now(function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)` of concrete arrays, computed at once also where a larger program is being traced."""
+    if not is_traced(jnp.zeros(())):
+        return function(*args)
+    # not by `jax.ensure_compile_time_eval`, inside which jax 0.7 cannot compile a loop
+    jitted: Any = eqx.filter_jit(function)
+    return jitted.lower(*args).compile()(*args)
+
+
 def _only_vmapped(args: PyTree) -> bool:
     """Whether `jax.vmap` is the innermost transformation of every traced argument."""
     kinds = {transformations(leaf)[0] for leaf in jax.tree.leaves(args) if is_traced(leaf)}

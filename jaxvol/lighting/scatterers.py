@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from .._util.checks import flag, integer, is_flag, is_traced, number
 from .._util.memo import memoized
+from .._util.xla import computed_now
 from ..march import March, Transform
 from ..transfer import Transfer
 from ..volume import Volume, without_voxels
@@ -290,7 +291,7 @@ class ScattererTemplates(Lighting):
             cache.clear()
             with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
                 around = Surroundings(volume, transfer, march.locate(volume))
-                cache[tree] = entry = leaves, _baked(self, around)
+            cache[tree] = entry = leaves, computed_now(_baked, self, around)
         return entry[1]
 
     def shading(self, around: Surroundings) -> Shading:

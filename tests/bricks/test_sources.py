@@ -5,7 +5,6 @@ import subprocess
 import sys
 import textwrap
 
-import jax
 import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
@@ -16,6 +15,8 @@ from jaxvol.bricks import files
 from jaxvol.bricks.files import FileSource
 from jaxvol.bricks.opening import levels_of, source_of
 from jaxvol.bricks.sources import ArraySource
+
+from ..scenes import in_float64
 
 
 SHAPE = (23, 17, 31)
@@ -163,7 +164,7 @@ def test_types_that_no_volume_has_are_converted_as_in_a_volume(stored, read):
 
 def test_doubles_stay_doubles_where_jax_has_them():
     data = np.random.default_rng(0).random(SHAPE)
-    with jax.enable_x64(True):
+    with in_float64():
         assert source_of(data).read((0, 0, 0), SHAPE).dtype == np.float64
 
 

@@ -24,6 +24,7 @@ from jaxvol.bricks.summary_files import summary_of
 from jaxvol.occupancy import BLOCK, Blocks
 from jaxvol.variation import Windows
 
+from ..scenes import in_float64
 from .test_sources import voxels, x_fastest
 from .test_zarr import written
 
@@ -152,7 +153,7 @@ def test_a_real_volume(real_volume):
 
 
 def test_ranges_of_doubles():
-    with jax.enable_x64(True):
+    with in_float64():
         data = np.random.default_rng(0).normal(size=SHAPE)
         assert_equal(scan(source_of(data)).blocks(), Blocks.of(jv.Volume(data)))
 
