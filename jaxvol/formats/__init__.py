@@ -6,7 +6,7 @@ that the file holds; the caller's own arguments to `load` override them.
 `load_ultrasound` reads files of ultrasound as acquired, which hold a probe beside the voxels.
 
 Files are data: nothing is unpickled, and the content of a file is checked against its header before
-memory is allocated for it. (`medical` says for which files that is left to SimpleITK.)
+memory is allocated for it.
 """
 
 import os
@@ -24,6 +24,7 @@ from ..volume import Volume
 from .dicom import dicom_files, read_dicom, read_dicom_folder
 from .kretz import read_kretz, refuse_kretz
 from .medical import read_medical
+from .metaimage import read_metaimage
 from .raw import read_raw
 from .save import save as save
 from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files
@@ -36,7 +37,8 @@ READERS: dict[str, Reader] = {
     ".raw.gz": read_raw,
     ".npy": read_npy,
     ".npz": read_npz,
-    **dict.fromkeys((".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), read_medical),
+    **dict.fromkeys((".nii", ".nii.gz", ".nrrd"), read_medical),
+    **dict.fromkeys((".mha", ".mhd"), read_metaimage),
     ".dcm": read_dicom,
     **dict.fromkeys(TIFF, read_tiff),
     ".vol": refuse_kretz,
@@ -60,7 +62,8 @@ def load(
     | `.raw`, `.raw.gz` | the arguments; else a JSON file beside it; else the name `name_XxYxZ_dtype.raw` |
     | `.npy` | its own; the array is data[x, y, z] |
     | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
-    | `.nii`, `.nii.gz`, `.mha`, `.mhd`, `.nrrd` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
+    | `.mha`, `.mhd` | its own |
+    | `.nii`, `.nii.gz`, `.nrrd` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
     | a folder of DICOM slices, or `.dcm`, one file of a series in a folder | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |

@@ -1,4 +1,4 @@
-"""Reads medical images with SimpleITK, as volumes along the axes of the patient, or askew to them.
+"""Reads NIfTI and NRRD images with SimpleITK, as volumes along the axes of the patient, or askew to them.
 
 SimpleITK takes memory as headers say, and returns garbage for some files that are cut short. So the size of
 the content is compared with the header before it reads any.
@@ -6,13 +6,12 @@ the content is compared with the header before it reads any.
 
 import gzip
 import math
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._util.files import MOST_VOXELS, Header, as_array, check_size, chunks, decoding, file_size
+from .._util.files import MOST_VOXELS, Header, check_size, chunks, decoding, file_size
 from .orientation import toward_axes
 
 
@@ -30,14 +29,14 @@ def simple_itk(path: Path) -> Any:
 
 
 def read_medical(path: Path, header: Header) -> dict[str, Any]:
-    """Reader for `.nii`, `.nii.gz`, `.mha`, `.mhd` and `.nrrd`."""
+    """Reader for `.nii`, `.nii.gz` and `.nrrd`."""
     header.refuse(path)
     n_bytes = file_size(path)
     sitk = simple_itk(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     name = path.name.lower()
-    kind = "Nifti" if name.endswith((".nii", ".nii.gz")) else "Nrrd" if name.endswith(".nrrd") else "Meta"
+    kind = "Nrrd" if name.endswith(".nrrd") else "Nifti"
     reader.SetImageIO(f"{kind}ImageIO")
     with decoding(path):
         reader.ReadImageInformation()
@@ -49,9 +48,9 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
             )
         if kind == "Nifti":
             _check_nifti(path, reader, n_bytes)
-        elif kind == "Nrrd":
+        else:
             _check_nrrd(path, math.prod(size), _voxel_type(reader).itemsize)
-        image = (_inflated_metaimage(path, reader) if kind == "Meta" else None) or reader.Execute()
+        image = reader.Execute()
     # copied by this, since the view is invalid once the image is freed
     data = np.array(sitk.GetArrayViewFromImage(image).T)
     if data.dtype == np.float64:
@@ -105,47 +104,3 @@ def _check_nrrd(path: Path, voxels: int, itemsize: int) -> None:
 def _voxel_type(reader: Any) -> np.dtype:
     sitk = simple_itk(Path(reader.GetFileName()))
     return sitk.GetArrayViewFromImage(sitk.Image([1, 1, 1], reader.GetPixelIDValue())).dtype
-
-
-def _inflated_metaimage(path: Path, reader: Any) -> Any | None:
-    """The image in a compressed MetaImage; None for one that is not compressed, and holds what it says.
-
-    The header may state the number of compressed bytes. If that is too small, ITK still trusts it and leaves
-    the rest of the volume unset; here the end is that of the compressed stream itself.
-    """
-    sitk = simple_itk(path)
-    fields: dict[str, str] = {}
-    voxel = _voxel_type(reader)
-    expected = math.prod(reader.GetSize()) * voxel.itemsize
-    with path.open("rb") as stream:
-        while (line := stream.readline(LONGEST_LINE)) and len(fields) < MOST_FIELDS:
-            key, _, value = line.decode("latin-1").partition("=")
-            fields[key.strip()] = value.strip()
-            if "ElementDataFile" in fields:
-                break
-        named = fields.get("ElementDataFile", "")
-        local = named.upper() == "LOCAL"
-        source = path if local else path.parent / named
-        if not source.is_file():
-            raise ValueError(
-                f"path: {path} cannot be read: it must hold its voxels, or name one file of them; "
-                f"got {named!r}."
-            )
-        if not fields.get("CompressedData", "").lower().startswith(("t", "1")):
-            held = source.stat().st_size - (stream.tell() if local else 0)
-            if (
-                fields.get("BinaryData", "True").lower().startswith("f")
-            ):  # at least a digit and a space for each
-                held = (held + 1) // 2 * voxel.itemsize
-            check_size(path, min(held, expected), expected)
-            return None
-        packed = stream.read() if local else source.read_bytes()
-    msb = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "")).lower().startswith("t")
-    content = zlib.decompressobj(wbits=47).decompress(packed, expected + 1)  # 47: a zlib or gzip header
-    check_size(path, len(content), expected)
-    array = as_array(content, reader.GetSize()[::-1], voxel.newbyteorder(">" if msb else "<"), "C")
-    image = sitk.GetImageFromArray(array)
-    image.SetSpacing(reader.GetSpacing())
-    image.SetOrigin(reader.GetOrigin())
-    image.SetDirection(reader.GetDirection())
-    return image
