@@ -7,6 +7,7 @@ transfer function only, and is 64 times as large.
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Shaped, UInt8
@@ -20,7 +21,7 @@ from jaxvol.occupancy import FARTHEST, ROUNDING, Blocks, Occupancy
 class Measured(Occupancy):
     """Occupied cells, of which the distances are known."""
 
-    distances: UInt8[Array, " cells"]
+    distances: UInt8[Array, " cells"] = eqx.field(kw_only=True)
 
     def distance(self) -> UInt8[Array, " cells"]:
         return self.distances
@@ -53,7 +54,7 @@ def distances(volume: jv.Volume, transfer: jv.TransferFunction) -> Measured:
         found = np.asarray(distance_transform_cdt(~visible, metric="chessboard"))
         away = np.minimum(found, FARTHEST - 1)
     corner, size = (tuple(of) for of in (volume.origin, volume.spacing))
-    return Measured(jnp.asarray(visible), corner, size, jnp.asarray(away.astype(np.uint8).ravel()))
+    return Measured(jnp.asarray(visible), corner, size, distances=jnp.asarray(away.astype(np.uint8).ravel()))
 
 
 def over_corners(data: Shaped[np.ndarray, "nx ny nz"], combine: np.ufunc) -> np.ndarray:

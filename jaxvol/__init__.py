@@ -5,7 +5,7 @@ it. A volume gives values, a transfer function maps them to colour and extinctio
 composited front to back into a `Rendering`.
 """
 
-from . import bricks as bricks, lighting as lighting, metrics as metrics
+from . import bricks as bricks, datasets as datasets, lighting as lighting, metrics as metrics
 from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
 from .camera import Camera as Camera
 from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
@@ -36,7 +36,7 @@ from .fitting import (
     refined as refined,
     write_transfer as write_transfer,
 )
-from .formats import load as load, load_ultrasound as load_ultrasound
+from .formats import load as load, load_ultrasound as load_ultrasound, save as save
 from .isosurface import Isosurface as Isosurface
 from .labels import LabelTransferFunction as LabelTransferFunction
 from .lighting import (

@@ -1,4 +1,5 @@
-"""What does the command `jaxvol` do? It renders volume files, plans how to, and fits transfer functions."""
+"""What does the command `jaxvol` do? It renders volume files, plans how to, fits transfer functions,
+tells what a file holds, and fetches public ones."""
 
 import argparse
 import os
@@ -15,11 +16,13 @@ import numpy as np
 
 from ._util.checks import output_file
 from .camera import Camera
+from .commands.data import add_data_options, volume_of
+from .commands.datasets import add_datasets
+from .commands.info import add_info
 from .compositing import Compositing, Over
 from .display import image_file, save_image
 from .figures import add_figures
 from .fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
-from .formats import load
 from .isosurface import Isosurface
 from .lighting import Lighting, Phong
 from .march import March, Transform
@@ -41,6 +44,9 @@ from .volume import Volume
 EXAMPLES = """\
 examples:
   jaxvol demo
+  jaxvol datasets list
+  jaxvol datasets fetch engine
+  jaxvol info engine_256x256x128_uint8.raw.gz
   jaxvol render engine_256x256x128_uint8.raw.gz --preset engine -o engine.png
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
@@ -216,6 +222,8 @@ def _parser() -> argparse.ArgumentParser:
     solver.add_argument("--progress", action="store_true", help="show a progress bar")
     fit_command.set_defaults(run=_fit)
     add_figures(commands, shared)
+    add_info(commands, shared)
+    add_datasets(commands, shared)
     return parser
 
 
@@ -322,9 +330,7 @@ def _view_options() -> argparse.ArgumentParser:
 def _scene_options() -> argparse.ArgumentParser:
     """Options shared by all commands that render a volume file."""
     scene = argparse.ArgumentParser(add_help=False)
-    scene.add_argument(
-        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
-    )
+    add_data_options(scene)
     scene.add_argument(
         "--step",
         type=float,
@@ -332,14 +338,6 @@ def _scene_options() -> argparse.ArgumentParser:
     )
     scene.add_argument(
         "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
-    )
-    data = scene.add_argument_group("data", "needed if the file and its name do not specify it")
-    data.add_argument(
-        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
-    )
-    data.add_argument("--dtype", help="such as uint8 or uint16le")
-    data.add_argument(
-        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
     )
     return scene
 
@@ -435,7 +433,7 @@ def _tolerance(options: argparse.Namespace) -> float:
 
 def _view(options: argparse.Namespace) -> tuple[Volume, TransferFunction, Camera]:
     """What is looked at, and from where."""
-    volume = _volume(options)
+    volume = volume_of(options)
     transfer = _look(options, volume)
     view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
     if options.camera and options.parallel:
@@ -505,7 +503,7 @@ def _look(options: argparse.Namespace, volume: Volume) -> TransferFunction:
 
 def _fit(options: argparse.Namespace) -> None:
     output_file("--output", options.output)
-    volume = _volume(options)
+    volume = volume_of(options)
     # half a voxel
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     march = March(step, FAST, "midpoint")
@@ -524,11 +522,6 @@ def _fit(options: argparse.Namespace) -> None:
     path = write_transfer(options.output, result.parameters)
     error = (2 * result.loss) ** 0.5
     print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")
-
-
-def _volume(options: argparse.Namespace) -> Volume:
-    """The volume in the file."""
-    return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
 
 
 def _picture(

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
+from ._util.frame import Frame
 from ._util.memo import memoized
 from ._util.platform import while_loop
 from ._util.sharding import varying
@@ -143,12 +144,14 @@ class Sums(eqx.Module):
 class Occupancy(eqx.Module):
     """A regular grid of cells in the world. Everything visible lies in an occupied cell of it.
 
-    - `origin`, `size`: world position of the grid's corner, and side lengths of a cell.
+    - `origin`, `size`: position of the grid's corner, and side lengths of a cell, along the axes of `frame`,
+      or, without one, the world's.
     """
 
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
     size: Vec3
+    frame: Frame | None = None
 
     def sums(self) -> Sums:
         """For queries about boxes."""
@@ -181,8 +184,17 @@ class Occupancy(eqx.Module):
 
     def cell(self, point: Vec3) -> Vec3:
         """Coordinate of a world point in the grid, in cells."""
+        point = self.own_point(point)
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
+
+    def own_point(self, point: Vec3) -> Vec3:
+        """A world point along the grid's axes."""
+        return point if self.frame is None else self.frame.coordinates(point)
+
+    def own_direction(self, direction: Vec3) -> Vec3:
+        """A world direction along the grid's axes."""
+        return direction if self.frame is None else self.frame.components(direction)
 
 
 def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:

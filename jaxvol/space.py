@@ -1,7 +1,7 @@
 """Where does a world point lie in the grid, and where does a ray enter and leave the grid?
 
 A `Space` answers both for one volume; this is the seam `locate`. The default, `Affine`, applies
-spacing and origin, so rays stay straight in the grid. A space with curved rays returns a
+spacing, origin and direction, so rays stay straight in the grid. A space with curved rays returns a
 different `Path`; the rest of the march is unaffected.
 """
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ._util.frame import Frame
 from ._util.vec3 import Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
 from .volume import Volume
@@ -167,16 +168,27 @@ class Straight(Path):
 
 
 class Affine(Space):
-    """A grid along the world axes, given by spacing and origin."""
+    """A grid given by spacing, origin and direction.
+
+    - `low`, `high`: its first and its last node, and `spacing`: all along the grid's own axes, which are
+      those of `frame`, or, without one, the world's.
+    """
 
     low: Vec3
     high: Vec3
     spacing: Vec3
+    frame: Frame | None
 
     def __init__(self, volume: Volume):
-        low, high = volume.corners
-        self.low, self.high = apart(low), apart(high)
         self.spacing = apart(volume.spacing)
+        if volume.direction is None:
+            low, high = volume.corners
+            self.low, self.high, self.frame = apart(low), apart(high), None
+        else:
+            # from the first node, where the numbers are small: many origins are far away
+            self.frame = Frame.of(volume.origin, volume.direction)
+            high = (jnp.asarray(volume.shape, volume.spacing.dtype) - 1) * volume.spacing
+            self.low, self.high = apart(jnp.zeros_like(high)), apart(high)
 
     @property
     def diagonal(self) -> Scalar:
@@ -185,30 +197,43 @@ class Affine(Space):
     @property
     def middle(self) -> Vec3:
         x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
-        return x, y, z
+        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        return slab_interval(origin, direction, self.low, self.high)
+        if self.frame is not None:
+            origin = self.frame.coordinates(origin)
+        return slab_interval(origin, self.own(direction), self.low, self.high)
 
     def coordinate(self, point: Vec3) -> Vec3:
+        if self.frame is not None:
+            point = self.frame.coordinates(point)
         # times the reciprocal, since XLA stores quotients of which there is more than one use
         x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
 
     def point(self, coordinate: Vec3) -> Vec3:
-        x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
-        return x, y, z
+        x, y, z = self._own_point(coordinate)
+        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
         return self.spacing
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         x, y, z = (BLOCK * step for step in self.spacing)
-        return Occupancy(visible, self.low if first is None else self.point(first), (x, y, z))
+        low = self.low if first is None else self._own_point(first)
+        return Occupancy(visible, low, (x, y, z), self.frame)
 
     def path(self, entry: Vec3, direction: Vec3) -> Straight:
-        dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
+        dx, dy, dz = (d / step for d, step in zip(self.own(direction), self.spacing, strict=True))
         return Straight(self.coordinate(entry), (dx, dy, dz))
+
+    def own(self, direction: Vec3) -> Vec3:
+        """Components of a world direction along the grid's axes, in world length."""
+        return direction if self.frame is None else self.frame.components(direction)
+
+    def _own_point(self, coordinate: Vec3) -> Vec3:
+        x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
+        return x, y, z
 
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:

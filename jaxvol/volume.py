@@ -10,9 +10,11 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
-from ._util.checks import Arrayable, described, finite_array, require
+from ._util.checks import Arrayable, described, finite_array, is_traced, require
+from ._util.named_axes import along_xyz, is_named
 from ._util.vec3 import Scalar, Vec3
 from ._util.voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by
 from ._util.voxels import label_array, voxel_array
@@ -29,7 +31,7 @@ class Field(eqx.Module):
     @abstractmethod
     def value(self, volume: "Volume", coordinate: Vec3) -> Scalar:
         """Value at a grid coordinate, whose world position is
-        `volume.origin + coordinate * volume.spacing`."""
+        `volume.origin + volume.direction @ (coordinate * volume.spacing)`."""
 
 
 class Volume(eqx.Module):
@@ -42,8 +44,15 @@ class Volume(eqx.Module):
       device; a voxel is converted after it is fetched. float64 is kept if JAX's 64-bit types are enabled,
       and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
       int8, uint16, int16 and float32 that holds every value exactly.
-    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT).
-    - `origin`: world position of node (0, 0, 0).
+      Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
+      evenly spaced, give spacing and origin. For an image stack of scikit-image, [plane, row, column], pass
+      `stack.T`: x then runs along the rows, y from row to row, z from plane to plane.
+    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT). By default
+      that of the data's coordinates, or 1.
+    - `origin`: world position of node (0, 0, 0). By default that of the data's coordinates, or 0.
+    - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
+      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
+      and for the identity, the data's axes are the world's, and the field is None.
     - `labels`: optional integer label of every node (a segmentation), of the same shape. 64-bit labels
       become 32-bit.
     - `field`: optional `Field` that supplies the values instead of the voxels; the voxel grid then only sets
@@ -52,15 +61,20 @@ class Volume(eqx.Module):
     bfloat16 keeps 8 significant bits, float16 11: values around 1000 are rounded to multiples of 4 and of 0.5
     (`experiments/stability.py`, "voxels of 16-bit floats").
 
+    `direction` is differentiable like `spacing`, as far as it turns: gradients are exact along changes that
+    keep it orthonormal, such as those of the angles that it is computed from.
+
     **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
     unsupported type, or hold NaN or infinity, even if only after conversion to float32; for integers that no
-    type holds exactly; for spacing that is not positive; and for labels of another shape or type, or beyond
+    type holds exactly; for spacing that is not positive; for a direction whose columns are not of length 1
+    and orthogonal to 1e-4; and for labels of another shape or type, or beyond
     int32.
     """
 
     data: Shaped[Array, "nx ny nz"]
     spacing: Float[Array, "3"]
     origin: Float[Array, "3"]
+    direction: Float[Array, "3 3"] | None
     labels: Integer[Array, "nx ny nz"] | None
     field: Field | None
     fetch: Fetch
@@ -68,18 +82,23 @@ class Volume(eqx.Module):
     def __init__(
         self,
         data: Arrayable,
-        spacing: Arrayable = (1.0, 1.0, 1.0),
-        origin: Arrayable = (0.0, 0.0, 0.0),
+        spacing: Arrayable | None = None,
+        origin: Arrayable | None = None,
         labels: Arrayable | None = None,
         *,
+        direction: Arrayable | None = None,
         field: Field | Any | None = None,
     ):
+        data, place = along_xyz(data) if is_named(data) else (data, {})
         self.data = voxel_array(data)
+        spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
+        origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin
         spacing = finite_array("spacing", spacing, (3,))
         self.spacing = require(
             spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}."
         )
         self.origin = finite_array("origin", origin, (3,))
+        self.direction = None if direction is None else _turn(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape)
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
@@ -100,19 +119,33 @@ class Volume(eqx.Module):
 
     @property
     def bounds(self) -> Float[Array, "6"]:
-        """World extent (x_min, x_max, y_min, y_max, z_min, z_max), from the first node to the last."""
+        """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes: a box along the world's
+        axes, in which a volume with a `direction` lies askew."""
         low, high = self.corners
+        if self.direction is not None:
+            # of each axis of the data, what it adds to the world's, up or down
+            reach = self.direction * (self._steps * self.spacing)[None, :]
+            low = self.origin + jnp.sum(jnp.minimum(reach, 0), axis=1)
+            high = self.origin + jnp.sum(jnp.maximum(reach, 0), axis=1)
         return jnp.stack([low, high], axis=-1).reshape(-1)
 
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """World positions of the first and the last node."""
-        steps = jnp.asarray(self.shape, self.spacing.dtype) - 1
-        return self.origin, self.origin + steps * self.spacing
+        if self.direction is not None:
+            # not by a matrix product, which some GPUs round to 10 bits
+            along = self.direction * (self._steps * self.spacing)[None, :]
+            return self.origin, self.origin + jnp.sum(along, axis=1)
+        return self.origin, self.origin + self._steps * self.spacing
+
+    @property
+    def _steps(self) -> Float[Array, "3"]:
+        """Number of cells along x, y, z."""
+        return jnp.asarray(self.shape, self.spacing.dtype) - 1
 
     @property
     def center(self) -> Float[Array, "3"]:
-        """World position of the center of the bounds."""
+        """World position of the center of the grid."""
         low, high = self.corners
         return (low + high) / 2
 
@@ -196,6 +229,18 @@ class Volume(eqx.Module):
         return slope(0), slope(1), slope(2)
 
 
+def _turn(direction: Arrayable) -> Float[Array, "3 3"] | None:
+    """A direction, checked; None for one that is known to be the identity."""
+    turn = require(
+        finite_array("direction", direction, (3, 3)),
+        lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
+        "direction must be a 3 x 3 matrix whose columns have length 1 and are orthogonal to each other; got "
+        "{got}.",
+    )
+    known = not is_traced(turn) and np.array_equal(np.asarray(turn), np.eye(3))
+    return None if known else turn
+
+
 def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
     x, y, z = (component if i == axis else c for i, c in enumerate(coordinate))
     return x, y, z
@@ -217,8 +262,8 @@ def with_voxels(volume: Volume, data: Array) -> Volume:
 
 
 def part_of(volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int]) -> Volume:
-    """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing
-    and origin are those of the whole. Beyond the part nothing is known: its faces are read."""
+    """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing,
+    origin and direction are those of the whole. Beyond the part nothing is known: its faces are read."""
     fetch = eqx.tree_at(
         lambda fetch: fetch.window, volume.fetch, Window(first, whole), is_leaf=lambda leaf: leaf is None
     )

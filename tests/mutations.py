@@ -1340,6 +1340,49 @@ MUTATIONS = [
         "jnp.arange(chosen.size, dtype=jnp.int32), 0)",
         ("_util/test_compaction.py::test_all_at_once_each_chosen_one_is_put_where_it_was_and_no_other",),
     ),
+    # direction
+    Mutation(
+        "direction: rays are not turned into the cells of what is visible",
+        "occupancy.py",
+        "return direction if self.frame is None else self.frame.components(direction)",
+        "return direction",
+        ("test_direction.py::test_what_is_leapt_over_does_not_show",),
+    ),
+    Mutation(
+        "direction: rows taken for columns",
+        "_util/frame.py",
+        "apart(direction[:, axis])",
+        "apart(direction[axis])",
+        ("test_direction.py::test_nodes_lie_where_numpy_puts_them",),
+    ),
+    Mutation(
+        "direction: left out of bricks",
+        "bricks/stream.py",
+        ", direction=volume.direction)",
+        ")",
+        ("test_direction.py::test_bricks_keep_the_direction",),
+    ),
+    Mutation(
+        "direction: light comes from where it would without",
+        "path_tracing/walks.py",
+        "x, y, z = self.space.point(coordinate)",
+        "x, y, z = (o + c for o, c in zip(apart(self.volume.origin), coordinate, strict=True))",
+        ("test_direction.py::test_light_arrives_at_the_world_point",),
+    ),
+    Mutation(
+        "DICOM: slices in the order of their names",
+        "formats/dicom.py",
+        "slices = sorted(slices, key=lambda each: float(each.position @ normal))",
+        "slices = list(slices)",
+        ("formats/test_dicom.py::test_a_shuffled_series_comes_out_sorted_and_rescaled",),
+    ),
+    Mutation(
+        "an axis is reversed, and the origin stays",
+        "formats/orientation.py",
+        "        if sign < 0:",
+        "        if False:",
+        ("formats/test_save.py::test_a_volume_turned_by_more_comes_back_in_the_same_place",),
+    ),
     # ultrasound as acquired
     Mutation(
         "kretz: beams and planes exchanged",

@@ -55,6 +55,14 @@ def file_size(path: Path) -> int:
     return size
 
 
+def gzip_size(path: Path) -> int:
+    """Size modulo 2**32 that a gzip file says its content has; nothing is decompressed."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, 2)
+        stream.seek(max(size - 4, 0))
+        return int.from_bytes(stream.read(4), "little")
+
+
 def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
     """All bytes of a stream, which must be `expected`; at most one more is read."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing

@@ -12,6 +12,10 @@ import numpy as np
 from .files import CORRUPT, MOST_VOXELS, Header, Stream, as_array, check_size, decoding, file_size, read_all
 
 
+VOLUME = ("data", "spacing", "origin", "direction", "labels")
+"""Arguments of `Volume` that a `.npz` file may hold."""
+
+
 def read_npy(path: Path, header: Header) -> dict[str, Any]:
     """Reader for `.npy`: one array, the data."""
     header.refuse(path)
@@ -25,7 +29,7 @@ def read_npz(path: Path, header: Header) -> dict[str, Any]:
     header.refuse(path)
     with _opened(path) as (names, read):
         if "data" in names:
-            return {name: read(name) for name in ("data", "spacing", "origin", "labels") if name in names}
+            return {name: read(name) for name in VOLUME if name in names}
         if len(names) == 1:
             return {"data": read(names[0])}
         raise ValueError(

@@ -169,7 +169,8 @@ def render_bricks(
             part if name in known else given
             for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
         )
-    scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting)
+    direction = source.direction if isinstance(source, Volume) else None
+    scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting, direction)
     check_not_sharded(mesh, scene)
     scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
     job = _Job(chosen, room, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
@@ -214,9 +215,10 @@ def _scene_of(
     march: March,
     compositing: Mode | Compositing[Any] | Any,
     lighting: Lighting | None,
+    direction: Any = None,
 ) -> Scene:
     """The scene of a source, without its voxels. `place`: its spacing and origin."""
-    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place)
+    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=direction)
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape)
     return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
 

@@ -190,7 +190,7 @@ class Stream:
         """A part of the volume, once it is read."""
         volume = self.scene.volume
         voxels = jax.device_put(load.voxels.result())  # on a CPU, not copied if a file was read (`empty_box`)
-        part = Volume(voxels, volume.spacing, volume.origin)
+        part = Volume(voxels, volume.spacing, volume.origin, direction=volume.direction)
         return part_of(part, jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:

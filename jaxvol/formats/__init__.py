@@ -1,4 +1,4 @@
-"""Loads volumes from files, with a reader chosen by the ending of the file's name.
+"""Loads volumes from files, with a reader chosen by the ending of the file's name, and saves them.
 
 A registry maps endings to readers, and `register` adds to it. A reader returns the arguments of `Volume`
 that the file holds; the caller's own arguments to `load` override them.
@@ -6,7 +6,7 @@ that the file holds; the caller's own arguments to `load` override them.
 `load_ultrasound` reads files of ultrasound as acquired, which hold a probe beside the voxels.
 
 Files are data: nothing is unpickled, and the content of a file is checked against its header before
-memory is allocated for it. (`medical` says for which files that is left to SimpleITK.)
+memory is allocated for it.
 """
 
 import os
@@ -14,14 +14,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from .._util.checks import Arrayable
 from .._util.files import Header
 from .._util.npy import read_npy, read_npz
 from ..transforms import ToroidalMap
 from ..volume import Volume
+from .dicom import dicom_files, read_dicom, read_dicom_folder
 from .kretz import read_kretz, refuse_kretz
 from .medical import read_medical
+from .metaimage import read_metaimage
 from .raw import read_raw
+from .save import save as save
+from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files
 
 
 Reader: TypeAlias = Callable[[Path, Header], dict[str, Any]]
@@ -31,7 +37,10 @@ READERS: dict[str, Reader] = {
     ".raw.gz": read_raw,
     ".npy": read_npy,
     ".npz": read_npz,
-    **dict.fromkeys((".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), read_medical),
+    **dict.fromkeys((".nii", ".nii.gz", ".nrrd"), read_medical),
+    **dict.fromkeys((".mha", ".mhd"), read_metaimage),
+    ".dcm": read_dicom,
+    **dict.fromkeys(TIFF, read_tiff),
     ".vol": refuse_kretz,
 }
 
@@ -43,23 +52,31 @@ def load(
     dtype: str | Any | None = None,
     spacing: Arrayable | None = None,
     origin: Arrayable | None = None,
+    direction: Arrayable | None = None,
+    labels: str | os.PathLike[str] | None = None,
 ) -> Volume:
-    """Load a volume from a file, whose format is given by the ending of its name.
+    """Load a volume from a file, whose format is given by the ending of its name, or from a folder of slices.
 
     | ending | header |
     |---|---|
     | `.raw`, `.raw.gz` | the arguments; else a JSON file beside it; else the name `name_XxYxZ_dtype.raw` |
     | `.npy` | its own; the array is data[x, y, z] |
-    | `.npz` | its own; arrays `data` and, if any, `spacing`, `origin`, `labels`; or one array of any name |
-    | `.nii`, `.nii.gz`, `.mha`, `.mhd`, `.nrrd` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
+    | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
+    | `.mha`, `.mhd` | its own |
+    | `.nii`, `.nii.gz`, `.nrrd` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
+    | a folder of DICOM slices, or `.dcm`, one file of a series in a folder | their own; read by SimpleITK |
+    | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
+    | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
 
     Raw files store x fastest, like those of the Open SciVis datasets. The JSON file has the raw file's name
     with `.json` appended, or in place of `.raw` or `.raw.gz`, and uses the datasets' keys `size`, `type` and
     `spacing`, and `origin`; any of them may be missing. If the sources differ, an argument overrides the
     JSON, and the JSON overrides the name; nothing is guessed.
 
-    Medical images are rescaled (CT in HU) and reoriented so that x, y, z increase towards the patient's left,
-    back and head (LPS), and float64 becomes float32. Integers of 32 and 64 bits, from any kind of file, are
+    Medical images are rescaled (CT in HU), float64 becomes float32, and axes are exchanged and reversed so
+    that x, y, z increase towards the patient's left, back and head (LPS). An oblique image keeps its voxels,
+    and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie; their
+    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are
     converted to smaller types, as described in `Volume`.
 
     **Arguments:**
@@ -70,27 +87,71 @@ def load(
       `be` (`uint16be`); raw files only.
     - `spacing`: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
     - `origin`: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
+    - `direction`: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
+    - `labels`: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
+      at the same place: it becomes the volume's labels.
 
     **Returns:** the `Volume`, with voxels in the file's type except as described above.
 
     **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or
-    shorter than its header says, or without a header; for an image that is oblique, not 3-D or not scalar;
-    for `.vol` files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for
-    a format that needs SimpleITK if it is missing.
+    shorter than its header says, or without a header; for an image that is not 3-D or not scalar; for a
+    folder of several DICOM series, or in which slices are missing, there twice, or do not fit together; for
+    labels that lie elsewhere; for `.vol` files, which `load_ultrasound` reads; and for anything that `Volume`
+    rejects. `ImportError` for a format that needs SimpleITK or tifffile if it is missing.
     """
     path = _existing(path)
-    ending = max((e for e in READERS if path.name.lower().endswith(e)), key=len, default=None)
-    if ending is None:
-        fault = "is a directory" if path.is_dir() else "has an unknown ending"
-        raise ValueError(f"path: {path} {fault}; expected a file ending in {', '.join(sorted(READERS))}.")
-    overrides = {
-        name: value for name, value in (("spacing", spacing), ("origin", origin)) if value is not None
-    }
-    arguments = READERS[ending](path, Header(shape, dtype)) | overrides
+    given = (("spacing", spacing), ("origin", origin), ("direction", direction))
+    overrides = {name: value for name, value in given if value is not None}
+    arguments = _reader(path)(path, Header(shape, dtype)) | overrides
     try:
-        return Volume(**arguments)
+        volume = Volume(**arguments)
+        return volume if labels is None else _labelled(volume, labels)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from fault
+
+
+def _reader(path: Path) -> Reader:
+    """The reader for a file, by the ending of its name, or for a folder, by what is in it."""
+    ending = max((e for e in READERS if path.name.lower().endswith(e)), key=len, default=None)
+    if ending is not None:
+        return READERS[ending]
+    if not path.is_dir():
+        raise ValueError(
+            f"path: {path} has an unknown ending; expected a file ending in {', '.join(sorted(READERS))}."
+        )
+    if dicom_files(path):
+        return read_dicom_folder
+    if tiff_files(path):
+        return read_tiff_folder
+    raise ValueError(
+        f"path: {path} is a directory without DICOM and TIFF files; expected such a folder, or a file "
+        f"ending in {', '.join(sorted(READERS))}."
+    )
+
+
+def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
+    """The volume with the voxels of another file as labels."""
+    other = load(labels)
+    for name in ("shape", "spacing", "origin", "direction"):
+        own, there = (
+            np.eye(3) if value is None else np.asarray(value)
+            for value in (getattr(volume, name), getattr(other, name))
+        )
+        # a hundredth of a voxel, at the far end of some hundred
+        slack = 0.01 * float(volume.spacing.min()) if name == "origin" else 1e-4
+        if not np.allclose(own, there, rtol=1e-4 if name == "spacing" else 0, atol=slack):
+            raise ValueError(
+                f"labels: {labels} must have the {name} of the volume, {own.tolist()}; it has "
+                f"{there.tolist()}."
+            )
+    whole = np.asarray(other.data)
+    if whole.dtype.kind == "f":
+        if not np.array_equal(whole, np.rint(whole)):
+            raise ValueError(f"labels: {labels} must hold integers; got {whole.dtype} with fractions.")
+        whole = whole.astype(np.int32)
+    return Volume(
+        *(volume.data, volume.spacing, volume.origin, whole), direction=volume.direction, field=volume.field
+    )
 
 
 def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:
@@ -141,8 +202,8 @@ def register(ending: str, reader: Reader) -> None:
     - `ending`: how the files' names end, such as `".vti"`; case is ignored, and of two endings that match
       a name the longer one is used.
     - `reader`: `reader(path, header)` returns a dict of arguments of `Volume`: `data`, and those of
-      `spacing`, `origin` and `labels` that the file holds. A reader of files that contain their shape and
-      type calls `header.refuse(path)`. `path` exists, and may be a directory.
+      `spacing`, `origin`, `direction` and `labels` that the file holds. A reader of files that contain their
+      shape and type calls `header.refuse(path)`. `path` exists, and may be a directory.
 
     **Raises:** `ValueError` for an ending without a dot.
     """

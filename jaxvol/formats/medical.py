@@ -1,29 +1,43 @@
-"""Reads medical images with SimpleITK, as volumes along the axes of the patient.
+"""Reads NIfTI and NRRD images with SimpleITK, as volumes along the axes of the patient, or askew to them.
 
-Uncompressed MetaImage and NRRD files are left to SimpleITK, which trusts their headers.
+SimpleITK takes memory as headers say, and returns garbage for some files that are cut short. So the size of
+the content is compared with the header before it reads any.
 """
 
 import gzip
 import math
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._util.files import MOST_VOXELS, Header, as_array, check_size, chunks, decoding, file_size
+from .._util.files import MOST_VOXELS, Header, check_size, chunks, decoding, file_size
+from .orientation import toward_axes
+
+
+LONGEST_LINE, MOST_FIELDS = 2**16, 2**10
+"""Of a header in text. It is at most one of corrupt files that has more."""
+
+
+def simple_itk(path: Path) -> Any:
+    """The module SimpleITK. **Raises** `ImportError` that says what to install for reading `path`."""
+    try:
+        import SimpleITK  # pyright: ignore[reportMissingImports]
+    except ImportError as fault:
+        raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault
+    return SimpleITK
 
 
 def read_medical(path: Path, header: Header) -> dict[str, Any]:
-    """Reader for `.nii`, `.nii.gz`, `.mha`, `.mhd` and `.nrrd`."""
+    """Reader for `.nii`, `.nii.gz` and `.nrrd`."""
     header.refuse(path)
     n_bytes = file_size(path)
-    try:
-        import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
-    except ImportError as fault:
-        raise ImportError(f"reading {path} needs SimpleITK: pip install jaxvol[io]") from fault
+    sitk = simple_itk(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
+    name = path.name.lower()
+    kind = "Nrrd" if name.endswith(".nrrd") else "Nifti"
+    reader.SetImageIO(f"{kind}ImageIO")
     with decoding(path):
         reader.ReadImageInformation()
         size, parts = reader.GetSize(), reader.GetNumberOfComponents()
@@ -32,22 +46,16 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
                 f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; "
                 f"got size {size} and {parts} values per voxel."
             )
-        # for truncated NIfTI and for MetaImage that fails to inflate, ITK returns garbage without an error
-        if path.name.lower().endswith((".nii", ".nii.gz")):
+        if kind == "Nifti":
             _check_nifti(path, reader, n_bytes)
-        image = _inflated_metaimage(path, reader) or reader.Execute()
-    image = sitk.DICOMOrient(image, "LPS")
-    direction = np.reshape(image.GetDirection(), (3, 3))
-    if not np.allclose(direction, np.eye(3), rtol=0, atol=1e-3):
-        raise ValueError(
-            f"path: {path} is oblique, which is not supported: its axes, reoriented as close to LPS as "
-            f"possible, are {direction.round(3).tolist()}. Resample it on a grid along the patient's axes."
-        )
-    # copied, because the view is invalid once the image is freed
-    data = np.array(sitk.GetArrayViewFromImage(image).T, order="C")
+        else:
+            _check_nrrd(path, math.prod(size), _voxel_type(reader).itemsize)
+        image = reader.Execute()
+    # copied by this, since the view is invalid once the image is freed
+    data = np.array(sitk.GetArrayViewFromImage(image).T)
     if data.dtype == np.float64:
         data = data.astype(np.float32)
-    return {"data": data, "spacing": image.GetSpacing(), "origin": image.GetOrigin()}
+    return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
 
 
 def _check_nifti(path: Path, reader: Any, n_bytes: int) -> None:
@@ -59,35 +67,40 @@ def _check_nifti(path: Path, reader: Any, n_bytes: int) -> None:
     check_size(path, min(n_bytes, expected), expected)  # other data may follow the voxels
 
 
-def _inflated_metaimage(path: Path, reader: Any) -> Any | None:
-    """The image in a compressed MetaImage; None for any other file.
-
-    The header may state the number of compressed bytes. If that is too small, ITK still trusts it and leaves
-    the rest of the volume unset; here the end is that of the compressed stream itself.
-    """
-    import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
-
+def _check_nrrd(path: Path, voxels: int, itemsize: int) -> None:
+    """**Raises** `ValueError` if less follows the header of an NRRD file than it says."""
     fields: dict[str, str] = {}
-    if not path.name.lower().endswith((".mha", ".mhd")):
-        return None
     with path.open("rb") as stream:
-        for line in stream:
-            key, _, value = line.decode("latin-1").partition("=")
-            fields[key.strip()] = value.strip()
-            if "ElementDataFile" in fields:
-                break
-        if not fields.get("CompressedData", "").lower().startswith(("t", "1")):
-            return None
-        local = fields["ElementDataFile"].upper() == "LOCAL"
-        packed = stream.read() if local else (path.parent / fields["ElementDataFile"]).read_bytes()
-    msb = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "")).lower().startswith("t")
-    voxel = sitk.GetArrayViewFromImage(sitk.Image([1, 1, 1], reader.GetPixelIDValue())).dtype
-    expected = math.prod(reader.GetSize()) * voxel.itemsize
-    content = zlib.decompressobj(wbits=47).decompress(packed, expected + 1)  # 47: a zlib or gzip header
-    check_size(path, len(content), expected)
-    array = as_array(content, reader.GetSize()[::-1], voxel.newbyteorder(">" if msb else "<"), "C")
-    image = sitk.GetImageFromArray(array)
-    image.SetSpacing(reader.GetSpacing())
-    image.SetOrigin(reader.GetOrigin())
-    image.SetDirection(reader.GetDirection())
-    return image
+        while (line := stream.readline(LONGEST_LINE).strip()) and len(fields) < MOST_FIELDS:
+            key, _, value = line.decode("latin-1").partition(":")
+            fields[key.strip().lower().replace(" ", "")] = value.strip()
+        named = fields.get("datafile")
+        if named is None:
+            begin, source = stream.tell(), path
+        else:
+            begin, source = 0, path.parent / named
+            if not source.is_file():
+                raise ValueError(
+                    f"path: {path} must hold its voxels, or name one file of them; got {named!r}."
+                )
+    expected, encoding = voxels * itemsize, fields.get("encoding", "").lower()
+    with source.open("rb") as stream:
+        stream.seek(begin)
+        if encoding in ("gzip", "gz"):
+            with gzip.GzipFile(fileobj=stream) as inflated:
+                held = sum(map(len, chunks(inflated, expected)))
+        elif encoding == "raw":
+            held = source.stat().st_size - begin
+        elif encoding in ("ascii", "text", "txt"):  # at least a digit and a space for each
+            held = (source.stat().st_size - begin + 1) // 2 * itemsize
+        else:
+            raise ValueError(
+                f"path: {path} must have the encoding raw, gzip or ascii; got {encoding!r}. Save it "
+                "as one of these."
+            )
+    check_size(path, min(held, expected), expected)
+
+
+def _voxel_type(reader: Any) -> np.dtype:
+    sitk = simple_itk(Path(reader.GetFileName()))
+    return sitk.GetArrayViewFromImage(sitk.Image([1, 1, 1], reader.GetPixelIDValue())).dtype

@@ -48,7 +48,8 @@ class Flight(eqx.Module):
     def to(
         cls, majorants: Majorants, start: Vec3, direction: Vec3, spacing: Vec3, distance: Scalar
     ) -> "Flight":
-        """Flight from a grid coordinate in a world direction, over `distance` or to the grid's border."""
+        """Flight from a grid coordinate over `distance`, or to the grid's border. `direction`: its components
+        along the grid's axes, of a unit vector."""
         x, y, z = (_nonzero(d / step) for d, step in zip(direction, spacing, strict=True))
         end = distance
         for rate, at, last in zip((x, y, z), start, majorants.last, strict=True):

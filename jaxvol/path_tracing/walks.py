@@ -16,6 +16,7 @@ from .._util.noise import hashed_uniforms_4
 from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, select, times
 from .._util.xla import in_memory
 from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
+from ..space import Affine
 from ..volume import Volume
 from .majorants import Majorants
 from .medium import Medium
@@ -116,19 +117,17 @@ class WalkScene(NamedTuple):
         return apart(sum(constant, jnp.zeros(3, jnp.float32)))
 
     @property
-    def spacing(self) -> Vec3:
-        return apart(self.volume.spacing)
+    def space(self) -> Affine:
+        return Affine(self.volume)
 
     def flight(self, start: Vec3, direction: Vec3, end: Scalar) -> Flight:
         """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
-        return Flight.to(self.majorants, start, direction, self.spacing, end)
+        return Flight.to(self.majorants, start, self.space.own(direction), self.space.spacing, end)
 
     def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
         """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
         weighted to give that of all of them on average."""
-        x, y, z = (
-            o + c * s for o, c, s in zip(apart(self.volume.origin), coordinate, self.spacing, strict=True)
-        )
+        x, y, z = self.space.point(coordinate)
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
         each = [light.at((x, y, z)) for light in self.located]

@@ -119,11 +119,14 @@ class HalfSpace(NamedTuple):
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
             for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
         )
-        a, b, c = map(jnp.abs, self.normal)
+        a, b, c = map(jnp.abs, grid.own_direction(self.normal))
         # as far as coordinates go: what rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
+        if grid.frame is not None:
+            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.origin))
         reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
-        return self.height((x[:, None, None], y[None, :, None], z[None, None])), reach
+        middle = x[:, None, None], y[None, :, None], z[None, None]
+        return self.height(middle if grid.frame is None else grid.frame.point(middle)), reach
 
 
 class _Clipped(Space):

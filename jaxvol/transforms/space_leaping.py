@@ -179,7 +179,8 @@ class _Distances(EmptySpaceIndex):
         self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
         start = self.occupancy.cell(rays.entry)
-        rate = [r / size for r, size in zip(rays.direction, self.occupancy.size, strict=True)]
+        direction = self.occupancy.own_direction(rays.direction)
+        rate = [r / size for r, size in zip(direction, self.occupancy.size, strict=True)]
         if self.starts is not None:
             assert self.corner is not None
             last = (n - 1 for n in reversed(self.starts.shape))

@@ -35,12 +35,12 @@ CUBES = 48
 class ToroidalMap(Transform):
     """Interpret `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, evenly spaced over the ranges.
 
-    The volume's own spacing and origin have no meaning under this map; world coordinates are the probe's,
-    with the origin on the motor axis. The world is empty outside the swept sector. A ray may leave the sector
-    and re-enter it, as through its hollow near side. Of such gaps two are found; what a third one hides is
-    taken for material. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside,
-    and so may one that runs along a face at less than 1e-5 of it. `AlphaCorrection` cuts cells at both ends
-    of gaps.
+    The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
+    coordinates are the probe's, with the origin on the motor axis. The world is empty outside the swept
+    sector. A ray may leave the sector and re-enter it, as through its hollow near side. Of such gaps two are
+    found; what a third one hides is taken for material. A ray that is nowhere farther outside than 2e-6 of
+    the probe's size counts as inside, and so may one that runs along a face at less than 1e-5 of it.
+    `AlphaCorrection` cuts cells at both ends of gaps.
 
     **Arguments:**
 
@@ -141,6 +141,10 @@ class ToroidalMap(Transform):
         return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
 
     def locate(self, space: Space, volume: Volume) -> Space:
+        if volume.direction is not None:
+            raise ValueError(
+                "volume has a direction, and ToroidalMap places its voxels by the probe: pass one without."
+            )
         return _Sector(self, volume.shape)
 
     def _forward(self, point: Vec3) -> Vec3:

@@ -191,7 +191,7 @@ HUGE = (2000, 1000, 1000)
 NOT_FINITE = np.array([1, np.nan, 2, np.inf, 3, -np.inf, 4, 5], "float32").tobytes()
 
 BAD_FILES = {
-    "unknown ending": ("a.tiff", b"II*", r"unknown ending; .*\.npy.*\.raw\.gz"),
+    "unknown ending": ("a.vti", b"II*", r"unknown ending; .*\.npy.*\.raw\.gz"),
     "empty": (RAW, b"", r"empty \(0 bytes\)"),
     "no header": ("a.raw", b"12", r"shape=.*name_XxYxZ_dtype\.raw.*a\.raw\.json"),
     "unknown dtype": ("a_5x4x3_rgb8.raw", b"1", "dtype must be uint8.*got 'rgb8'"),
@@ -375,11 +375,20 @@ def test_a_turned_image_comes_out_along_left_back_and_head(sitk, tmp_path, endin
     assert same(load(path), expected, (2, 3, 1), (10 - 3 * 2, 20 - 2 * 3, 30))
 
 
-def test_an_oblique_image_is_refused(sitk, tmp_path):
+@pytest.mark.parametrize("ending", ITK_ENDINGS)
+def test_an_oblique_image_keeps_its_voxels_and_its_direction(sitk, tmp_path, ending):
     c, s = np.cos(0.1), np.sin(0.1)
-    path = write_itk(sitk, tmp_path / "a.mha", ramp("int16"), direction=[[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    with pytest.raises(ValueError, match=r"oblique, which is not supported.*0\.995"):
-        load(path)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    path = write_itk(sitk, tmp_path / f"a{ending}", ramp("int16"), (1, 2, 3), (4, 5, 6), turn)
+    volume = load(path)
+    assert same(volume, ramp("int16"), (1, 2, 3), (4, 5, 6))
+    np.testing.assert_allclose(np.array(volume.direction), turn, atol=1e-6)
+    # turned by nearly a right angle as well, about z: the first axis to the back, the second to the right
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    volume = load(write_itk(sitk, path, ramp("int16"), (1, 2, 3), (4, 5, 6), turn @ quarter))
+    corner = np.array([4, 5, 6]) + turn @ quarter @ (0, 3 * 2, 0)
+    assert same(volume, ramp("int16").transpose(1, 0, 2)[::-1], (2, 1, 3), corner)
+    np.testing.assert_allclose(np.array(volume.direction), turn, atol=1e-6)
 
 
 def test_nifti_values_are_scaled(sitk, tmp_path):

@@ -1,0 +1,105 @@
+"""Writes volumes to files that `load` reads again as they were."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._util.checks import described, is_traced, output_file
+from ..volume import Volume
+
+
+def save(volume: Volume | Any, path: str | os.PathLike[str]) -> Path:
+    """Write a volume to a file, in the format of its ending; `jv.load` reads the same volume.
+
+    | ending | written |
+    |---|---|
+    | `.npz` | voxels, spacing, origin, direction, labels; compressed |
+    | `.nrrd`, `.mha`, `.mhd` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nii`, `.nii.gz` | the same; direction is rounded, to about 1e-7 |
+
+    Voxels are written in their own type, and read so: with the same values, spacing and origin. Medical
+    formats are read along the patient's axes: a volume whose axes are turned by more than 45 degrees comes
+    back with axes exchanged or reversed, and every voxel where it was in the world.
+
+    A file that is there is replaced, at once when the new one is whole.
+
+    **Arguments:**
+
+    - `volume`: with voxels; of one that has a `field`, they are not what is shown, and it is refused.
+    - `path`: the file to write. Folders are made where they are missing.
+
+    **Returns:** the path.
+
+    **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
+    of voxels that the format cannot hold, and a file that cannot be written. `ImportError` if the format
+    needs SimpleITK, and it is missing.
+    """
+    if not isinstance(volume, Volume):
+        raise ValueError(f"volume must be a Volume; got {described(volume)}.")
+    if is_traced(volume):
+        raise ValueError("volume must not be traced: save it outside of jit and grad.")
+    if volume.field is not None:
+        raise ValueError(
+            "volume must have voxels; got one with a field. Save an array of the field's values."
+        )
+    path = Path(path)
+    ending = max((e for e in WRITERS if path.name.lower().endswith(e)), key=len, default=None)
+    if ending is None:
+        raise ValueError(f"path must end in {', '.join(sorted(WRITERS))}; got {path}.")
+    write = WRITERS[ending]
+    output_file("path", path)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        write(volume, Path(folder) / path.name)
+        # the header last: it names the other file of two
+        for file in sorted(Path(folder).iterdir(), key=lambda file: file.name == path.name):
+            os.replace(file, path.parent / file.name)
+    return path
+
+
+def _write_npz(volume: Volume, path: Path) -> None:
+    arrays = {"data": volume.data, "spacing": volume.spacing, "origin": volume.origin}
+    if volume.direction is not None:
+        arrays["direction"] = volume.direction
+    if volume.labels is not None:
+        arrays["labels"] = volume.labels
+    if volume.data.dtype == "bfloat16":
+        raise ValueError("volume has voxels of bfloat16, which .npz cannot hold; convert them to float32.")
+    with path.open("wb") as stream:
+        np.savez_compressed(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
+
+
+def _write_medical(volume: Volume, path: Path) -> None:
+    try:
+        import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
+    except ImportError as fault:
+        raise ImportError(f"writing {path.name} needs SimpleITK: pip install jaxvol[io]") from fault
+    if volume.labels is not None:
+        raise ValueError(
+            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
+            "and voxels as two volumes, and read them by load(path, labels=...)."
+        )
+    data = np.asarray(volume.data)
+    if data.dtype.name in ("float16", "bfloat16"):
+        raise ValueError(
+            f"volume has voxels of {data.dtype}, which {path.name} cannot hold. Convert them to float32."
+        )
+    image = sitk.GetImageFromArray(np.ascontiguousarray(data.T))
+    image.SetSpacing(np.asarray(volume.spacing, float).tolist())
+    image.SetOrigin(np.asarray(volume.origin, float).tolist())
+    if volume.direction is not None:
+        image.SetDirection(np.asarray(volume.direction, float).ravel().tolist())
+    compress = not path.name.lower().endswith((".nii", ".mhd"))
+    try:
+        sitk.WriteImage(image, str(path), compress)
+    except RuntimeError as fault:
+        raise ValueError(f"path: {path.name} cannot be written ({fault}).") from fault
+
+
+WRITERS: dict[str, Callable[[Volume, Path], None]] = {
+    ".npz": _write_npz,
+    **dict.fromkeys((".nrrd", ".mha", ".mhd", ".nii", ".nii.gz"), _write_medical),
+}
