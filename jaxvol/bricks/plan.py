@@ -150,7 +150,7 @@ def plan(
     if isinstance(volume, Volume) and memory is None:
         return plan_in_memory(volume, transfer, camera, tolerance, **how)
     if isinstance(volume, Volume) and volume.direction is not None:
-        raise ValueError("volume must lie along the axes of the world to be planned with memory; leave it out.")
+        raise ValueError("volume must lie along the axes of the world to be planned with memory.")
     begun, room = time.perf_counter(), budget(memory)
     place = {name: value for name, value in (("spacing", spacing), ("origin", origin)) if value is not None}
     opened, *_ = levels_of(volume, **place, **(source or {}))
