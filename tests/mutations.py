@@ -154,7 +154,7 @@ MUTATIONS = [
         "bricks/files.py",
         "(rows, row), self._type, run, 0, (row_stride, size)",
         "(rows, row), self._type, run, 0, (row * size, size)",
-        ("bricks/test_sources.py::test_raw_files_are_read_in_rows_and_in_planes[uint8-16384-4194304]",),
+        ("bricks/test_sources.py::test_raw_files_are_read_in_rows_and_in_planes[uint8-16384-8388608]",),
     ),
     Mutation(
         "files: a change after opening is not noticed",
