@@ -1,7 +1,8 @@
 """Draws charts again from their records; nothing is measured.
 
-`python -m experiments.redraw` draws all, `--only speed kisti` some. `path_traced.png`, `tomography.png`,
-`elevation_angle.png`, `lit.png` and `stability.html` show images that no record holds: their experiments alone draw them.
+`python -m experiments.redraw` draws all, `--only speed kisti` some. `elevation_angle.png`, `path_traced.png`,
+`tomography.png`, `lit.png` and `stability.html` show images that no record holds: their experiments alone
+draw them.
 """
 
 from argparse import Namespace

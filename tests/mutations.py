@@ -1449,8 +1449,8 @@ MUTATIONS = [
     Mutation(
         "scan conversion: one node too few",
         "scan_conversion.py",
-        "int(min(n, MOST_NODES)) + 1 for n",
-        "int(min(n, MOST_NODES)) for n",
+        "int(min(n, MOST_VOXELS)) + 1 for n",
+        "int(min(n, MOST_VOXELS)) for n",
         ("test_scan_conversion.py::test_the_grid_encloses_the_sector_and_is_centred_on_it",),
     ),
     Mutation(
