@@ -1,7 +1,8 @@
 """Draws charts again from their records; nothing is measured.
 
-`python -m experiments.redraw` draws all, `--only speed kisti` some. `path_traced.png`, `tomography.png`,
-`lit.png` and `stability.html` show images that no record holds: their experiments alone draw them.
+`python -m experiments.redraw` draws all, `--only speed kisti` some. `elevation_angle.png`, `path_traced.png`,
+`tomography.png`, `lit.png` and `stability.html` show images that no record holds: their experiments alone
+draw them.
 """
 
 from argparse import Namespace
@@ -12,6 +13,7 @@ from typing import Any
 from . import (
     accuracy,
     adaptive_error,
+    bricks,
     common,
     fit_pose,
     fit_transfer,
@@ -24,10 +26,12 @@ from . import (
     mean_free_path,
     minimum_distance,
     model_choice,
+    out_of_core,
     overhead,
     pareto_chart,
     planning,
     record,
+    scaling,
     scan_conversion,
     shading,
     speed,
@@ -39,6 +43,7 @@ from .command import command
 DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "accuracy": accuracy.draw,
     "adaptive_error": adaptive_error.draw,
+    "bricks": bricks.draw,
     "fit_pose": lambda result, path: fit_pose.draw(result["starts"], path),
     "fit_transfer": lambda result, path: fit_transfer.draw(result["scenes"], path),
     "gradient_agreement": lambda result, path: gradient_agreement.draw(result["scenes"], path),
@@ -54,10 +59,12 @@ DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "mean_free_path": mean_free_path.draw,
     "minimum_distance": minimum_distance.draw,
     "model_choice": model_choice.draw,
+    "out_of_core": out_of_core.draw,
     "overhead": lambda result, path: overhead.draw(result["conditions"], result["sizes"], path),
     "pareto": pareto_chart.draw,
     "planning": planning.draw,
     "planning_seed_1": planning.draw,
+    "scaling": scaling.draw,
     "scan_conversion": scan_conversion.draw,
     "shading": lambda result, path: shading.draw(result["scenes"], path),
     "speed": speed.draw,

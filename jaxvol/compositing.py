@@ -90,7 +90,9 @@ class Compositing(eqx.Module, Generic[State]):
 
     def joined(self, front: State, back: State) -> State:
         """The state after the fragments of `front` and then those of `back`, where both were begun anew. By
-        default states do not tell, and `render_bricks` refuses to join them."""
+        default states do not tell, and `render_bricks` refuses to join them.
+
+        **Raises:** `NotImplementedError` by default."""
         raise NotImplementedError(f"{type(self).__name__} does not join the states of two parts of a ray.")
 
     @property

@@ -154,7 +154,7 @@ MUTATIONS = [
         "bricks/files.py",
         "(rows, row), self._type, run, 0, (row_stride, size)",
         "(rows, row), self._type, run, 0, (row * size, size)",
-        ("bricks/test_sources.py::test_raw_files_are_read_in_rows_and_in_planes[uint8-16384-4194304]",),
+        ("bricks/test_sources.py::test_raw_files_are_read_in_rows_and_in_planes[uint8-16384-8388608]",),
     ),
     Mutation(
         "files: a change after opening is not noticed",
@@ -755,8 +755,8 @@ MUTATIONS = [
     Mutation(
         "empty space: blocks without the nodes of their upper faces",
         "occupancy.py",
-        "for i in range(BLOCK + 1 + 2 * margin)",
-        "for i in range(BLOCK + 2 * margin)",
+        "parts = range(BLOCK + 1 + 2 * margin)",
+        "parts = range(BLOCK + 2 * margin)",
         ("test_occupancy.py::test_blocks_hold_every_value_between_their_nodes",),
     ),
     Mutation(
@@ -1492,8 +1492,8 @@ MUTATIONS = [
     Mutation(
         "scan conversion: one node too few",
         "scan_conversion.py",
-        "int(min(n, MOST_NODES)) + 1 for n",
-        "int(min(n, MOST_NODES)) for n",
+        "int(min(n, MOST_VOXELS)) + 1 for n",
+        "int(min(n, MOST_VOXELS)) for n",
         ("test_scan_conversion.py::test_the_grid_encloses_the_sector_and_is_centred_on_it",),
     ),
     Mutation(

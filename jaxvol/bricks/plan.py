@@ -123,26 +123,27 @@ def plan(
 ) -> Plan | BudgetPlan:
     """Finds the cheapest way to render a scene within a tolerance, and within a budget of memory.
 
-    Of a `Volume`, without `memory`: the `Plan` of `planning.plan`, which has the other arguments, and says
-    how it is found. Otherwise a `BudgetPlan`:
+    Of a `Volume`, without `memory`: as `planning.plan`, which says how it is found. Otherwise:
 
     - where the volume and what `render` makes of it fit into `memory` (IN_MEMORY bytes for each byte of
       voxels), it is read, and planned as a `Volume`;
     - otherwise it is rendered by `render_bricks`. The march is planned on a copy of every n-th voxel along
       each axis that fits, read slab by slab, and its step divided by n: as many steps a voxel as the copy
-      needs.
-      That is cautious where the volume is smooth, but the error is that of the copy: detail finer than n
-      voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
+      needs. That is cautious where the volume is smooth, but the error is that of the copy: detail finer than
+      n voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
       that `AlphaCorrection` and `SpaceLeaping` are kept.
 
     **Arguments:**
 
     - `volume`: a `Volume`, or what `bricks.levels_of` opens: an array, a memory map, a path. Of several
       levels of detail, the finest.
+    - `transfer`, `camera`, `tolerance`, `compositing`: as for `planning.plan`.
     - `memory`: bytes, as for `render_bricks`; by default a quarter of the device's memory.
-    - `spacing`, `origin`, `cache`: as for `render_bricks`. `source`: other options of `bricks.levels_of`,
-      such as {"shape": (nx, ny, nz), "dtype": "uint8"}.
+    - `spacing`, `origin`, `cache`: as for `render_bricks`.
+    - `source`: other options of `bricks.levels_of`, such as {"shape": (nx, ny, nz), "dtype": "uint8"}.
     - `options`: of `planning.plan`: `transforms`, `lighting`, `gradients`, `seed`.
+
+    **Returns:** a `Plan` of a `Volume` without `memory`, otherwise a `BudgetPlan`.
 
     **Raises:** `ValueError` as `planning.plan` and `render_bricks` do.
     """

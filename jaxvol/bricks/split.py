@@ -124,19 +124,22 @@ def split(
     shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None, least: int = 1
 ) -> BrickGrid:
     """Few bricks that fit into so many bytes, and have fewer than 2**31 voxels: there is one more along the
-    axis where they are longest, until they do. There are at least `least`, unless they would be smaller than
-    bricks are.
+    axis where they are longest, until they do; first among the axes along which the smallest bricks, with
+    what is read around them, are shorter than the volume. There are at least `least`, unless they would be
+    smaller than bricks are.
 
     **Raises:** `ValueError` if the smallest ones do not fit."""
     memory = integer("memory", memory, 1)
     cells = [n - 1 for n in shape]
+    x, y, z = (min(EDGE, c) for c in cells)
+    short = np.less(stored_of(BrickGrid(shape, (x, y, z)), margin, probe), shape).tolist()
     parts = [1, 1, 1]
     while True:
         size = [_rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
         grid = BrickGrid(shape, (size[0], size[1], size[2]))
         stored = stored_of(grid, margin, probe)
-        longest = max(range(3), key=lambda axis: (size[axis] > min(EDGE, cells[axis])) * size[axis])
-        smallest = size[longest] <= min(EDGE, cells[longest])
+        left = [axis for axis in range(3) if size[axis] > min(EDGE, cells[axis])]
+        smallest = not left
         if fits(stored, dtype, margin, memory) and (grid.number >= least or smallest):
             return grid
         if smallest:
@@ -145,7 +148,7 @@ def split(
                 f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
                 f"{' x '.join(map(str, size))} cells and what is read around them; got {memory}."
             )
-        parts[longest] += 1
+        parts[max(left, key=lambda axis: (short[axis], size[axis]))] += 1
 
 
 def check_part(stored: Node) -> None:

@@ -486,7 +486,7 @@ def test_no_ray_meets_a_brick_after_one_that_is_behind_it(spacing, distance, par
         points = nodes + along
         ahead = np.sum((points - eye / (spacing, spacing, 2 * spacing)) * toward, -1) > 0
         inside = np.all((points > 0) & (points < 32), -1) & (ahead | parallel)
-        x, y, z = map(jnp.asarray, np.moveaxis(points, -1, 0))
+        x, y, z = jnp.moveaxis(jnp.asarray(points), -1, 0)
         bricks = np.asarray(grid.brick_of((x, y, z)))
         for ray in range(len(nodes)):
             met = place[bricks[inside[:, ray], ray]]
