@@ -141,12 +141,12 @@ def test_the_reference_in_float64_and_the_derivative_along_a_turn():
     toward = np.array([[1.0, 1.4, -1.9]]) / np.linalg.norm((1.0, 1.4, -1.9))
     rays = target[None] - 3 * toward, toward
     with in_float64():
-        volume, transfer = to_float64((straight, soft_transfer(0.5)))
+        volume, transfer, marched = to_float64((straight, soft_transfer(0.5), march))
 
         @jax.jit
         def color(angles):
             turned = jv.Volume(volume.data, volume.spacing, volume.origin, direction=turn(angles))
-            return jv.render_rays(turned, transfer, rays[0], rays[1], march, adjoint="direct").rgba[0]
+            return jv.render_rays(turned, transfer, rays[0], rays[1], marched, adjoint="direct").rgba[0]
 
         angles = np.array(ANGLES)
         derivative = np.asarray(jax.jacrev(color)(angles))

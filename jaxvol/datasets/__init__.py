@@ -88,9 +88,13 @@ def load(
     mirror: str | None = None,
     progress: bool = True,
 ) -> Volume:
-    """A dataset as a `Volume`; it is fetched as by `fetch`, which has the arguments and errors, first.
+    """A dataset as a `Volume`; it is fetched first, if it is not on this machine yet.
 
-    **Raises:** also `ValueError` for one of 2³¹ voxels or more: it is to be fetched, and its path given to
+    **Arguments:** `name`, `folder`, `mirror`, `progress`: as for `fetch`.
+
+    **Returns:** the volume, with the published spacing.
+
+    **Raises:** as `fetch`, and `ValueError` for one of 2³¹ voxels or more: it is to be fetched, and its path given to
     `render_bricks`.
     """
     dataset = info(name)

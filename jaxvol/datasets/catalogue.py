@@ -77,14 +77,18 @@ def catalogue() -> dict[str, Dataset]:
 
 
 def names() -> list[str]:
-    """Names of all datasets."""
+    """Names of all datasets.
+
+    **Returns:** the names, sorted."""
     return sorted(catalogue())
 
 
 def info(name: str | Any) -> Dataset:
     """What is known of a dataset; nothing is fetched.
 
-    - `name`: one of `names()`, or the title that it was published under; case is ignored.
+    **Arguments:** `name`: one of `names()`, or the title that it was published under; case is ignored.
+
+    **Returns:** its entry in the published list.
 
     **Raises:** `ValueError` for a name that is not in the list.
     """

@@ -5,6 +5,7 @@ repeated or put in. They are read in another process, which has little memory.
 """
 
 import gzip
+import io
 import json
 import select
 import subprocess
@@ -304,6 +305,8 @@ def test_a_header_alone_takes_no_memory(worker, tmp_path, kind):
 
 
 def _lengthened(content):
-    """A TIFF file whose first image has 4000 times as many rows (tag 257, a short)."""
-    at = content.index(b"\x01\x01\x03\x00\x01\x00\x00\x00") + 8
-    return content[:at] + (16000).to_bytes(2, "little") + content[at + 2 :]
+    """A TIFF file whose first image has 4000 times as many rows (tag 257)."""
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        rows = file.pages.first.tags[257]
+        at, size = rows.valueoffset, rows.valuebytecount
+    return content[:at] + (16000).to_bytes(size, "little") + content[at + size :]
