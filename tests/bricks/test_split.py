@@ -81,6 +81,18 @@ def test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes(kind, length
     assert limited == 20 or kind == "behind the axis"
 
 
+def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other():
+    """From a node 13.4 mm from the apex, in random directions: 12 mm are an angle of asin(12 / 13.4), and not
+    12 / 13.4."""
+    space, length, at = space_of(near_apex()), 12.0, (20.0, 2.0, 12.0)
+    node = np.asarray(space.point(tuple(map(jnp.asarray, at))))
+    toward = np.random.default_rng(0).normal(size=(20_000, 3))
+    toward *= length / np.linalg.norm(toward, axis=-1)[:, None]
+    x, y, z = jnp.asarray(node + toward).T
+    reached = np.asarray(space.coordinate((x, y, z))[1])
+    assert 28 < np.max(reached) - at[1] <= nodes_within(space, SHAPE, np.array(at), np.array(at), length)[1]
+
+
 def test_light_is_looked_for_among_more_nodes_near_the_apex():
     """Across beams they are the whole scan there, and few far from it."""
     probe = near_apex()
