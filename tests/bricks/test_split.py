@@ -85,7 +85,8 @@ def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other()
     """From a node 13.4 mm from the apex, in random directions: 12 mm are an angle of asin(12 / 13.4), and not
     12 / 13.4."""
     space, length, at = space_of(near_apex()), 12.0, (20.0, 2.0, 12.0)
-    node = np.asarray(space.point(tuple(map(jnp.asarray, at))))
+    i, j, k = map(jnp.asarray, at)
+    node = np.asarray(space.point((i, j, k)))
     toward = np.random.default_rng(0).normal(size=(20_000, 3))
     toward *= length / np.linalg.norm(toward, axis=-1)[:, None]
     x, y, z = jnp.asarray(node + toward).T
