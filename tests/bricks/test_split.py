@@ -81,6 +81,19 @@ def test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes(kind, length
     assert limited == 20 or kind == "behind the axis"
 
 
+def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other():
+    """From a node 13.4 mm from the apex, in random directions: 12 mm are an angle of asin(12 / 13.4), and not
+    12 / 13.4."""
+    space, length, at = space_of(near_apex()), 12.0, (20.0, 2.0, 12.0)
+    i, j, k = map(jnp.asarray, at)
+    node = np.asarray(space.point((i, j, k)))
+    toward = np.random.default_rng(0).normal(size=(20_000, 3))
+    toward *= length / np.linalg.norm(toward, axis=-1)[:, None]
+    x, y, z = jnp.asarray(node + toward).T
+    reached = np.asarray(space.coordinate((x, y, z))[1])
+    assert 28 < np.max(reached) - at[1] <= nodes_within(space, SHAPE, np.array(at), np.array(at), length)[1]
+
+
 def test_light_is_looked_for_among_more_nodes_near_the_apex():
     """Across beams they are the whole scan there, and few far from it."""
     probe = near_apex()
@@ -210,7 +223,7 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
 
 
 def test_no_cells_are_looked_for_behind_the_last_sample_of_a_ray():
-    """A ray of 10**6 steps has 16 samples at the most, which end in the first few bricks."""
-    found = cells_of(scene_of_fog(jv.March(1e-4, (fog()[1],), max_samples=16)), brick=3)
+    """A ray of some 10**5 steps has 16 samples at the most, which end in the first few bricks."""
+    found = cells_of(scene_of_fog(jv.March(1e-3, (fog()[1],), max_samples=16)), brick=3)
     assert bool(found.any)
     assert 1 <= int(jnp.max(found.cells.until)) <= 16
