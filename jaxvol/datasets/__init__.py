@@ -94,8 +94,8 @@ def load(
 
     **Returns:** the volume, with the published spacing.
 
-    **Raises:** as `fetch`, and `ValueError` for one of 2³¹ voxels or more: it is to be fetched, and its path given to
-    `render_bricks`.
+    **Raises:** as `fetch`, and `ValueError` for one of 2³¹ voxels or more: it is to be fetched, and its path
+    given to `render_bricks`.
     """
     dataset = info(name)
     voxels = dataset.shape[0] * dataset.shape[1] * dataset.shape[2]
