@@ -1,13 +1,15 @@
 """How is linear colour saved as an image file? The sRGB curve, and the file formats."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from ._util.checks import Arrayable, described, output_file
+from ._util.whole_files import whole_file
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
@@ -37,7 +39,9 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 
-def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
+def save_image(
+    path: str | os.PathLike[str], linear: Arrayable, *, text: Mapping[str, str] | None = None
+) -> Path:
     """Write an image, in the format given by the file extension:
 
     | extension | contents |
@@ -53,8 +57,10 @@ def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
       (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
       may be infinite. 8-bit formats clip to [0, 1].
+    - `text`: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries beside the image, as `Image.info`
+      of Pillow has them; other formats carry none.
 
-    **Returns:** the path. Its folder is created if it does not exist.
+    **Returns:** the path. Its folder is created if it does not exist. The file appears whole or not at all.
 
     **Raises:** `ValueError` for input that is not an array, an unknown extension, a shape that the format
     does not hold, NaN, infinite colours, and a path that cannot be written.
@@ -80,12 +86,13 @@ def save_image(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     if bad.any():
         raise ValueError(f"image must not be NaN or infinite; {bad.sum()} of its {image.size} values are.")
     ending = path.suffix.lower()
-    if ending == ".npy":
-        np.save(path, image)
-    elif ending in (".tif", ".tiff"):
-        _save_tiff(path, image)
-    else:
-        _save_display(path, image)
+    with whole_file(path) as part:
+        if ending == ".npy":
+            np.save(part, image)
+        elif ending in (".tif", ".tiff"):
+            _save_tiff(part, image)
+        else:
+            _save_display(part, image, text or {})
     return path
 
 
@@ -131,11 +138,28 @@ def _save_tiff(path: Path, image: Float[np.ndarray, "..."]) -> None:
     imwrite(path, image, photometric="rgb" if image.ndim == 3 else "minisblack", extrasamples=extra)
 
 
-def _save_display(path: Path, image: Float[np.ndarray, "height width channels"]) -> None:
-    from skimage.io import imsave
-
+def displayed(
+    image: Float[np.ndarray, "height width channels"],
+) -> UInt8[np.ndarray, "height width channels"]:
+    """Linear RGB, or premultiplied RGBA, as 8-bit sRGB with straight alpha."""
     color, opacity = image[..., :3], image[..., 3:]
     # straight alpha: viewers multiply by the opacity
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
     display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
-    imsave(path, np.asarray(jnp.round(display * 255)).astype(np.uint8), check_contrast=False)
+    return np.asarray(jnp.round(display * 255)).astype(np.uint8)
+
+
+def _save_display(
+    path: Path, image: Float[np.ndarray, "height width channels"], text: Mapping[str, str]
+) -> None:
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    picture = Image.fromarray(displayed(image))
+    if path.suffix.lower() != ".png":
+        picture.save(path)
+        return
+    chunks = PngInfo()
+    for keyword, content in text.items():
+        chunks.add_itxt(keyword, content, zip=True)
+    picture.save(path, pnginfo=chunks)

@@ -162,7 +162,7 @@ def plan(
             raise ValueError(
                 f"memory must hold a copy of 2 voxels along each axis to plan with; got {memory}."
             )
-    copy = _copy(opened, stride)
+    copy = copied(opened, stride)
     found = plan_in_memory(copy, transfer, camera, tolerance, **how)
     if stride == 1:
         return BudgetPlan(found, opened, room, 1, None, 0, opened.nbytes, compositing, cache)
@@ -180,7 +180,7 @@ def plan(
     return BudgetPlan(found, opened, room, stride, stream.grid.counts, loads, nbytes, compositing, cache)
 
 
-def _copy(source: VoxelSource, stride: int) -> Volume:
+def copied(source: VoxelSource, stride: int) -> Volume:
     """Every `stride`-th voxel, read in slabs across the axis where these are thinnest."""
     spacing, origin = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
     axis = int(np.argmax([n / c for n, c in zip(source.shape, source.chunks, strict=True)]))

@@ -1,8 +1,11 @@
 """Which options say what a volume file holds, where the file and its name do not?"""
 
 import argparse
+import math
 from pathlib import Path
 
+from ..bricks import VoxelSource, levels_of
+from ..bricks.plan import IN_MEMORY, copied
 from ..formats import load
 from ..volume import Volume
 
@@ -25,3 +28,25 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
 def volume_of(options: argparse.Namespace) -> Volume:
     """The volume in the file."""
     return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
+
+
+def source_of(options: argparse.Namespace) -> VoxelSource:
+    """The volume in the file, of which parts are read."""
+    given = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
+    return levels_of(options.file, **{name: value for name, value in given.items() if value is not None})[0]
+
+
+COPIED = 2**22
+"""Voxels, at most, of a copy from which a histogram and a place are taken."""
+
+
+def copy_of(source: VoxelSource, memory: int) -> Volume:
+    """A copy of every n-th voxel, which fits into so many bytes, stretched to the bounds of the whole."""
+    most = min(COPIED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
+    stride = 1
+    while math.prod(-(-n // stride) for n in source.shape) > most and min(source.shape) // (stride + 1) >= 2:
+        stride += 1
+    copy = copied(source, stride)
+    spacing = source.spacing or (1.0, 1.0, 1.0)
+    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, spacing, copy.shape, strict=True)]
+    return Volume(copy.data, whole, copy.origin)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._util.checks import described
+from .._util.whole_files import whole_file
 from ..camera import Camera
 from ..display import from_srgb
 from ..transfer import TransferFunction
@@ -60,11 +61,21 @@ def read_transfer(path: File) -> TransferFunction:
     **Returns:** the `TransferFunction`.
 
     **Raises:** `ValueError`, naming the file, if it is missing or holds anything else."""
-    fields = _fields(str(path), _json(path), TRANSFER, TRANSFER)
+    return transfer_of_fields(str(path), _json(path))
+
+
+def transfer_of_fields(what: str, content: Any) -> TransferFunction:
+    """The transfer function that `transfer_fields` wrote; `what` names its place in errors."""
+    fields = _fields(what, content, TRANSFER, TRANSFER)
     try:
         return TransferFunction(**fields)
     except ValueError as fault:
-        raise ValueError(f"{path}: {fault}") from fault
+        raise ValueError(f"{what}: {fault}") from fault
+
+
+def transfer_fields(transfer: TransferFunction) -> dict[str, Any]:
+    """Its values, colours and extinctions, as JSON holds them."""
+    return {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}
 
 
 def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
@@ -79,8 +90,8 @@ def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
         raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    fields = {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}
-    path.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
+    with whole_file(path) as part:
+        part.write_text(json.dumps(transfer_fields(transfer), indent=1) + "\n", encoding="utf-8")
     return path
 
 

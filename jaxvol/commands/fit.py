@@ -1,0 +1,86 @@
+"""`jaxvol fit`: a transfer function that makes given images of a volume."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from .._util.checks import output_file
+from ..fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
+from ..march import March
+from .data import volume_of
+from .frames import FAST
+from .options import scene_options
+from .progress import working
+
+
+def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
+    """Add the subcommand. `commands`: what `add_subparsers` returned."""
+    parser = commands.add_parser(
+        "fit",
+        parents=[shared, scene_options()],
+        help="fit a transfer function to images of a volume",
+        description="Fit a transfer function to images of a volume.",
+    )
+    parser.add_argument("--images", type=Path, nargs="+", required=True, metavar="IMAGE", help="sRGB, as PNG")
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        required=True,
+        metavar="JSON",
+        help="a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
+        "parallel_scale, window",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("transfer.json"),
+        help="JSON to write (default: %(default)s)",
+    )
+    start = parser.add_argument_group("start")
+    start.add_argument(
+        "--start", type=Path, metavar="JSON", help="a transfer function written by this command"
+    )
+    start.add_argument(
+        "--points", type=int, default=8, help="else, flat grey with this many points (default: 8)"
+    )
+    start.add_argument(
+        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of their values (default: all)"
+    )
+    solver = parser.add_argument_group("solver")
+    solver.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
+    solver.add_argument("--max-steps", type=int, default=100)
+    solver.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="save every step here; resume from here after an interruption",
+    )
+    parser.set_defaults(run=_fit)
+
+
+def _fit(options: argparse.Namespace) -> None:
+    output_file("--output", options.output)
+    with working(f"reading {options.file}"):
+        volume = volume_of(options)
+    # half a voxel
+    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
+    march = March(step, FAST, "midpoint")
+    views = read_views(options.images, options.cameras)
+    file = options.start
+    start = read_transfer(file) if file else flat_grey(volume, options.points, options.clim)
+    with working("fitting, steps") as told:
+        result = fit(
+            ImageResidual(
+                lambda transfer, camera: (volume, transfer, camera, march), views, options.background
+            ),
+            start,
+            solver=options.solver,
+            max_steps=options.max_steps,
+            checkpoint=options.checkpoint,
+            checkpoint_seconds=0,  # Ctrl-C may come at any time, and a checkpoint is small
+            callback=lambda step, parameters, loss: told(step, options.max_steps),
+        )
+    path = write_transfer(options.output, result.parameters)
+    error = (2 * result.loss) ** 0.5
+    print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")

@@ -1,0 +1,111 @@
+"""`jaxvol render`: an image of a volume file."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..camera import Camera
+from ..display import image_file, save_image
+from ..rendering import Rendering
+from ..unseen import why_unseen
+from .frames import Frames, frames_of
+from .options import scene_options, view_options
+from .orbit import views_of
+from .progress import working
+from .recorded import settings_of, text_of, transfer_from_file
+from .scene import axis_of, scene_of, turned
+
+
+def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "") -> None:
+    """Add the subcommand. `commands`: what `add_subparsers` returned."""
+    parser = commands.add_parser(
+        "render",
+        parents=[shared, scene_options(), view_options()],
+        help="render a volume file to an image",
+        description="Render a volume file to an image.",
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("out.png"),
+        metavar="FILE",
+        help="image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); default: %(default)s. "
+        "A .png holds the options that made it: see --like",
+    )
+    parser.add_argument(
+        "--transparent",
+        action="store_true",
+        help="write opacity instead of a background: .png (straight alpha), .tif or .npy (premultiplied)",
+    )
+    parser.add_argument(
+        "--depth",
+        type=Path,
+        metavar="FILE",
+        help="also write depth, the (mean) distance to what is visible, else infinite: .npy or .tif, float32",
+    )
+    parser.add_argument(
+        "--turn", type=float, default=0, metavar="DEGREES", help="turn the camera about --axis (default: 0)"
+    )
+    parser.add_argument(
+        "--orbit",
+        type=float,
+        metavar="DEGREES",
+        help="plan for all of an orbit of so many degrees, as jaxvol animate does",
+    )
+    parser.set_defaults(run=_render)
+
+
+def _render(options: argparse.Namespace) -> None:
+    image_file("--output", options.output, 4 if options.transparent else 3)
+    if options.depth:
+        image_file("--depth", options.depth, 0)
+    scene = scene_of(options)
+    camera = turned(scene.camera, options.turn, axis_of(options))
+    views = (camera,) if options.orbit is None else views_of(options, scene, options.orbit)
+    frames = frames_of(options, scene, views)
+    rendering = rendered(frames, camera, options.output)
+    told = {}
+    if options.output.suffix.lower() == ".png":
+        held = transfer_from_file(options, scene.transfer)
+        told = text_of("render", settings_of(options), options.file, transfer=held)
+    image = rendering.rgba if options.transparent else rendering.image(options.background)
+    save_image(options.output, image, text=told)
+    if options.depth:
+        print(f"{save_image(options.depth, rendering.depth)}: distances, world length")
+    if scene.source is None:
+        why = why_unseen(frames.volume, frames.transfer, camera, frames.march, rendering, scene.compositing)
+        if why is not None:
+            print(f"{options.output}: nothing is seen: {why}")
+
+
+def rendered(frames: Frames, camera: Camera, path: Path) -> Rendering:
+    """One image; prints what it took, under the name of the file that it is for."""
+    begun = time.perf_counter()
+    with working(f"rendering {path}") as told:
+        rendering = frames.render(camera, told)
+    took = time.perf_counter() - begun
+    device = jax.devices()[0]
+    millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
+    shape = frames.volume.shape if frames.source is None else frames.source.shape
+    print(
+        f"{path}: {' x '.join(map(str, camera.size))} pixels of {' x '.join(map(str, shape))} voxels, "
+        f"{millions:.1f} million samples in {took:.2f} s including compilation, "
+        f"on {device.device_kind} ({device.platform})"
+    )
+    if frames.source is not None:
+        bricks = rendering.bricks
+        print(
+            f"{path}: {bricks.loads} bricks of {' x '.join(map(str, bricks.counts))} read, {bricks.bytes_read} bytes"
+        )
+    if np.any(rendering.exhausted):
+        print(
+            f"{path}: incomplete: rays used up their {frames.march.most_samples} samples; use a longer step"
+        )
+    return rendering

@@ -1,0 +1,161 @@
+"""What do the options of a scene mean? What is looked at, how it looks, from where, and what is cut away."""
+
+import argparse
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..automatic import automatic_transfer, labels_shown
+from ..bricks import VoxelSource
+from ..camera import Camera
+from ..compositing import Compositing, Over
+from ..fitting import read_transfer
+from ..isosurface import Isosurface
+from ..lighting import Lighting, Phong
+from ..march import Transform
+from ..modes import compositing_of
+from ..presets import SHADED, colormap, preset
+from ..projections import Average
+from ..transfer import Transfer
+from ..transforms.clip import Clip
+from ..volume import Volume
+from .data import copy_of, source_of, volume_of
+from .progress import working
+
+
+class Scene(NamedTuple):
+    """What is looked at, and how. Of a volume that is read in bricks from `source`, `volume` is a copy of every
+    n-th voxel in the same place."""
+
+    volume: Volume
+    transfer: Transfer
+    camera: Camera
+    compositing: Compositing[Any]
+    lighting: Lighting | None
+    clip: tuple[Transform, ...]
+    source: VoxelSource | None
+
+
+def scene_of(options: argparse.Namespace) -> Scene:
+    """The scene that the options describe."""
+    mode = _mode(options)
+    clip = _clip(options)
+    source = None
+    with working(f"reading {options.file}"):
+        if options.memory is None:
+            volume = volume_of(options)
+        else:
+            source = source_of(options)
+            volume = copy_of(source, options.memory)
+        if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
+            volume, transfer = shown
+        else:
+            transfer = _look(options, volume)
+    return Scene(volume, transfer, _view(options, volume), mode, _lighting(options, mode), clip, source)
+
+
+def is_automatic(options: argparse.Namespace) -> bool:
+    """Whether nothing is said of the transfer function."""
+    names = ("preset", "cmap", "transfer", "kept_transfer", "opacity", "clim", "unit_distance")
+    said = any(getattr(options, name, None) is not None for name in names)
+    return options.compositing == "over" and not said
+
+
+def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
+    """The camera, turned about an axis through its focal point."""
+    if not degrees:
+        return camera
+    axis = np.asarray(axis, float)
+    if not np.isfinite(axis).all() or not axis.any():
+        raise ValueError(f"--axis must not be 0; got {' '.join(map(str, axis))}.")
+    rotation = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
+    position, focal, up = (
+        np.asarray(v, float) for v in (camera.position, camera.focal_point, camera.view_up)
+    )
+    return Camera(
+        focal + rotation.apply(position - focal),
+        focal,
+        rotation.apply(up),
+        camera.view_angle,
+        size=camera.size,
+        parallel_scale=camera.parallel_scale,
+        window=camera.window,
+    )
+
+
+def _mode(options: argparse.Namespace) -> Compositing[Any]:
+    """The compositing mode that the options name."""
+    shows_surface, value = options.compositing == "isosurface", options.isovalue
+    if shows_surface and value is None:
+        raise ValueError("--compositing isosurface needs the value on the surface: --isovalue VALUE.")
+    if value is not None and not shows_surface:
+        raise ValueError(
+            f"--isovalue goes with --compositing isosurface; got --compositing {options.compositing}."
+        )
+    return Isosurface(value) if shows_surface else compositing_of(options.compositing)
+
+
+def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
+    """The light that the options ask for, or that is usual for what they show."""
+    shade = options.shade
+    if shade and isinstance(mode, Average):
+        raise ValueError("--shade needs a place that is shaded; leave it out with --compositing average.")
+    if shade is None:
+        surfaces = options.preset in SHADED or is_automatic(options)
+        shade = (surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
+    return Phong() if shade else None
+
+
+def _look(options: argparse.Namespace, volume: Volume) -> Transfer:
+    """The transfer function that the options specify."""
+    kept = getattr(options, "kept_transfer", None)
+    if options.transfer or kept is not None:
+        for name in ("clim", "opacity", "unit_distance"):
+            if getattr(options, name) is not None:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} is for presets and colormaps; --transfer needs none."
+                )
+        return read_transfer(options.transfer) if kept is None else kept
+    if is_automatic(options):
+        return automatic_transfer(volume)
+    unit_distance = 1.0 if options.unit_distance is None else options.unit_distance
+    if options.preset and options.opacity is not None:
+        raise ValueError("--opacity is for colormaps; a preset has its own.")
+    if options.preset:
+        return preset(options.preset, options.clim, unit_distance)
+    clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
+    cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    return colormap(cmap, clim, options.opacity or "linear", unit_distance)
+
+
+def _view(options: argparse.Namespace, volume: Volume) -> Camera:
+    """Where it is looked at from."""
+    view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
+    if options.camera and options.parallel:
+        raise ValueError(
+            "--parallel goes with --direction, which shows the whole volume; leave out --camera."
+        )
+    if options.camera and options.direction:
+        raise ValueError("--camera sets the position; leave out --direction.")
+    if options.camera:
+        camera = Camera(options.camera[:3], options.camera[3:], **view)
+    else:
+        side = options.direction or (0.5, -1, 0.4)
+        camera = Camera.looking_at(volume, side, parallel=options.parallel, **view)
+    return camera.zoom(options.zoom)
+
+
+def axis_of(options: argparse.Namespace) -> Any:
+    """The axis that the camera turns about."""
+    return options.view_up if options.axis is None else options.axis
+
+
+def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:
+    """What is cut away, if anything is."""
+    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    if options.clip_box is None and not planes:
+        if options.clip_inside_out:
+            raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
+        return ()
+    return (Clip(options.clip_box, planes, inside_out=options.clip_inside_out),)
