@@ -27,6 +27,7 @@ ORDER = [
     "transfer2d",
     "display",
     "presets",
+    "automatic",
     "camera",
     "beams",
     "march",

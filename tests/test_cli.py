@@ -97,7 +97,9 @@ def render_file(volume_file, *words, size=("16", "16")):
 
 def test_render_renders_once_and_writes_opacity_and_depth(volume_file, tmp_path, monkeypatch, capsys):
     calls = []
-    monkeypatch.setattr("jaxvol.cli.render", lambda *a, **how: calls.append(a) or jv.render(*a, **how))
+    monkeypatch.setattr(
+        "jaxvol.commands.frames.render", lambda *a, **how: calls.append(a) or jv.render(*a, **how)
+    )
     output, depth = tmp_path / "a" / "x.png", tmp_path / "b" / "depth.tif"
     assert (
         render_file(volume_file, "--preset", "engine", "--transparent", "-o", output, "--depth", depth) == 0
@@ -166,7 +168,9 @@ def test_render_takes_what_fit_writes_and_writes_linear_floats(volume_file, tmp_
 def test_parallel_rays_are_asked_for_by_an_option(volume_file, tmp_path, monkeypatch):
     rendering = jv.render(*scene_of(volume_file))
     cameras = []
-    monkeypatch.setattr("jaxvol.cli.render", lambda *scene, **how: cameras.append(scene[2]) or rendering)
+    monkeypatch.setattr(
+        "jaxvol.commands.frames.render", lambda *scene, **how: cameras.append(scene[2]) or rendering
+    )
     output = tmp_path / "x.png"
     assert render_file(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
     (camera,) = cameras
@@ -195,9 +199,11 @@ def test_clips_are_those_of_the_library(volume_file, tmp_path, monkeypatch):
     np.testing.assert_allclose(np.load(output), expected, atol=1e-5)
     assert rmse(expected, images["whole"].image((1, 1, 1))) > 0.05
     planned = []
-    monkeypatch.setattr("jaxvol.cli.plan", lambda *scene, transforms, **how: planned.append(transforms))
+    monkeypatch.setattr(
+        "jaxvol.commands.frames.plan", lambda *scene, transforms, **how: planned.append(transforms)
+    )
     for command in ("plan", "render"):
-        monkeypatch.setattr("jaxvol.cli._picture", None)  # not called
+        monkeypatch.setattr("jaxvol.commands.render.rendered", None)  # not called
         with contextlib.suppress(TypeError, AttributeError):  # there is no plan to print or render
             main([command, str(volume_file), *map(str, view), *map(str, words)])
     for (given,) in planned:
@@ -240,13 +246,14 @@ STARTED = """
 import signal
 import sys
 import jaxvol.cli
+from jaxvol.commands import frames
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
-render = jaxvol.cli.render
+render = frames.render
 def announced(*scene, **how):
     print("under way", flush=True)
     return render(*scene, **how)
-jaxvol.cli.render = announced
+frames.render = announced
 sys.exit(jaxvol.cli.main(sys.argv[1:]))
 """
 
@@ -348,7 +355,7 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys
     arguments, message = BAD[case]
     arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
     output = tmp_path / "x.png"
-    monkeypatch.setattr("jaxvol.cli.render", None)  # fails if it is called
+    monkeypatch.setattr("jaxvol.commands.frames.render", None)  # fails if it is called
     assert main(["render", "-o", str(output), *arguments]) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1

@@ -60,7 +60,7 @@ def text_of(
         content["file"] = {"name": str(file), "sha256": sha256 or checksum(file)}
     if isinstance(transfer, TransferFunction):
         content["transfer"] = transfer_fields(transfer)
-    return {KEYWORD: json.dumps(content)}
+    return {KEYWORD: json.dumps(content, sort_keys=True)}
 
 
 def settings_of(options: argparse.Namespace, without: frozenset[str] = frozenset()) -> dict[str, Any]:

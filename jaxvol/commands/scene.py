@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..automatic import automatic_transfer, labels_shown
+from ..automatic import automatic_transfer, labels_shown, visible_box
 from ..bricks import VoxelSource
 from ..camera import Camera
 from ..compositing import Compositing, Over
@@ -52,7 +52,8 @@ def scene_of(options: argparse.Namespace) -> Scene:
             volume, transfer = shown
         else:
             transfer = _look(options, volume)
-    return Scene(volume, transfer, _view(options, volume), mode, _lighting(options, mode), clip, source)
+        seen = visible_box(volume, transfer) if is_automatic(options) else volume
+    return Scene(volume, transfer, _view(options, seen), mode, _lighting(options, mode), clip, source)
 
 
 def is_automatic(options: argparse.Namespace) -> bool:
@@ -130,7 +131,7 @@ def _look(options: argparse.Namespace, volume: Volume) -> Transfer:
 
 
 def _view(options: argparse.Namespace, volume: Volume) -> Camera:
-    """Where it is looked at from."""
+    """Where it is looked at from. `volume`: what the camera is to show, unless its position is given."""
     view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
     if options.camera and options.parallel:
         raise ValueError(

@@ -35,8 +35,9 @@ def parsed(
     for command in _commands(loose):
         for action in command._actions:
             _relax(action)
-            action.default = argparse.SUPPRESS
-    given = vars(loose.parse_args(arguments))
+            # argparse would convert what says SUPPRESS for a positional argument
+            action.default = argparse.SUPPRESS if action.option_strings else None
+    given = {name: value for name, value in vars(loose.parse_args(arguments)).items() if value is not None}
     settings: dict[str, Any] = {}
     parser = make()
     command = _chosen(parser, given)

@@ -1,0 +1,106 @@
+"""How does the page of `jaxvol demo` look? Pictures, what they show, and the code that makes them; no network."""
+
+import html
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+
+class Section(NamedTuple):
+    """A part of the page: pictures in a row, each with a caption."""
+
+    title: str
+    text: str
+    pictures: Mapping[str, str]
+    code: str
+
+
+SECTIONS: Sequence[Section] = (
+    Section(
+        "A shaded volume",
+        "A phantom of a head: the skull under translucent skin and muscle, shaded by the gradient of the values.",
+        {"head": "Head, smoothed by one voxel, integrated over each cell"},
+        """\
+import numpy as np
+import jaxvol as jv
+from scipy.ndimage import gaussian_filter
+
+phantom = jv.phantom("head", 320)
+smooth = gaussian_filter(np.asarray(phantom.data, np.float32), 1.0)
+head = jv.Volume(smooth, phantom.spacing, phantom.origin)
+march = jv.March(
+    float(head.spacing[0]) / 2,
+    (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()),
+    "preintegrated",
+)
+rendering = jv.render(
+    head,
+    jv.preset("head", unit_distance=0.01),
+    jv.Camera.looking_at(head, (0.65, -1, 0.15)).zoom(1.45),
+    march,
+    lighting=jv.lighting.Phong(),
+)
+jv.save_png("head.png", rendering.image(background=(1, 1, 1)))""",
+    ),
+    Section(
+        "Wood grain, before and after",
+        "A translucent cube at far too long a step, 0.25 of its edge's unit. Each ray's last cell reaches past the "
+        "cube by another fraction of a step: terraces. Cutting the cell at the exit makes the same step exact "
+        "there. Nothing else was changed.",
+        {"before": "No transform", "after": "AlphaCorrection()"},
+        """\
+cube = jv.phantom("linear", 64)
+look = jv.TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
+camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0)).zoom(1.3)
+for transforms in ((), (jv.AlphaCorrection(),)):
+    rendering = jv.render(cube, look, camera, jv.March(0.25, transforms))""",
+    ),
+    Section(
+        "A fit by gradients, in seconds",
+        "Two images of 64 x 64 pixels of an engine were given, and not the transfer function that made them. From "
+        "flat grey, Levenberg\N{EN DASH}Marquardt finds one by differentiating the renderer. This view was in none "
+        "of the images.",
+        {"fit_start": "Where it began", "fit_found": "What it found", "fit_true": "The truth"},
+        """\
+march = jv.March(step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
+residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
+found = jv.fit(residual, jv.flat_grey(engine, points=12), max_steps=20)
+found.parameters  # a TransferFunction""",
+    ),
+)
+
+STYLE = """\
+body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; background: #fff }
+h1 { font-weight: 600 } h2 { margin-top: 3rem; border-top: 1px solid #ddd; padding-top: 1.5rem; font-weight: 600 }
+.row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; flex: 0 1 auto; max-width: 32rem }
+.three figure { flex: 1 1 18rem; max-width: 23rem } img { max-width: 100%; border: 1px solid #ddd; display: block }
+figcaption { font-size: 0.95rem } figcaption small { color: #666 }
+pre { background: #f5f5f5; padding: 0.8rem 1rem; overflow-x: auto; font-size: 0.85rem }
+"""
+
+
+def page(said: Mapping[str, str]) -> str:
+    """The page. `said`: the names of the pictures that there are, each with what it took."""
+    body = [
+        "<h1>What jaxvol does</h1>",
+        "<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render FILE</code>, and "
+        "<code>jaxvol animate FILE</code>.</p>",
+    ]
+    for section in SECTIONS:
+        there = {name: text for name, text in section.pictures.items() if name in said}
+        if there:
+            body.append(f"<h2>{section.title}</h2>\n<p>{html.escape(section.text)}</p>")
+            figures = "".join(_figure(name, text, said[name]) for name, text in there.items())
+            body.append(f'<div class="row{" three" if len(there) > 2 else ""}">{figures}</div>')
+            body.append(f"<pre>{html.escape(section.code)}</pre>")
+    head = f'<meta charset="utf-8"><title>jaxvol demo</title><style>{STYLE}</style>'
+    text = "\n".join(body)
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{text}\n</body></html>\n'
+
+
+def _figure(name: str, caption: str, took: str) -> str:
+    small = f"<br><small>{html.escape(took)}</small>" if took else ""
+    return (
+        f'<figure><img src="{name}.png" alt="{html.escape(caption)}">'
+        f"<figcaption>{html.escape(caption)}{small}</figcaption></figure>"
+    )
