@@ -29,12 +29,14 @@ CUT = 0.25
 def automatic_transfer(volume: Volume | Any) -> TransferFunction:
     """A transfer function that shows what a volume holds, from its histogram.
 
-    Two thresholds part the values into three classes so that the variance within each is least (Otsu): what is
-    around the object, the object, and what is dense in it. The border of the object is shown translucent, what
-    is dense in it nearly opaque. Where the volume's faces cut through the object, as through the body in most
-    CT scans, the object would be a block: only what is dense is shown then, and its surroundings are faint.
+    Two thresholds part the values into three classes so that the variance within each is least (Otsu): what
+    is around the object, the object, and what is dense in it. The border of the object is shown translucent,
+    what is dense in it nearly opaque. Where the volume's faces cut through the object, as through the body in
+    most CT scans, the object would be a block: only what is dense is shown then, and its surroundings are
+    faint.
 
-    It is a guess. Opacities refer to a part of the volume's diagonal, so that they do not depend on its units.
+    It is a guess. Opacities refer to a part of the volume's diagonal, so that they do not depend on its
+    units.
 
     **Arguments:** `volume`: the `Volume`. Of more than 2 million voxels, every n-th is looked at.
 
@@ -52,10 +54,7 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
         return TransferFunction([low], [_linear(TISSUE)], extinction_of([0.5], _unit(volume)))
     first, second = thresholds(values)
     faces = _faces(np.asarray(volume.data))
-    if np.mean(faces > first) < CUT:
-        points = _shell(low, first, second, high)
-    else:
-        points = _dense(first, second, high)
+    points = _shell(low, first, second, high) if np.mean(faces > first) < CUT else _dense(first, second, high)
     at, colors, opacities = zip(*points, strict=True)
     return TransferFunction(
         np.array(at), np.array([_linear(c) for c in colors]), extinction_of(opacities, _unit(volume))
@@ -111,8 +110,8 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 FEWEST_FLAT = 0.8
 """Part of the voxels, of those that are not the lowest, whose neighbour has the same value: above it, whole
-numbers are taken for labels. It was 0.92 in a segmented frog, 0.25 at most in twelve scans and simulations, and
-0.46 at most in phantoms."""
+numbers are taken for labels. It was 0.92 in a segmented frog, 0.25 at most in twelve scans and simulations,
+and 0.46 at most in phantoms."""
 
 MOST_LABELS = 64
 
@@ -126,9 +125,9 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     Voxels are taken for labels if they are whole numbers of few kinds, and nearly all of a kind lie beside
     others of it. The lowest is what is around.
 
-    **Returns:** a volume in the same place, whose values are smooth, 255 inside of all labels, and whose labels
-    reach one voxel beyond; and a transfer function that shows what is inside, each label in its own colour.
-    """
+    **Returns:** a volume in the same place, whose values are smooth, 255 inside of all labels, and whose
+    labels reach one voxel beyond; and a transfer function that shows what is inside, each label in its own
+    colour."""
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     data = np.asarray(volume.data)
@@ -181,8 +180,8 @@ STRAYS = 0.3
 
 
 def visible_box(volume: Volume, transfer: TransferFunction | LabelTransferFunction) -> Volume:
-    """The box in which nearly all lies that a transfer function shows, as a volume of 2³ voxels to look at: that
-    of the whole volume, where nothing is visible."""
+    """The box in which nearly all lies that a transfer function shows, as a volume of 2³ voxels to look at:
+    that of the whole volume, where nothing is visible."""
     stride = _stride(volume.shape)
     data = np.asarray(volume.data)[::stride, ::stride, ::stride]
     if isinstance(transfer, LabelTransferFunction):

@@ -1,5 +1,5 @@
-"""What does the command `jaxvol` do? It puts its subcommands together, reports faults in one line, and ends at
-once when it is interrupted."""
+"""What does the command `jaxvol` do? It puts its subcommands together, reports faults in one line, and ends
+at once when it is interrupted."""
 
 import argparse
 import os
@@ -54,9 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     **Returns:** the exit code: 0, or 2 for bad input, reported in one line; 1, with nothing said, where what
-    reads stdout has ended. Ctrl-C is reported in one line, too, and ends the process at once with code 130, by
-    `os._exit`: XLA does not stop compiling or computing for a signal. Files that are not whole are removed.
-    """
+    reads stdout has ended. Ctrl-C is reported in one line, too, and ends the process at once with code 130,
+    by `os._exit`: XLA does not stop compiling or computing for a signal. Files that are not whole are
+    removed."""
     command = next((word for word in (sys.argv[1:] if arguments is None else arguments)), "")
     options = argparse.Namespace()
     try:

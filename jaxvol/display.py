@@ -57,8 +57,8 @@ def save_image(
     - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
       (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
       may be infinite. 8-bit formats clip to [0, 1].
-    - `text`: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries beside the image, as `Image.info`
-      of Pillow has them; other formats carry none.
+    - `text`: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries beside the image, as
+      `Image.info` of Pillow has them; other formats carry none.
 
     **Returns:** the path. Its folder is created if it does not exist. The file appears whole or not at all.
 

@@ -1,4 +1,5 @@
-"""How does a file appear whole or not at all? It is written beside its place, and moved there in one operation."""
+"""How does a file appear whole or not at all? It is written beside its place, and moved there in one
+operation."""
 
 import itertools
 import os
@@ -53,7 +54,8 @@ def _beside(path: Path) -> Iterator[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove all that is not whole yet. For a process that ends at once: nothing takes its place afterwards."""
+    """Remove all that is not whole yet. For a process that ends at once: nothing takes its place
+    afterwards."""
     _MOVING.acquire()  # and never released
     for part in list(_UNDERWAY):
         _remove(part)

@@ -108,8 +108,8 @@ def _check_mp4(size: Any) -> None:
         import imageio_ffmpeg  # noqa: F401  (imageio's plug-in)
     except ImportError as fault:
         raise ImportError(
-            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a folder of '
-            "PNGs."
+            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a '
+            "folder of PNGs."
         ) from fault
     if any(side % 2 for side in size):
         raise ValueError(

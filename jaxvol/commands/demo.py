@@ -37,7 +37,7 @@ OVER = compositing_of("over")
 
 def add_demo(commands: Any, shared: argparse.ArgumentParser) -> None:
     """Add the subcommand. `commands`: what `add_subparsers` returned."""
-    text = "Render a shaded head, wood grain before and after, and a fit by gradients; and a page that shows them."
+    text = "Render a shaded head, wood grain before and after, and a fit by gradients, and a page of them."
     parser = commands.add_parser(
         "demo", parents=[shared], help="show what the toolkit does", description=text
     )
@@ -88,8 +88,8 @@ SCALE = 128
 
 
 def _smooth(volume: Volume) -> Volume:
-    """The volume, smoothed by a Gaussian of one voxel. A border that is one voxel wide has normals that follow the
-    grid, and shaded it shows rings."""
+    """The volume, smoothed by a Gaussian of one voxel. A border that is one voxel wide has normals that
+    follow the grid, and shaded it shows rings."""
     data = gaussian_filter(SCALE * np.asarray(volume.data, np.float32), 1.0)
     return Volume(np.round(data).astype(np.uint16), volume.spacing, volume.origin)
 

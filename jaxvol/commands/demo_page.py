@@ -1,4 +1,5 @@
-"""How does the page of `jaxvol demo` look? Pictures, what they show, and the code that makes them; no network."""
+"""How does the page of `jaxvol demo` look? Pictures, what they show, and the code that makes them; no
+network."""
 
 import html
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,8 @@ class Section(NamedTuple):
 SECTIONS: Sequence[Section] = (
     Section(
         "A shaded volume",
-        "A phantom of a head: the skull under translucent skin and muscle, shaded by the gradient of the values.",
+        "A phantom of a head: the skull under translucent skin and muscle, shaded by the gradient of "
+        "the values.",
         {"head": "Head, smoothed by one voxel, integrated over each cell"},
         """\
 import numpy as np
@@ -43,9 +45,9 @@ jv.save_png("head.png", rendering.image(background=(1, 1, 1)))""",
     ),
     Section(
         "Wood grain, before and after",
-        "A translucent cube at far too long a step, 0.25 of its edge's unit. Each ray's last cell reaches past the "
-        "cube by another fraction of a step: terraces. Cutting the cell at the exit makes the same step exact "
-        "there. Nothing else was changed.",
+        "A translucent cube at far too long a step. Each ray's last cell "
+        "reaches past the cube by another fraction of a step, which shows as terraces. Cutting that cell where "
+        "the ray leaves the cube makes the same step exact there; nothing else is changed.",
         {"before": "No transform", "after": "AlphaCorrection()"},
         """\
 cube = jv.phantom("linear", 64)
@@ -56,9 +58,9 @@ for transforms in ((), (jv.AlphaCorrection(),)):
     ),
     Section(
         "A fit by gradients, in seconds",
-        "Two images of 64 x 64 pixels of an engine were given, and not the transfer function that made them. From "
-        "flat grey, Levenberg\N{EN DASH}Marquardt finds one by differentiating the renderer. This view was in none "
-        "of the images.",
+        "Given were two images of an engine, of 64 x 64 pixels, but not the transfer function that made them. "
+        "From flat grey, the method of Levenberg and Marquardt finds one by derivatives of the renderer. The "
+        "view below was in none of the images.",
         {"fit_start": "Where it began", "fit_found": "What it found", "fit_true": "The truth"},
         """\
 march = jv.March(step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
@@ -69,12 +71,12 @@ found.parameters  # a TransferFunction""",
 )
 
 STYLE = """\
-body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222; background: #fff }
-h1 { font-weight: 600 } h2 { margin-top: 3rem; border-top: 1px solid #ddd; padding-top: 1.5rem; font-weight: 600 }
-.row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; flex: 0 1 auto; max-width: 32rem }
-.three figure { flex: 1 1 18rem; max-width: 23rem } img { max-width: 100%; border: 1px solid #ddd; display: block }
-figcaption { font-size: 0.95rem } figcaption small { color: #666 }
+body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; margin: 2rem auto; padding: 0
+  1rem; color: #222; background: #fff }
+h1 { font-weight: 600 } h2 { margin-top: 3rem; border-top: 1px solid #ddd; padding-top: 1.5rem; font-weight:
+600 } .row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; flex: 0 1 auto; max-width: 32rem
+} .three figure { flex: 1 1 18rem; max-width: 23rem } img { max-width: 100%; border: 1px solid #ddd; display:
+block } figcaption { font-size: 0.95rem } figcaption small { color: #666 }
 pre { background: #f5f5f5; padding: 0.8rem 1rem; overflow-x: auto; font-size: 0.85rem }
 """
 
@@ -83,7 +85,8 @@ def page(said: Mapping[str, str]) -> str:
     """The page. `said`: the names of the pictures that there are, each with what it took."""
     body = [
         "<h1>What jaxvol does</h1>",
-        "<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render FILE</code>, and "
+        "<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render "
+        "FILE</code>, and "
         "<code>jaxvol animate FILE</code>.</p>",
     ]
     for section in SECTIONS:

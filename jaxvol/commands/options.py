@@ -1,4 +1,4 @@
-"""Which options do several commands share? Where programs are kept, what a scene is, and how it is looked at."""
+"""Which options do several commands share? Where programs are kept, what a scene is, how it is looked at."""
 
 import argparse
 import os
@@ -104,8 +104,8 @@ def _appearance(view: argparse.ArgumentParser) -> None:
     transfer.add_argument(
         "--cmap",
         metavar="NAME",
-        help="a matplotlib colormap, or a colour, over --clim (default with --clim, --opacity, and modes other "
-        "than over: gray; isosurfaces: white)",
+        help="a matplotlib colormap, or a colour, over --clim (default with --clim, --opacity, and modes "
+        "other than over: gray; isosurfaces: white)",
     )
     transfer.add_argument(
         "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"

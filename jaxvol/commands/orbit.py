@@ -11,8 +11,8 @@ PLANNED_VIEWS = 4
 
 
 def angles_of(degrees: float, frames: int) -> list[float]:
-    """Angles of the frames: evenly spaced from 0 on, to `degrees`; or, where that ends at the beginning, to one
-    frame before it."""
+    """Angles of the frames: evenly spaced from 0 on, to `degrees`; or, where that ends at the beginning, to
+    one frame before it."""
     closed = degrees % 360 == 0
     return [degrees * i / max(frames if closed else frames - 1, 1) for i in range(frames)]
 

@@ -16,8 +16,9 @@ Told = Callable[[int, int], None]
 
 @contextmanager
 def working(what: str) -> Iterator[Told]:
-    """Show `what` with the seconds that it has taken, on the terminal of stderr, until the context ends; yields
-    a function that adds how many are done of how many. Nothing is shown where stderr is no terminal."""
+    """Show `what` with the seconds that it has taken, on the terminal of stderr, until the context ends;
+    yields a function that adds how many are done of how many. Nothing is shown where stderr is no
+    terminal."""
     begun, count = time.monotonic(), ""
 
     def told(done: int, of: int) -> None:

@@ -1,4 +1,5 @@
-"""Which settings made a picture? They are written into a PNG, and read again as data that anyone may have made."""
+"""Which settings made a picture? They are written into a PNG, and read again as data that anyone may have
+made."""
 
 import argparse
 import hashlib
@@ -80,8 +81,8 @@ def transfer_from_file(options: argparse.Namespace, transfer: Transfer) -> Trans
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a file; of a folder, of the names and contents of its files; of a MetaImage header, of that and
-    of its data."""
+    """SHA-256 of a file; of a folder, of the names and contents of its files; of a MetaImage header, of that
+    and of its data."""
     files = [path]
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if file.is_file())
@@ -104,8 +105,8 @@ def checksum(path: Path) -> str:
 def recorded_in(path: Path) -> Recorded:
     """What a picture says of how it was made.
 
-    **Raises:** `ValueError`, naming the file, if it is no PNG, says nothing, or says what jaxvol does not write.
-    Options are checked where they are used.
+    **Raises:** `ValueError`, naming the file, if it is no PNG, says nothing, or says what jaxvol does not
+    write. Options are checked where they are used.
     """
     text = _text_in(path)
     try:
@@ -155,5 +156,6 @@ def _file(path: Path, content: Any) -> tuple[str, str]:
         if isinstance(name, str) and isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest):
             return name, digest
     raise ValueError(
-        f"{path}: the settings in it are damaged: file must have a name and a SHA-256; got {shortened(content)}."
+        f"{path}: the settings in it are damaged: file must have a name and a SHA-256; got "
+        f"{shortened(content)}."
     )

@@ -36,8 +36,8 @@ def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "
         type=Path,
         default=Path("out.png"),
         metavar="FILE",
-        help="image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); default: %(default)s. "
-        "A .png holds the options that made it: see --like",
+        help="image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); default: "
+        "%(default)s. A .png holds the options that made it: see --like",
     )
     parser.add_argument(
         "--transparent",
@@ -101,9 +101,8 @@ def rendered(frames: Frames, camera: Camera, path: Path) -> Rendering:
     )
     if frames.source is not None:
         bricks = rendering.bricks
-        print(
-            f"{path}: {bricks.loads} bricks of {' x '.join(map(str, bricks.counts))} read, {bricks.bytes_read} bytes"
-        )
+        counts = " x ".join(map(str, bricks.counts))
+        print(f"{path}: {bricks.loads} bricks of {counts} read, {bricks.bytes_read} bytes")
     if np.any(rendering.exhausted):
         print(
             f"{path}: incomplete: rays used up their {frames.march.most_samples} samples; use a longer step"

@@ -25,8 +25,8 @@ from .progress import working
 
 
 class Scene(NamedTuple):
-    """What is looked at, and how. Of a volume that is read in bricks from `source`, `volume` is a copy of every
-    n-th voxel in the same place."""
+    """What is looked at, and how. Of a volume that is read in bricks from `source`, `volume` is a copy of
+    every n-th voxel in the same place."""
 
     volume: Volume
     transfer: Transfer

@@ -1,5 +1,5 @@
-"""Where do options come from? From the command line, a TOML file, and the picture that `--like` names, in this
-order: what is given earlier counts."""
+"""Where do options come from? From the command line, a TOML file, and the picture that `--like` names, in
+this order: what is given earlier counts."""
 
 import argparse
 import tomllib
@@ -28,8 +28,8 @@ def parsed(
 ) -> argparse.Namespace:
     """The options of a command, from all places. `make`: makes the parser.
 
-    **Raises:** `ValueError` for a file that cannot be read, and, naming file and option, for an option that the
-    command has not, or whose value is of another kind.
+    **Raises:** `ValueError` for a file that cannot be read, and, naming file and option, for an option that
+    the command has not, or whose value is of another kind.
     """
     loose = make()
     for command in _commands(loose):
