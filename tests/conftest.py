@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hypothesis
 import jax
+import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
@@ -14,7 +15,7 @@ from . import typechecker  # noqa: F401  (the hook imports it by name)
 
 
 with install_import_hook("jaxvol", "tests.typechecker.check"):
-    import jaxvol  # noqa: F401  (the hook instruments every module imported with it)
+    import jaxvol
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -66,6 +67,15 @@ def limit_programs_in_memory():
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > 15_000:
         jax.clear_caches()
+
+
+@pytest.fixture
+def volume_file(tmp_path):
+    """A raw file of a small volume, whose name tells its shape and type."""
+    volume = jaxvol.phantom("engine", 24)
+    path = tmp_path / "engine_24x24x24_uint8.raw"
+    path.write_bytes(np.asarray(volume.data).transpose(2, 1, 0).tobytes())
+    return path
 
 
 @pytest.fixture

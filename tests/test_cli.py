@@ -23,14 +23,6 @@ from jaxvol.metrics import rmse
 from .scenes import slow
 
 
-@pytest.fixture
-def volume_file(tmp_path):
-    volume = jv.phantom("engine", 24)
-    path = tmp_path / "engine_24x24x24_uint8.raw"
-    path.write_bytes(np.asarray(volume.data).transpose(2, 1, 0).tobytes())
-    return path
-
-
 def scene_of(volume_file):
     """The scene that the command renders. All images of this file share its shapes, and so one program."""
     view = jv.Camera((40, -30, 20), (11.5,) * 3, (0, 0, 1), size=(16, 16)).zoom(1.5)

@@ -45,9 +45,9 @@ jv.save_png("head.png", rendering.image(background=(1, 1, 1)))""",
     ),
     Section(
         "Wood grain, before and after",
-        "A translucent cube at far too long a step. Each ray's last cell "
-        "reaches past the cube by another fraction of a step, which shows as terraces. Cutting that cell where "
-        "the ray leaves the cube makes the same step exact there; nothing else is changed.",
+        "A translucent cube at far too long a step. Each ray's last cell reaches past the cube by another "
+        "fraction of a step, which shows as terraces. Cutting that cell where the ray leaves the cube makes "
+        "the same step exact there; nothing else is changed.",
         {"before": "No transform", "after": "AlphaCorrection()"},
         """\
 cube = jv.phantom("linear", 64)
@@ -58,9 +58,9 @@ for transforms in ((), (jv.AlphaCorrection(),)):
     ),
     Section(
         "A fit by gradients, in seconds",
-        "Given were two images of an engine, of 64 x 64 pixels, but not the transfer function that made them. "
-        "From flat grey, the method of Levenberg and Marquardt finds one by derivatives of the renderer. The "
-        "view below was in none of the images.",
+        "Given were two images of an engine, of 64 x 64 pixels, but not the transfer function that made "
+        "them. From flat grey, the method of Levenberg and Marquardt finds one by derivatives of the "
+        "renderer. The view below was in none of the images.",
         {"fit_start": "Where it began", "fit_found": "What it found", "fit_true": "The truth"},
         """\
 march = jv.March(step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")

@@ -1,0 +1,118 @@
+"""Do options come from a TOML file, with those of the command line above them?"""
+
+import re
+
+import pytest
+
+from jaxvol.cli import _parser, main
+from jaxvol.commands.settings import parsed
+
+
+def options(*words):
+    return parsed(_parser, [str(word) for word in words])
+
+
+@pytest.fixture
+def config(tmp_path):
+    def written(text):
+        path = tmp_path / "settings.toml"
+        path.write_text(text)
+        return path
+
+    return written
+
+
+def test_every_kind_of_option_is_taken_from_a_file(config):
+    path = config(
+        """
+        file = "a.raw"
+        size = [40, 30]
+        step = 1
+        view-up = [0, 1.5, 0]
+        preset = "engine"
+        compositing = "maximum"
+        shade = false
+        parallel = true
+        clip-plane = [[1, 2, 3, 0, 0, 1], [4, 5, 6, 1, 0, 0]]
+        memory = "2M"
+        output = "b.png"
+        """
+    )
+    found = vars(options("render", "--config", path))
+    flags = "a.raw --size 40 30 --step 1 --view-up 0 1.5 0 --preset engine --compositing maximum --no-shade "
+    flags += "--parallel --clip-plane 1 2 3 0 0 1 --clip-plane 4 5 6 1 0 0 --memory 2M -o b.png"
+    expected = vars(options("render", *flags.split()))
+    assert found.pop("config") == path
+    assert expected.pop("config") is None
+    assert found == expected
+    assert found["memory"] == 2 * 2**20
+
+
+def test_the_command_line_stands_above_the_file(config):
+    path = config(
+        'file = "a.raw"\npreset = "engine"\nsize = [8, 8]\nclip-plane = [[1, 2, 3, 0, 0, 1]]\nstep = 2.0'
+    )
+    words = ["--cmap", "gray", "--size", 9, 9, "--clip-plane", 0, 0, 0, 1, 0, 0, "--tolerance", 0.1]
+    found = options("render", "b.raw", "--config", path, *words)
+    assert str(found.file) == "b.raw"
+    assert (found.cmap, found.preset) == ("gray", None)  # one stands in the place of the other
+    assert (found.tolerance, found.step) == (0.1, None)
+    assert list(found.size) == [9, 9]
+    assert found.clip_plane == [[0, 0, 0, 1, 0, 0]]
+
+
+def test_what_a_command_needs_may_stand_in_the_file(config):
+    path = config('file = "a.raw"\nimages = ["a.png"]\ncameras = "c.json"')
+    found = options("fit", "--config", path)
+    assert [str(each) for each in (found.file, *found.images, found.cameras)] == ["a.raw", "a.png", "c.json"]
+    with pytest.raises(SystemExit):
+        options("fit", "a.raw", "--config", config('images = ["a.png"]'))
+
+
+BAD = {
+    "unknown": ("sise = [1, 2]", "settings.toml: jaxvol render has no option 'sise'. Did you mean size?"),
+    "of another command": ('solver = "adam"', "jaxvol render has no option 'solver'"),
+    "a table": ("[render]\nstep = 1", "has no option 'render'"),
+    "itself": ('config = "a.toml"', "has no option 'config'"),
+    "text": ('step = "long"', "settings.toml: step must be a number; got 'long'"),
+    "truth": ("step = true", "step must be a number; got True"),
+    "no truth": ("parallel = 1", "parallel must be true or false; got 1"),
+    "fraction": ("size = [1.5, 2]", "size must be a whole number; got 1.5"),
+    "too few": ("view-up = [0, 1]", "view-up must be a list of 3 numbers; got [0, 1]"),
+    "no list": ("view-up = 3", "view-up must be a list of 3 numbers; got 3"),
+    "flat list": ("clip-plane = [1, 2, 3, 4, 5, 6]", "clip-plane must be a list of 6 numbers; got 1"),
+    "no list of lists": ("clip-plane = 1", "clip-plane must be a list of lists; got 1"),
+    "choice": ('compositing = "under"', "compositing must be one of over, maximum"),
+    "bytes": ('memory = "much"', "memory must be a number of bytes, such as 256M; got 'much'"),
+    "no bytes": ("memory = 0", "memory must be a number of bytes"),
+    "path": ("transfer = 5", "transfer must be a text; got 5"),
+    "no TOML": ("step = ", "settings.toml is not TOML"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_faults_name_the_file_and_the_option(case, config, capsys):
+    text, message = BAD[case]
+    assert main(["render", "a.raw", "--config", str(config(text))]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("jaxvol render: error: ")
+    assert printed.count("\n") == 1
+    assert message in printed
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path, capsys):
+    assert main(["render", "a.raw", "--config", str(tmp_path / "no.toml")]) == 2
+    assert re.search(r"--config: \S*no\.toml cannot be read", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(("text", "count"), [("1000", 1000), ("256M", 2**28), ("2g", 2**31), ("0.5K", 512)])
+def test_memory_is_a_number_of_bytes(text, count):
+    assert options("plan", "a.raw", "--memory", text).memory == count
+
+
+@pytest.mark.parametrize("text", ["much", "", "-1", "0", "nan", "inf", "1e999", "5T"])
+def test_other_memory_is_refused(text, capsys):
+    with pytest.raises(SystemExit) as stop:
+        options("plan", "a.raw", f"--memory={text}")
+    assert stop.value.code == 2
+    assert "--memory" in capsys.readouterr().err
