@@ -1,0 +1,77 @@
+"""Does a file appear whole or not at all?"""
+
+import contextlib
+import os
+import subprocess
+import sys
+
+from jaxvol._util.whole_files import whole_file, whole_folder
+
+
+def test_a_file_takes_its_place_at_the_end(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_text("old")
+    with whole_file(path) as part:
+        assert part.suffix == ".png"
+        part.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert os.listdir(tmp_path) == ["a.png"]
+
+
+def test_after_an_error_all_is_as_it_was(tmp_path):
+    (tmp_path / "a.png").write_text("old")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "b").write_text("old")
+    for context, path, inside in ((whole_file, "a.png", "."), (whole_folder, "folder", "b")):
+        with contextlib.suppress(ZeroDivisionError), context(tmp_path / path) as part:
+            (part / inside).write_text("new")
+            raise ZeroDivisionError
+    assert (tmp_path / "a.png").read_text() == "old"
+    assert (tmp_path / "folder" / "b").read_text() == "old"
+    assert sorted(os.listdir(tmp_path)) == ["a.png", "folder"]
+
+
+def test_files_of_a_folder_take_their_places_beside_others(tmp_path):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "mine").write_text("kept")
+    (folder / "a").write_text("old")
+    with whole_folder(folder) as part:
+        (part / "deep").mkdir()
+        (part / "a").write_text("new")
+        (part / "deep" / "b").write_text("new")
+        assert (folder / "a").read_text() == "old"
+    found = {
+        file.relative_to(folder).as_posix(): file.read_text() for file in folder.rglob("*") if file.is_file()
+    }
+    assert found == {"mine": "kept", "a": "new", "deep/b": "new"}
+    assert os.listdir(tmp_path) == ["folder"]
+
+
+ENDS = """
+import os, sys, threading, time
+from pathlib import Path
+from jaxvol._util.whole_files import remove_unfinished, whole_file, whole_folder
+
+def write():
+    with whole_folder(Path("folder")) as folder, whole_file(Path("a.png")) as part:
+        (folder / "b").write_text("half")
+        part.write_text("half")
+        begun.set()
+        removed.wait()
+
+begun, removed = threading.Event(), threading.Event()
+threading.Thread(target=write, daemon=True).start()
+begun.wait()
+remove_unfinished()
+removed.set()
+time.sleep(0.5)  # the thread goes on, but nothing appears
+os._exit(130)
+"""
+
+
+def test_a_process_that_ends_at_once_leaves_nothing(tmp_path):
+    run = subprocess.run([sys.executable, "-c", ENDS], cwd=tmp_path, check=False, capture_output=True)
+    assert run.returncode == 130, run.stderr
+    assert os.listdir(tmp_path) == []
