@@ -20,6 +20,9 @@ RIVALS = (
 )
 """Options of which one replaces the others."""
 
+OF_RENDER = frozenset({"turn", "orbit", "transparent"})
+"""Options that, of the commands that look at a volume, only render has."""
+
 NOT_IN_FILES = frozenset({"help", "config", "programs", "version"})
 
 
@@ -104,7 +107,7 @@ def _of_picture(command: argparse.ArgumentParser, given: dict[str, Any], path: P
     refused = NOT_IN_FILES | {"file", "output", "depth", "like"}
     known = {action.dest for action in command._actions}
     # what only the command render has, another leaves out
-    settings = {n: v for n, v in found.settings.items() if n not in ("turn", "orbit") or n in known}
+    settings = {n: v for n, v in found.settings.items() if n not in OF_RENDER or n in known}
     settings = _checked(command, settings, f"{path}: the settings in it", refused)
     if found.transfer is not None:
         settings["kept_transfer"] = found.transfer
