@@ -30,16 +30,37 @@ def scene_of(volume_file):
     return jv.load(volume_file), jv.preset("engine"), view, march
 
 
+SMALL = ["--size", "40", "30", "--resolution", "24"]
+
+
 def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
-    assert main(["demo", "-o", str(tmp_path), "--size", "40", "30", "--resolution", "24"]) == 0
+    assert main(["demo", "-o", str(tmp_path / "demo"), *SMALL, "--only", "head", "grain"]) == 0
     printed = capsys.readouterr().out
     for name in ("head.png", "before.png", "after.png"):
-        image = imread(tmp_path / name)
+        image = imread(tmp_path / "demo" / name)
         assert image.shape == (30, 40, 3)
         assert image.std() > 5
-        assert str(tmp_path / name) in printed
+        assert str(tmp_path / "demo" / name) in printed
     assert "compilation" in printed
     assert "cpu" in printed.lower() or "gpu" in printed.lower()
+    page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
+    assert sorted(re.findall(r'src="([^"]+)"', page)) == ["after.png", "before.png", "head.png"]
+    assert "http" not in page  # no network
+    assert main(["render", "--like", str(tmp_path / "demo" / "head.png")]) == 2
+    assert "was made by: jaxvol demo --size 40 30 --resolution 24 --only head grain. Run that." in (
+        capsys.readouterr().err
+    )
+
+
+@pytest.mark.slow
+def test_demo_fits_a_transfer_function(tmp_path, capsys):
+    with pytest.warns(UserWarning, match="not determined"):
+        assert main(["demo", "-o", str(tmp_path), *SMALL, "--only", "fit"]) == 0
+    true, found, start = (
+        imread(tmp_path / f"fit_{name}.png").astype(float) for name in ("true", "found", "start")
+    )
+    assert np.abs(found - true).mean() < np.abs(start - true).mean() / 5
+    assert "RMSE of this view" in capsys.readouterr().out
 
 
 def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):

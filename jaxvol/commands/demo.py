@@ -114,7 +114,7 @@ VIEWS = (0.5, -1, 0.4), (-1, -0.3, 0.5)
 
 HELD_OUT = (0.8, 0.9, 0.7)
 
-FITTED = 64
+FITTED = 48
 """Voxels along each axis of what is fitted, and pixels along each side of the images."""
 
 
@@ -125,7 +125,7 @@ def _fit(options: argparse.Namespace, save: Save) -> dict[str, str]:
     cameras = [Camera.looking_at(engine, side, size=(FITTED, FITTED)).zoom(1.4) for side in VIEWS]
     frames = Frames(engine, true, march, OVER, None)
     views = [(camera, frames.render(camera).image((1, 1, 1))) for camera in cameras]
-    start = flat_grey(engine, points=12)
+    start = flat_grey(engine, points=8)
     begun = time.perf_counter()
     with working("fitting a transfer function, steps") as told:
         found: Fit = fit(
@@ -152,7 +152,7 @@ def _fit(options: argparse.Namespace, save: Save) -> dict[str, str]:
     return {"fit_start": "", "fit_found": said, "fit_true": ""}
 
 
-STEPS = 20
+STEPS = 12
 
 PARTS: dict[str, Callable[[argparse.Namespace, Save], dict[str, str]]] = {
     "head": _head,

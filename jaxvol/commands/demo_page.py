@@ -58,14 +58,14 @@ for transforms in ((), (jv.AlphaCorrection(),)):
     ),
     Section(
         "A fit by gradients, in seconds",
-        "Given were two images of an engine, of 64 x 64 pixels, but not the transfer function that made "
+        "Given were two images of an engine, of 48 x 48 pixels, but not the transfer function that made "
         "them. From flat grey, the method of Levenberg and Marquardt finds one by derivatives of the "
         "renderer. The view below was in none of the images.",
         {"fit_start": "Where it began", "fit_found": "What it found", "fit_true": "The truth"},
         """\
 march = jv.March(step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
 residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
-found = jv.fit(residual, jv.flat_grey(engine, points=12), max_steps=20)
+found = jv.fit(residual, jv.flat_grey(engine, points=8), max_steps=12)
 found.parameters  # a TransferFunction""",
     ),
 )
