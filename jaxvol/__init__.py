@@ -6,6 +6,7 @@ composited front to back into a `Rendering`.
 """
 
 from . import bricks as bricks, datasets as datasets, lighting as lighting, metrics as metrics
+from .automatic import automatic_transfer as automatic_transfer
 from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
 from .camera import Camera as Camera
 from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting

@@ -1,6 +1,7 @@
 """`jaxvol datasets`: lists public volumes, and fetches them."""
 
 import argparse
+import sys
 from typing import Any
 
 from .. import datasets
@@ -34,7 +35,8 @@ def _list(options: argparse.Namespace) -> None:
 
 
 def _fetch(options: argparse.Namespace) -> None:
-    path = datasets.fetch(options.name, folder=options.folder, mirror=options.mirror)
+    where = {"folder": options.folder, "mirror": options.mirror}
+    path = datasets.fetch(options.name, **where, progress=sys.stderr.isatty())
     print(path)
     dataset = datasets.info(options.name)
     print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}")
