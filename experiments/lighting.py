@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
+from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
 from jaxvol.lighting import (
@@ -215,8 +216,13 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
 def pictures(templates: int, seed: int, path: Path, size: int, resolution: int) -> None:
     """Save the head without light and with it, side by side, under skin that nothing shows through."""
     scene = skin_head(size, resolution)
-    opaque = replace(scene.transfer, extinction=OPAQUE * scene.transfer.extinction)
-    scene = scene._replace(transfer=opaque, step=scene.step / 4)
+    # at 8 bits and a border of one voxel, normals follow the grid, and shaded they show rings
+    smooth = gaussian_filter(np.asarray(scene.volume.data, np.float32), 1.0)
+    volume = jv.Volume(smooth, scene.volume.spacing, scene.volume.origin)
+    # of one colour, since bones come within a voxel of the surface
+    colors = jnp.broadcast_to(scene.transfer.colors[1], scene.transfer.colors.shape)
+    opaque = replace(scene.transfer, colors=colors, extinction=OPAQUE * scene.transfer.extinction)
+    scene = scene._replace(volume=volume, transfer=opaque, step=scene.step / 4)
     lit = ScattererTemplates(FLESH, LIGHTS, templates=templates, blend=True)
     figure, axes = plt.subplots(1, 2, figsize=(2 * size / 90, size / 90 + 0.4), layout="constrained")
     titles = {

@@ -2,6 +2,7 @@
 
 import argparse
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ def _grain(options: argparse.Namespace, save: Save) -> dict[str, str]:
     # fraction of a step, which shows as terraces unless the cell is cut at the exit.
     cube = phantom("linear", 64)
     transfer = TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
-    camera = Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=tuple(options.size)).zoom(1.3)
+    camera = Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=tuple(options.size)).zoom(1.1)
     for name, transforms in (("before", ()), ("after", (AlphaCorrection(),))):
         image = _image(options, name, Frames(cube, transfer, March(0.25, transforms), OVER, None), camera)
         save(name, image.image((0, 0, 0)))
@@ -127,7 +128,8 @@ def _fit(options: argparse.Namespace, save: Save) -> dict[str, str]:
     views = [(camera, frames.render(camera).image((1, 1, 1))) for camera in cameras]
     start = flat_grey(engine, points=8)
     begun = time.perf_counter()
-    with working("fitting a transfer function, steps") as told:
+    with working("fitting a transfer function, steps") as told, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # two images do not determine the colours of what is transparent
         found: Fit = fit(
             ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views),
             start,
