@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ._util.checks import output_file
+from ._util.whole_files import whole_folder
 
 
 NEEDED = "paper_figs/index.py", "experiments/record.py"
@@ -37,8 +38,12 @@ def _figures(options: argparse.Namespace) -> None:
     folder = output_file("--output", options.output / "index.html").parent
     sys.path.insert(0, str(checkout()))
     index = importlib.import_module("paper_figs.index")
-    page = index.make(folder, run=options.anew, only=options.only, quick=options.quick)
-    print(f"open {page}")
+    if options.anew:  # takes hours: each result stays as soon as there is one
+        index.make(folder, run=True, only=options.only, quick=options.quick)
+    else:
+        with whole_folder(folder) as part:
+            index.make(part, only=options.only)
+    print(f"open {folder / 'index.html'}")
 
 
 def checkout() -> Path:

@@ -44,6 +44,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
+    # not by tempfile, whose files nobody else may read; several processes may write the same file
     part = path.with_name(f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{path.suffix}")
     _UNDERWAY.add(part)
     try:

@@ -7,7 +7,6 @@ all, and whoever finds it damaged makes it anew.
 import hashlib
 import json
 import os
-import secrets
 import warnings
 import zipfile
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from .._util.checks import described, integer
 from .._util.npy import read_arrays
+from .._util.whole_files import whole_file
 from ..occupancy import BLOCK
 from .sources import VoxelSource
 from .summary import COMBINED, Progress, Summary, scan
@@ -94,20 +94,13 @@ def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> 
     }
     arrays["about"] = told
     path.parent.mkdir(parents=True, exist_ok=True)
-    # not by tempfile, whose files nobody else may read
-    part = path.with_name(f"{path.name}.{secrets.token_hex(8)}.part")
-    try:
-        with part.open("xb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for name, array in arrays.items():
-                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with whole_file(path) as part, part.open("xb") as file:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, array, allow_pickle=False)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _read(path: Path, source: VoxelSource, about: dict[str, Any]) -> Summary | None:

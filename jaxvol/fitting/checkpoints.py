@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 import equinox as eqx
 import numpy as np
 
+from .._util.whole_files import whole_file
+
 
 T = TypeVar("T")
 
@@ -25,15 +27,14 @@ def save(path: Path, state: Any, about: dict[str, Any]) -> None:
     buffer = io.BytesIO()
     buffer.write(json.dumps(about).encode() + b"\n")
     eqx.tree_serialise_leaves(buffer, state)
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        file.write(_checksum_line(buffer))
-        file.write(buffer.getbuffer())
-        file.flush()
-        os.fsync(file.fileno())
-    if path.exists():
-        os.replace(path, before(path))
-    os.replace(part, path)
+    with whole_file(path) as part:
+        with part.open("wb") as file:
+            file.write(_checksum_line(buffer))
+            file.write(buffer.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            os.replace(path, before(path))
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
