@@ -51,7 +51,8 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
     values = _sampled(np.asarray(volume.data))
     low, high = float(values.min()), float(values.max())
     if not low < high:
-        return TransferFunction([low], [_linear(TISSUE)], extinction_of([0.5], _unit(volume)))
+        ends = [low, low + max(abs(low), 1.0)]
+        return TransferFunction(ends, [_linear(TISSUE)] * 2, extinction_of([0.5] * 2, _unit(volume)))
     first, second = thresholds(values)
     faces = _faces(np.asarray(volume.data))
     points = _shell(low, first, second, high) if np.mean(faces > first) < CUT else _dense(first, second, high)
@@ -95,17 +96,22 @@ def _dense(first: float, second: float, high: float) -> list[tuple[float, Any, f
 
 
 def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Otsu's two thresholds."""
+    """Otsu's two thresholds. Between classes that are far apart any threshold is as good: the middle of their
+    means is taken, where the border between them lies in a scan."""
     from skimage.filters import threshold_multiotsu
 
-    low, high = np.percentile(values, (0, 99.9))
+    low, high = (float(end) for end in np.percentile(values, (0, 99.9)))
+    high = high if high > low else float(values.max())
+    kept = np.clip(values, low, high)
     try:
-        first, second = threshold_multiotsu(
-            np.clip(values, low, max(high, np.nextafter(low, np.inf))), 3, nbins=BINS
-        )
+        first, second = threshold_multiotsu(kept, 3, nbins=BINS)
     except ValueError:  # of fewer than three values
-        first, second = values.min() + np.array([1, 2]) / 3 * (values.max() - values.min())
-    return float(first), float(second)
+        first, second = low + (high - low) / 3, low + 2 * (high - low) / 3
+    classes = [kept[kept <= first], kept[(kept > first) & (kept <= second)], kept[kept > second]]
+    if min(map(len, classes)) == 0:
+        return float(first), float(second)
+    means = [float(each.mean(dtype=np.float64)) for each in classes]
+    return (means[0] + means[1]) / 2, (means[1] + means[2]) / 2
 
 
 FEWEST_FLAT = 0.8

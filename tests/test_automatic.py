@@ -32,8 +32,8 @@ def test_thresholds_part_three_classes():
     values = np.concatenate([np.full(900, 10.0), np.full(80, 100.0), np.full(20, 200.0)]).astype(np.float32)
     values += np.random.default_rng(0).normal(0, 3, values.shape).astype(np.float32)
     first, second = thresholds(values)
-    assert 20 < first < 95
-    assert 110 < second < 195
+    assert first == pytest.approx(55, abs=2)  # in the middle, wherever between them
+    assert second == pytest.approx(150, abs=2)
 
 
 def test_what_is_around_is_transparent_and_what_is_dense_opaque():
@@ -49,7 +49,7 @@ def test_what_is_around_is_transparent_and_what_is_dense_opaque():
     )
     assert rgba[0, 0, 3] == 0
     assert rgba[16, 16, 3] > 0.95
-    assert 0.2 < (rgba[..., 3] > 0.1).mean() < 0.7
+    assert 0.1 < (rgba[..., 3] > 0.1).mean() < 0.5
     # the dense ball is brighter than what is around it
     assert rgba[16, 16, :3].mean() > 1.3 * np.median(rgba[..., :3].mean(-1)[rgba[..., 3] > 0.1])
 
@@ -70,11 +70,10 @@ def test_an_object_that_the_faces_cut_is_no_block():
     assert opacity_at(transfer, 200, 0.1 * across) > 0.9
 
 
-@pytest.mark.parametrize(
-    "data", [np.zeros((3, 3, 3), np.uint8), np.arange(27).reshape(3, 3, 3) % 2, np.eye(3)[None] * [[[1]]] * 3]
-)
-def test_volumes_of_few_values_are_shown_too(data):
-    transfer = jv.automatic_transfer(jv.Volume(np.broadcast_to(data, (3, 3, 3)).astype(np.uint8)))
+@pytest.mark.parametrize("kinds", [1, 2, 3])
+def test_volumes_of_few_values_are_shown_too(kinds):
+    data = (np.arange(27) % kinds).astype(np.uint8).reshape(3, 3, 3)
+    transfer = jv.automatic_transfer(jv.Volume(data))
     assert np.isfinite(np.asarray(transfer.extinction)).all()
     assert float(transfer.extinction.max()) > 0
 
