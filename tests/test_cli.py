@@ -297,6 +297,101 @@ def test_ctrl_c_ends_a_command_at_once_with_one_line(volume_file, tmp_path):
     assert not (tmp_path / "x.png").exists()
 
 
+HALF = """
+import signal
+import sys
+import time
+import jaxvol.cli
+from jaxvol.commands import {module}
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+made = {module}.{name}
+def slow(*given, **how):
+    found = made(*given, **how)
+    print("under way", flush=True)
+    time.sleep(60)
+    return found
+{module}.{name} = slow
+sys.exit(jaxvol.cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "module", "name"),
+    [
+        ("animate", "animate", "save_image"),
+        ("animate", "animate", "displayed"),
+        ("demo", "demo", "save_image"),
+    ],
+)
+def test_ctrl_c_leaves_no_half_written_file(command, module, name, volume_file, tmp_path):
+    """After the first frame of an orbit, into a folder and into a GIF; after the first picture of the demo."""
+    folder = tmp_path / "there"
+    folder.mkdir()
+    (folder / "mine").write_text("kept")
+    output = folder / "orbit.gif" if name == "displayed" else folder
+    words = ["demo", "--only", "grain"] if command == "demo" else [command, str(volume_file), "--step", "1"]
+    run = subprocess.Popen(
+        [sys.executable, "-c", HALF.format(module=module, name=name), *words]
+        + ["--size", "16", "16", "-o", str(output)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert run.stdout is not None
+    while "under way" not in run.stdout.readline():
+        assert run.poll() is None
+    run.send_signal(signal.SIGINT)
+    printed = run.communicate(timeout=60)[1]
+    assert run.returncode == 130
+    assert printed == f"\njaxvol {command}: interrupted\n"
+    assert [path.name for path in folder.iterdir()] == ["mine"]
+    assert {path.name for path in tmp_path.iterdir()} == {"there", volume_file.name}
+
+
+def test_a_reader_that_ends_early_leaves_no_traceback():
+    run = subprocess.Popen(
+        [sys.executable, "-m", "jaxvol", "datasets", "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert run.stdout is not None
+    assert run.stderr is not None
+    run.stdout.close()
+    assert run.stderr.read() == b""
+    assert run.wait(timeout=60) == 1
+
+
+def test_a_volume_is_rendered_brick_by_brick(volume_file, tmp_path, capsys):
+    look = ["--preset", "engine", "--no-shade"]
+    images = []
+    for words in ([], ["--memory", "200K"]):
+        assert render_file(volume_file, *look, *words, "-o", tmp_path / "x.npy") == 0
+        images.append(np.load(tmp_path / "x.npy"))
+    assert re.search(r"\d+ bricks of \d x \d x \d read", capsys.readouterr().out)
+    np.testing.assert_allclose(*images, atol=2e-5)
+    assert images[0].std() > 0.02
+    assert render_file(volume_file, "--memory", "10", "-o", tmp_path / "y.npy") == 2
+    assert "memory must hold" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_plan_with_memory_is_by_bricks_where_the_volume_does_not_fit(volume_file, tmp_path, capsys):
+    words = [str(volume_file), "--size", "16", "16", "--preset", "engine", "--memory"]
+    assert main(["plan", *words, "200K"]) == 0
+    assert "bricks:" in capsys.readouterr().out
+    assert main(["plan", *words, "1G"]) == 0
+    assert "in memory:" in capsys.readouterr().out
+    assert main(["render", *words, "200K", "-o", str(tmp_path / "x.png")]) == 0
+    assert "bricks of" in capsys.readouterr().out
+    assert main(["render", "--like", str(tmp_path / "x.png"), "-o", str(tmp_path / "y.png")]) == 0
+    np.testing.assert_array_equal(imread(tmp_path / "x.png"), imread(tmp_path / "y.png"))
+
+
+def test_files_that_are_not_read_in_parts_are_named(tmp_path, capsys):
+    jv.save(tmp_path / "v.npz", jv.phantom("linear", 4))
+    assert main(["render", str(tmp_path / "v.npz"), "--memory", "1M"]) == 2
+    assert "is not of a kind that is read in parts" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_fit_that_is_interrupted_goes_on_from_its_checkpoint(volume_file, seen, tmp_path):
     kept, cameras = tmp_path / "fit.ckpt", str(tmp_path / "cameras.json")
