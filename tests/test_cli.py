@@ -306,11 +306,13 @@ from jaxvol.commands import {module}
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
 made = {module}.{name}
+calls = []
 def slow(*given, **how):
-    found = made(*given, **how)
-    print("under way", flush=True)
-    time.sleep(60)
-    return found
+    calls.append(given)
+    if len(calls) == 2:
+        print("under way", flush=True)
+        time.sleep(60)
+    return made(*given, **how)
 {module}.{name} = slow
 sys.exit(jaxvol.cli.main(sys.argv[1:]))
 """
@@ -325,15 +327,15 @@ sys.exit(jaxvol.cli.main(sys.argv[1:]))
     ],
 )
 def test_ctrl_c_leaves_no_half_written_file(command, module, name, volume_file, tmp_path):
-    """After the first frame of an orbit, into a folder and into a GIF; after the first picture of the demo."""
+    """At the second frame of an orbit, into a folder and into a GIF; at the second picture of the demo."""
     folder = tmp_path / "there"
     folder.mkdir()
     (folder / "mine").write_text("kept")
     output = folder / "orbit.gif" if name == "displayed" else folder
     words = ["demo", "--only", "grain"] if command == "demo" else [command, str(volume_file), "--step", "1"]
+    words += ["--size", "16", "16"]
     run = subprocess.Popen(
-        [sys.executable, "-c", HALF.format(module=module, name=name), *words]
-        + ["--size", "16", "16", "-o", str(output)],
+        [sys.executable, "-c", HALF.format(module=module, name=name), *words, "-o", str(output)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -387,7 +389,7 @@ def test_a_plan_with_memory_is_by_bricks_where_the_volume_does_not_fit(volume_fi
 
 
 def test_files_that_are_not_read_in_parts_are_named(tmp_path, capsys):
-    jv.save(tmp_path / "v.npz", jv.phantom("linear", 4))
+    jv.save(jv.phantom("linear", 4), tmp_path / "v.npz")
     assert main(["render", str(tmp_path / "v.npz"), "--memory", "1M"]) == 2
     assert "is not of a kind that is read in parts" in capsys.readouterr().err
 
