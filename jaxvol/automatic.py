@@ -141,7 +141,6 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     if kinds is None:
         return None
     labels = np.searchsorted(kinds, data).astype(np.uint8)
-    # floats of a label's share need no more than 8 bits here
     share = gaussian_filter((labels > 0).astype(np.float32), LABEL_BLUR)
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
     shown = Volume(
