@@ -2,6 +2,7 @@
 this order: what is given earlier counts."""
 
 import argparse
+import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
@@ -34,13 +35,16 @@ def parsed(
     **Raises:** `ValueError` for a file that cannot be read, and, naming file and option, for an option that
     the command has not, or whose value is of another kind.
     """
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if {"-h", "--help"} & set(words):  # of the parser as it is
+        return make().parse_args(words)
     loose = make()
     for command in _commands(loose):
         for action in command._actions:
             _relax(action)
             # argparse would convert what says SUPPRESS for a positional argument
             action.default = argparse.SUPPRESS if action.option_strings else None
-    given = {name: value for name, value in vars(loose.parse_args(arguments)).items() if value is not None}
+    given = {name: value for name, value in vars(loose.parse_args(words)).items() if value is not None}
     settings: dict[str, Any] = {}
     parser = make()
     command = _chosen(parser, given)
@@ -53,7 +57,7 @@ def parsed(
         if action.dest in settings:
             _relax(action)
     command.set_defaults(**settings)
-    return parser.parse_args(arguments)
+    return parser.parse_args(words)
 
 
 def _without_rivals(settings: dict[str, Any], stronger: dict[str, Any]) -> dict[str, Any]:
