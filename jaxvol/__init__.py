@@ -6,6 +6,7 @@ composited front to back into a `Rendering`.
 """
 
 from . import bricks as bricks, datasets as datasets, lighting as lighting, metrics as metrics
+from ._util.programs import keep_programs as keep_programs
 from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
 from .camera import Camera as Camera
 from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
@@ -70,4 +71,5 @@ from .transforms import (
     SpaceLeaping as SpaceLeaping,
     ToroidalMap as ToroidalMap,
 )
+from .viewer import serve as serve, view as view
 from .volume import Field as Field, Volume as Volume

@@ -19,6 +19,7 @@ from .camera import Camera
 from .commands.data import add_data_options, volume_of
 from .commands.datasets import add_datasets
 from .commands.info import add_info
+from .commands.view import add_view
 from .compositing import Compositing, Over
 from .display import image_file, save_image
 from .figures import add_figures
@@ -224,6 +225,7 @@ def _parser() -> argparse.ArgumentParser:
     add_figures(commands, shared)
     add_info(commands, shared)
     add_datasets(commands, shared)
+    add_view(commands, shared)
     return parser
 
 

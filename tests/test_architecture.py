@@ -52,6 +52,7 @@ ORDER = [
     "bricks",
     "fitting",
     "unseen",
+    "viewer",
     "figures",
     "commands",
     "cli",
