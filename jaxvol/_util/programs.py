@@ -36,7 +36,7 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     """
     path = default_programs() if folder is None else Path(folder)
     path.mkdir(parents=True, exist_ok=True)
-    if jax.config.jax_compilation_cache_dir != str(path):
+    if _folder() != str(path):
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         _forget_that_none_was_set()
@@ -45,8 +45,12 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
 
 def keep_programs_by_default() -> None:
     """`keep_programs()`, unless JAX keeps them somewhere already."""
-    if not jax.config.jax_compilation_cache_dir:
+    if not _folder():
         keep_programs()
+
+
+def _folder() -> str | None:
+    return getattr(jax.config, "jax_compilation_cache_dir", None)
 
 
 def _forget_that_none_was_set() -> None:

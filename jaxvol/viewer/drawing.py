@@ -64,7 +64,7 @@ class Drawing:
         width, height = grid.size
         pixels = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.uint8)
         for column, row in grid.inside_out():
-            pixels[_place(column, row)] = self.tile(grid, column, row)
+            pixels[place(column, row)] = self.tile(grid, column, row)
         return pixels[:height, :width]
 
     def error(self) -> float:
@@ -94,7 +94,7 @@ class Drawing:
         return render(self.content.volume, self.transfer, camera, self.march, **how).rgba
 
 
-def _place(column: int, row: int) -> tuple[slice, slice]:
+def place(column: int, row: int) -> tuple[slice, slice]:
     """Where the pixels of a tile lie in the image."""
     return slice(row * SIDE, (row + 1) * SIDE), slice(column * SIDE, (column + 1) * SIDE)
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from .drawing import Content, Drawing, Pixels, _place
+from .drawing import Content, Drawing, Pixels, place
 from .pace import Pace
 from .state import State
 from .tiles import SIDE, Grid
@@ -124,19 +124,23 @@ class Model:
         pixels, shown = _stretched(self._last.pixels, grid), begun
         width, height = grid.size
         tiles = grid.inside_out()
-        for count, (column, row) in enumerate(tiles, 1):
-            pixels[_place(column, row)] = drawing.tile(grid, column, row)
-            now, last = time.perf_counter(), count == len(tiles)
-            if last or now - shown > EVERY:
-                shown, stage = now, "fine" if last else "drawing"
-                took = now - begun
-                frame = Frame(pixels[:height, :width].copy(), stage, state, took, took, state.step)
-                self._show(frame)
-                self._tell(
-                    _timing(frame) + ("; estimating the error …" if last else f", {count} of {len(tiles)}")
-                )
+
+        def show(stage: Literal["drawing", "fine"], more: str) -> None:
+            took = time.perf_counter() - begun
+            frame = Frame(pixels[:height, :width].copy(), stage, state, took, took, state.step)
+            self._last = frame
+            self._show(frame)
+            self._tell(f"{_timing(frame)}{more}")
+
+        for count, (column, row) in enumerate(tiles):
+            if time.perf_counter() - shown > EVERY:
+                shown = time.perf_counter()
+                show("drawing", f", {count} of {len(tiles)} tiles")
+            pixels[place(column, row)] = drawing.tile(grid, column, row)
             yield
-        self._tell(f"{_timing(frame)}; RMSE {drawing.error():.2g} (estimate)")
+        show("fine", ", estimating its error …")
+        yield
+        self._tell(f"{_timing(self._last)}, RMSE {drawing.error():.2g} (estimate)")
 
     def _failed(self, fault: Exception) -> None:
         self._tell(f"not drawn: {' '.join(str(fault).split())}")

@@ -2,7 +2,8 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import ipywidgets
@@ -22,7 +23,7 @@ from .state import State
 PER_NOTCH = 1.2
 """How much nearer one notch of a mouse wheel brings the camera, which browsers report as 100."""
 
-NARROW, WIDE = {"width": "70px"}, {"width": "290px"}
+WIDE = {"width": "330px"}
 
 
 class NotebookView(ipywidgets.HBox):
@@ -47,7 +48,7 @@ class NotebookView(ipywidgets.HBox):
         self.canvas.add_event_handler(self._pointed, "pointer_down", "pointer_move", "pointer_up", "wheel")
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
-        self._status = ipywidgets.HTML(layout={"width": "290px"})
+        self._status = ipywidgets.HTML(layout=WIDE)
         self.model = Model(content, state, self._show, self._tell)
         self._first = state
         self._at: tuple[float, float] | None = None
@@ -137,66 +138,63 @@ class NotebookView(ipywidgets.HBox):
         step = ipywidgets.FloatLogSlider(
             value=state.step, base=2, min=-4, max=4, step=0.25, description="step (voxels)", layout=WIDE
         )
+        step.style.description_width = "initial"  # pyright: ignore[reportAttributeAccessIssue]
         step.observe(lambda change: self.model.apply(lambda s: s.with_step(change["new"])), "value")
-        boxes = []
-        for name in choices.names:
-            box = ipywidgets.Checkbox(value=name in state.on, description=name, indent=False, layout=WIDE)
-            box.observe(
-                lambda change, name=name: self.model.apply(lambda s: s.with_transform(name, change["new"])),
-                "value",
-            )
-            boxes.append(box)
-        light = ipywidgets.Checkbox(value=state.lit, description="light", indent=False, layout=WIDE)
-        light.observe(lambda change: self.model.change(lit=change["new"]), "value")
-        reset = ipywidgets.Button(description="reset view")
+        light = _box("light", state.lit, lambda on: self.model.change(lit=on))
+        reset = ipywidgets.Button(description="reset view", layout={"width": "110px"})
         reset.on_click(lambda _: self._reset())
         self._rows()
-        headings = [ipywidgets.HTML(f"<b>{text}</b>") for text in ("transfer function", "march")]
         return [
             self._status,
-            reset,
-            headings[0],
+            _heading("transfer function"),
             self._window,
             self._level,
             self._points,
-            headings[1],
+            _heading("march and light"),
             step,
-            *boxes,
+            *(self._switch(name) for name in choices.names),
             light,
+            reset,
         ]
 
+    def _switch(self, name: str) -> ipywidgets.Checkbox:
+        return _box(
+            name,
+            name in self.model.state.on,
+            lambda on: self.model.apply(lambda state: state.with_transform(name, on)),
+        )
+
     def _ranged(self, change: Any) -> None:
-        if not self._quiet:
-            window, level = self._window.value, self._level.value
-            if self._changed(lambda curve: curve.over(window, level)):
-                self._rows()
+        window, level = self._window.value, self._level.value
+        self._edit(lambda curve: curve.over(window, level))
 
-    def _changed(self, change: Callable[[Curve], Curve]) -> bool:
-        """Change the curve; whether that could be done."""
-        from dataclasses import replace
-
-        return self.model.apply(lambda s: replace(s, curve=change(s.curve))) is None
-
-    @contextlib.contextmanager
-    def _without_echo(self) -> Iterator[None]:
+    def _edit(self, change: Callable[[Curve], Curve]) -> None:
+        """Change the curve, and let the controls show it; not while they are being made to."""
+        if self._quiet:
+            return
+        before = len(self.model.state.curve)
+        self.model.apply(lambda state: replace(state, curve=change(state.curve)))
+        curve = self.model.state.curve
+        if len(curve) != before:
+            self._rows()
         self._quiet = True
         try:
-            yield
+            self._window.value, self._level.value = curve.window, curve.level
+            for index, row in enumerate(self._points.children):
+                if curve.editable:
+                    row.children[0].value = _rounded(curve.values[index])
         finally:
             self._quiet = False
 
     def _rows(self) -> None:
         """A row of controls for each point."""
         curve = self.model.state.curve
-        with self._without_echo():
-            self._window.value, self._level.value = curve.window, curve.level
-        if not curve.editable:
-            self._points.children = (ipywidgets.HTML(f"<i>{len(curve)} points: too many to edit</i>"),)
-            return
-        self._points.children = tuple(self._row(curve, index) for index in range(len(curve)))
+        many = ipywidgets.HTML(f"<i>{len(curve)} points: too many to edit</i>")
+        rows = (self._row(curve, index) for index in range(len(curve)))
+        self._points.children = tuple(rows) if curve.editable else (many,)
 
-    def _row(self, curve: Curve, index: int) -> ipywidgets.Widget:
-        value = ipywidgets.FloatText(value=round(curve.values[index], 6), layout=NARROW)
+    def _row(self, curve: Curve, index: int) -> ipywidgets.HBox:
+        value = ipywidgets.FloatText(value=_rounded(curve.values[index]), layout={"width": "70px"})
         color = ipywidgets.ColorPicker(value=_hex(curve, index), concise=True, layout={"width": "32px"})
         opacity = ipywidgets.FloatSlider(
             value=curve.opacity(index),
@@ -204,32 +202,22 @@ class NotebookView(ipywidgets.HBox):
             max=1,
             step=0.005,
             readout_format=".3f",
-            layout={"width": "118px"},
+            layout={"width": "150px"},
         )
-        more = ipywidgets.Button(
-            description="+", tooltip="one more point behind this", layout={"width": "30px"}
+        more = _button("+", "one more point behind this one")
+        less = _button("−", "remove this point")
+        value.observe(lambda change: self._edit(lambda c: c.changed(index, value=change["new"])), "value")
+        opacity.observe(lambda change: self._edit(lambda c: c.changed(index, opacity=change["new"])), "value")
+        color.observe(
+            lambda change: self._edit(lambda c: c.changed(index, color=_rgb(change["new"]))), "value"
         )
-        less = ipywidgets.Button(description="−", tooltip="remove this point", layout={"width": "30px"})
-
-        def set_value(change: Any) -> None:
-            if self._changed(lambda c: c.changed(index, value=change["new"])):
-                curve = self.model.state.curve
-                with self._without_echo():
-                    self._window.value, self._level.value = curve.window, curve.level
-
-        def set_color(change: Any) -> None:
-            text = change["new"].lstrip("#")
-            r, g, b = (int(text[i : i + 2], 16) / 255 for i in (0, 2, 4))
-            self._changed(lambda c: c.changed(index, color=(r, g, b)))
-
-        value.observe(set_value, "value")
-        color.observe(set_color, "value")
-        opacity.observe(
-            lambda change: self._changed(lambda c: c.changed(index, opacity=change["new"])), "value"
-        )
-        more.on_click(lambda _: self._changed(lambda c: c.split(index)) and self._rows())
-        less.on_click(lambda _: self._changed(lambda c: c.without(index)) and self._rows())
+        more.on_click(lambda _: self._edit(lambda c: c.split(index)))
+        less.on_click(lambda _: self._edit(lambda c: c.without(index)))
         return ipywidgets.HBox([value, color, opacity, more, less])
+
+
+def _heading(text: str) -> ipywidgets.HTML:
+    return ipywidgets.HTML(f"<b>{text}</b>")
 
 
 def _slider(name: str, value: float, low: float, high: float, step: float) -> ipywidgets.FloatSlider:
@@ -238,5 +226,25 @@ def _slider(name: str, value: float, low: float, high: float, step: float) -> ip
     )
 
 
+def _box(name: str, on: bool, switch: Callable[[bool], Any]) -> ipywidgets.Checkbox:
+    box = ipywidgets.Checkbox(value=on, description=name, indent=False, layout=WIDE)
+    box.observe(lambda change: switch(bool(change["new"])), "value")
+    return box
+
+
+def _button(text: str, tooltip: str) -> ipywidgets.Button:
+    return ipywidgets.Button(description=text, tooltip=tooltip, layout={"width": "30px"})
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
 def _hex(curve: Curve, index: int) -> str:
     return "#" + "".join(f"{round(255 * c):02x}" for c in curve.display_color(index))
+
+
+def _rgb(text: str) -> tuple[float, float, float]:
+    """Of `#rrggbb`."""
+    r, g, b = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
+    return r, g, b

@@ -36,8 +36,7 @@ class Pace:
         a coarse one has no more than half."""
         if seconds > self.budget:
             self.rung -= 2 if seconds > 2 * self.budget else 1
-        elif seconds < self.budget / 2.5 and LADDER[min(self.rung + 1, len(LADDER) - 1)][0] <= max(
-            1, most // 2
-        ):
+        elif seconds < self.budget / 2.5:
             self.rung += 1
-        self.rung = min(max(self.rung, 0), len(LADDER) - 1)
+        enough = sum(tiles <= max(1, most // 2) for tiles, _ in LADDER)
+        self.rung = min(max(self.rung, 0), enough - 1)

@@ -77,7 +77,8 @@ class Page:
     async def _only_own_pages(self, connection: Any) -> None:
         """Any page that a browser shows may connect to a port of this machine; viser takes them all."""
         socket = self._server._websock_server._live_connections[connection.client_id]
-        origin = urlsplit(socket.request.headers.get("Origin", ""))
+        request = socket.request
+        origin = urlsplit(request.headers.get("Origin", "") if request else "")
         if origin.hostname not in OWN_NAMES or origin.port != self.port:
             await socket.close(1008, "this viewer is shown by its own pages only")
 

@@ -69,14 +69,14 @@ def begin(
         raise ValueError(f"the viewer shows a TransferFunction; got {described(transfer)}.")
     if not isinstance(volume, Volume):
         check_arguments("view(volume, transfer, camera, march)", volume=volume)
-    camera = Camera.looking_at(volume, size=size) if camera is None else camera
+    seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
     given = March(1.0) if march is None else march
     transfer = default_transfer(volume) if transfer is None else transfer
     check_arguments(
         "view(volume, transfer, camera, march)",
         volume=volume,
         transfer=transfer,
-        camera=camera,
+        camera=seen,
         march=given,
         lighting=lighting,
     )
@@ -96,7 +96,7 @@ def begin(
     )
     step = 1.0 if march is None else float(given.step) / voxel
     state = State(
-        Orbit.of(camera),
+        Orbit.of(seen),
         Curve.of(transfer, voxel),
         (1, 1),
         1.0,

@@ -71,9 +71,7 @@ class Worker(Generic[T]):
                 (request, asked), self._next = self._next, None
             try:
                 self._draw(request, asked)
-            except (
-                Exception
-            ) as fault:  # a viewer that is told what is wrong can be told to draw another thing
+            except Exception as fault:  # told to the user, who may ask for another image
                 self._failed(fault)
             with self._changed:
                 self._idle = self._next is None
