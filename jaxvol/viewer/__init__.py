@@ -52,7 +52,7 @@ def view(
       points or fewer can be edited point by point.
     - `camera`: by default one that sees the whole volume. Its size does not count.
     - `march`: whose transforms are on at first, and whose step is that of the fine image. By default steps of
-      one voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection` and `EarlyTermination`.
+      half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection` and `EarlyTermination`.
     - `lighting`: the light that can be turned on, by default `Phong`. `lit`: whether it is on at first.
     - `compositing`: as for `render`.
     - `background`: linear RGB.

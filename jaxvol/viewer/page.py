@@ -57,6 +57,7 @@ class Page:
         self.url = f"http://localhost:{self.port}"
         self._server._websock_server.on_client_connect(self._only_own_pages)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self._server.gui.main_panel.dock_right()
         self._server.scene.set_up_direction(tuple(state.orbit.view_up))
         first = self._server.initial_camera
         first.up = tuple(state.orbit.view_up)
@@ -114,17 +115,10 @@ class _Panel:
         self.client, self.gui = client, client.gui
         self.status = self.gui.add_markdown("starting …")
         self.model = Model(content, state, self._show, self._tell)
-        self._folders: list[Any] = []
         with self.gui.add_folder("transfer function"):
-            low, high = state.curve.values[0], state.curve.values[-1]
-            wide = max(high - low, 1e-12)
-            self.window = self.gui.add_slider("window", wide / 100, 4 * wide, wide / 100, wide)
-            self.level = self.gui.add_slider("level", low - wide, high + wide, wide / 100, state.curve.level)
-            self.points = self.gui.add_folder("points")
-        self.window.on_update(self._ranged)
-        self.level.on_update(self._ranged)
-        self._rows()
-        self._march()
+            self._look(state.curve)
+        with self.gui.add_folder("march and light"):
+            self._march(state)
 
     def look(self, orbit: Orbit, width: float, height: float) -> None:
         """From where, and at how many pixels."""
@@ -137,81 +131,91 @@ class _Panel:
     def _tell(self, text: str) -> None:
         self.status.content = f"`{text}`"
 
-    def _march(self) -> None:
-        state, choices = self.model.state, self.model.content.choices
-        with self.gui.add_folder("march and light"):
-            step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
+    def _march(self, state: State) -> None:
+        step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
+        _answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
+        for name in self.model.content.choices.names:
+            self._switch(name, name in state.on)
+        light = self.gui.add_checkbox("light", state.lit)
+        _answer(light, lambda: self.model.change(lit=bool(light.value)))
 
-            @step.on_update
-            async def _(_: Any) -> None:
-                self.model.apply(lambda s: s.with_step(step.value))
+    def _switch(self, name: str, on: bool) -> None:
+        box = self.gui.add_checkbox(name, on)
+        _answer(box, lambda: self.model.apply(lambda s: s.with_transform(name, bool(box.value))))
 
-            for name in choices.names:
-                self._switch(name)
-            light = self.gui.add_checkbox("light", state.lit)
-
-            @light.on_update
-            async def _(_: Any) -> None:
-                self.model.change(lit=bool(light.value))
-
-    def _switch(self, name: str) -> None:
-        box = self.gui.add_checkbox(name, name in self.model.state.on)
-
-        @box.on_update
-        async def _(_: Any) -> None:
-            self.model.apply(lambda s: s.with_transform(name, bool(box.value)))
-
-    async def _ranged(self, event: Any) -> None:
-        if event.client is None:  # set by this program
+    def _look(self, curve: Curve) -> None:
+        wide = max(curve.window, 1e-12)
+        low, high = curve.values[0] - wide, curve.values[-1] + wide
+        self.window = self.gui.add_slider("window", wide / 100, 4 * wide, wide / 100, wide)
+        self.level = self.gui.add_slider("level", low, high, wide / 100, curve.level)
+        for each in (self.window, self.level):
+            _answer(each, lambda: self._edit(lambda c: c.over(self.window.value, self.level.value)))
+        if not curve.editable:
+            self.gui.add_markdown(f"{len(curve)} points: too many to edit")
             return
-        window, level = self.window.value, self.level.value
-        if self._changed(lambda curve: curve.over(window, level)):
-            self._rows()
+        self.point = self.gui.add_dropdown("point", _names(curve))
+        self.value = self.gui.add_number("value", curve.values[0])
+        self.color = self.gui.add_rgb("color", _rgb(curve, 0))
+        self.opacity = self.gui.add_slider("opacity", 0.0, 1.0, 0.001, curve.opacity(0))
+        more = self.gui.add_button("add a point behind it")
+        less = self.gui.add_button("remove it")
+        _answer(self.point, self._refresh)
+        _answer(self.value, lambda: self._edit(lambda c: c.changed(self._at, value=self.value.value)))
+        _answer(self.opacity, lambda: self._edit(lambda c: c.changed(self._at, opacity=self.opacity.value)))
+        _answer(self.color, lambda: self._edit(lambda c: c.changed(self._at, color=_unit(self.color.value))))
+        more.on_click(_async(lambda: self._edit(lambda c: c.split(self._at))))
+        less.on_click(_async(lambda: self._edit(lambda c: c.without(self._at))))
 
-    def _changed(self, change: Callable[[Curve], Curve]) -> bool:
-        """Change the curve; whether that could be done."""
-        return self.model.apply(lambda s: replace(s, curve=change(s.curve))) is None
+    @property
+    def _at(self) -> int:
+        """Index of the point that is chosen."""
+        return int(self.point.value.partition(":")[0]) - 1
 
-    def _rows(self) -> None:
-        """The controls of each point."""
-        for folder in self._folders:
-            folder.remove()
+    def _edit(self, change: Callable[[Curve], Curve]) -> None:
+        """Change the curve, and let the controls show it."""
+        self.model.apply(lambda state: replace(state, curve=change(state.curve)))
         curve = self.model.state.curve
-        with self.points:
-            if not curve.editable:
-                self._folders = [self.gui.add_markdown(f"{len(curve)} points: too many to edit")]
-                return
-            self._folders = [self._row(curve, index) for index in range(len(curve))]
+        self.window.value, self.level.value = curve.window, curve.level
+        if curve.editable:
+            index = min(self._at, len(curve) - 1)
+            self.point.options = _names(curve)
+            self.point.value = _names(curve)[index]
+            self._refresh()
 
-    def _row(self, curve: Curve, index: int) -> Any:
-        folder = self.gui.add_folder(f"{index + 1}: {curve.values[index]:.5g}", expand_by_default=False)
-        with folder:
-            value = self.gui.add_number("value", curve.values[index])
-            r, g, b = (round(255 * c) for c in curve.display_color(index))
-            color = self.gui.add_rgb("color", (r, g, b))
-            opacity = self.gui.add_slider("opacity", 0.0, 1.0, 0.001, curve.opacity(index))
-            buttons = self.gui.add_button_group("point", ("one more behind", "remove"))
+    def _refresh(self) -> None:
+        """Show the point that is chosen."""
+        curve, index = self.model.state.curve, self._at
+        self.value.value, self.color.value = curve.values[index], _rgb(curve, index)
+        self.opacity.value = curve.opacity(index)
 
-        @value.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None and self._changed(lambda c: c.changed(index, value=value.value)):
-                now = self.model.state.curve
-                folder.label = f"{index + 1}: {now.values[index]:.5g}"
-                self.window.value, self.level.value = now.window, now.level
 
-        @color.on_update
-        async def _(_: Any) -> None:
-            r, g, b = (channel / 255 for channel in color.value)
-            self._changed(lambda c: c.changed(index, color=(r, g, b)))
+def _answer(control: Any, call: Callable[[], Any]) -> None:
+    """Call when a control was changed in the browser; not when this program changed it."""
 
-        @opacity.on_update
-        async def _(_: Any) -> None:
-            self._changed(lambda c: c.changed(index, opacity=opacity.value))
+    @control.on_update
+    async def _(event: Any) -> None:
+        if event.client is not None:
+            call()
 
-        @buttons.on_click
-        async def _(_: Any) -> None:
-            more = buttons.value != "remove"
-            if self._changed(lambda c: c.split(index) if more else c.without(index)):
-                self._rows()
 
-        return folder
+def _async(call: Callable[[], Any]) -> Callable[[Any], Any]:
+    # viser runs coroutines in its loop, one after the other, and plain functions in any order
+    async def called(_: Any) -> None:
+        call()
+
+    return called
+
+
+def _names(curve: Curve) -> tuple[str, ...]:
+    """Of its points."""
+    return tuple(f"{index + 1}: {value:.5g}" for index, value in enumerate(curve.values))
+
+
+def _rgb(curve: Curve, index: int) -> tuple[int, int, int]:
+    r, g, b = (round(255 * channel) for channel in curve.display_color(index))
+    return r, g, b
+
+
+def _unit(color: tuple[int, int, int]) -> tuple[float, float, float]:
+    r, g, b = (channel / 255 for channel in color)
+    return r, g, b

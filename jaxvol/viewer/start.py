@@ -45,6 +45,9 @@ OFFERED: tuple[Transform, ...] = (
 ON = AlphaCorrection, SpaceLeaping, EarlyTermination
 """Those that are on where no march is given."""
 
+STEP = 0.5
+"""Voxels between the samples of a fine image where no march is given."""
+
 SAMPLED = 2_000_000
 """Voxels at most that a range of values is found from."""
 
@@ -94,7 +97,7 @@ def begin(
         voxel,
         given.max_samples,
     )
-    step = 1.0 if march is None else float(given.step) / voxel
+    step = STEP if march is None else float(given.step) / voxel
     state = State(
         Orbit.of(seen),
         Curve.of(transfer, voxel),
