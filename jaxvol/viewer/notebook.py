@@ -109,9 +109,9 @@ class NotebookView(ipywidgets.HBox):
             self.model.zoom(PER_NOTCH ** (-float(event["dy"]) / 100))
         elif kind == "pointer_down":
             self._at = at
-        elif kind == "pointer_up" or not event["buttons"]:
+        elif kind == "pointer_up":
             self._at = None
-        elif self._at is not None:
+        elif self._at is not None and event["buttons"]:  # one without may come late, after the button went down
             ratio = self.canvas.get_pixel_ratio()
             moved = [(new - old) * ratio for new, old in zip(at, self._at, strict=True)]
             self._at = at
@@ -233,7 +233,7 @@ def _box(name: str, on: bool, switch: Callable[[bool], Any]) -> ipywidgets.Check
 
 
 def _button(text: str, tooltip: str) -> ipywidgets.Button:
-    return ipywidgets.Button(description=text, tooltip=tooltip, layout={"width": "30px"})
+    return ipywidgets.Button(description=text, tooltip=tooltip, layout={"width": "30px", "padding": "0"})
 
 
 def _rounded(value: float) -> float:
