@@ -103,6 +103,17 @@ class Page:
             time.sleep(0.02)
         self.mouse("Released", x + dx, y + dy, button="left", clickCount=1)
 
+    def write(self, selector: str, text: str) -> None:
+        """Write text in the first element that matches, in place of what is there, and press Enter."""
+        select = "e => {e.focus(); e.select ? e.select() : getSelection().selectAllChildren(e)}"
+        self.evaluate(f"({select})(document.querySelector({json.dumps(selector)}))")
+        self.call("Input.insertText", text=text)
+        enter = {"key": "Enter", "code": "Enter", "windowsVirtualKeyCode": 13}
+        for kind in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, **enter, **({"text": "\r"} if kind == "keyDown" else {})
+            )
+
     def screenshot(self, path: Path | None = None) -> Any:
         """The window as an array (height, width, 3) of 8 bits; written to `path` if given."""
         png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

@@ -45,7 +45,8 @@ class Model:
     **Arguments:**
 
     - `content`: what is looked at. `state`: how, at first.
-    - `show`: called with each `Frame`, and `tell` with what there is to say, in the thread that draws.
+    - `show`: called with each `Frame`, and `tell` with what there is to say, two lines, in the thread that
+      draws.
     """
 
     def __init__(
@@ -105,10 +106,10 @@ class Model:
         new = drawing.program not in self._pace
         pace = self._pace.setdefault(drawing.program, Pace())
         if new:
-            self._tell("compiling …")
+            self._tell("compiling …\nfor these transforms; the program is kept for the next time")
             begun = time.perf_counter()
             drawing.tile(Grid(1, 1, (SIDE, SIDE)), 0, 0)
-            self._tell(f"compiled in {time.perf_counter() - begun:.1f} s")
+            self._tell(f"compiled in {time.perf_counter() - begun:.1f} s\n")
         fine = Grid.fine(state.size)
         begun, coarser = time.perf_counter(), pace.coarser
         pixels = Drawing(self.content, state, coarser).image(Grid.coarse(state.size, pace.tiles))
@@ -143,12 +144,12 @@ class Model:
         self._tell(f"{_timing(self._last)}, RMSE {drawing.error():.2g} (estimate)")
 
     def _failed(self, fault: Exception) -> None:
-        self._tell(f"not drawn: {' '.join(str(fault).split())}")
+        self._tell(f"not drawn:\n{' '.join(str(fault).split())}")
 
 
 def _timing(frame: Frame) -> str:
     height, width, _ = frame.pixels.shape
-    return f"{frame.stage}: {width} x {height}, step {frame.step:.3g} voxels, {1e3 * frame.seconds:.0f} ms"
+    return f"{frame.stage}: {width} x {height}, step {frame.step:.3g} voxels\n{1e3 * frame.seconds:.0f} ms"
 
 
 def _stretched(pixels: Pixels, grid: Grid) -> UInt8[np.ndarray, "height width 3"]:

@@ -89,7 +89,7 @@ class NotebookView(ipywidgets.HBox):
         self._in_loop(self.canvas.request_draw)
 
     def _tell(self, text: str) -> None:
-        self._in_loop(lambda: setattr(self._status, "value", f"<code>{text}</code>"))
+        self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))
 
     def _in_loop(self, call: Callable[[], Any]) -> None:
         if self._loop is None or self._loop.is_closed():
@@ -111,7 +111,9 @@ class NotebookView(ipywidgets.HBox):
             self._at = at
         elif kind == "pointer_up":
             self._at = None
-        elif self._at is not None and event["buttons"]:  # one without may come late, after the button went down
+        elif (
+            self._at is not None and event["buttons"]
+        ):  # one without may come late, after the button went down
             ratio = self.canvas.get_pixel_ratio()
             moved = [(new - old) * ratio for new, old in zip(at, self._at, strict=True)]
             self._at = at

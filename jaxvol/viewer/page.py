@@ -4,6 +4,7 @@ behind its scene, which is empty."""
 import contextlib
 import io
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -23,7 +24,9 @@ HOST = "127.0.0.1"
 
 OWN_NAMES = {HOST, "localhost"}
 
-JPEG = {"coarse": 75, "drawing": 85, "fine": 92}
+ADD, REMOVE = "add behind", "remove"
+
+JPEG = {"coarse": 85, "drawing": 88, "fine": 94}
 """Quality of the images that are sent."""
 
 
@@ -113,7 +116,7 @@ class _Panel:
 
     def __init__(self, client: viser.ClientHandle, content: Content, state: State):
         self.client, self.gui = client, client.gui
-        self.status = self.gui.add_markdown("starting …")
+        self.status = self.gui.add_markdown("starting …  \n")
         self.model = Model(content, state, self._show, self._tell)
         with self.gui.add_folder("transfer function"):
             self._look(state.curve)
@@ -129,7 +132,7 @@ class _Panel:
         self.client.flush()
 
     def _tell(self, text: str) -> None:
-        self.status.content = f"`{text}`"
+        self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
 
     def _march(self, state: State) -> None:
         step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
@@ -140,7 +143,8 @@ class _Panel:
         _answer(light, lambda: self.model.change(lit=bool(light.value)))
 
     def _switch(self, name: str, on: bool) -> None:
-        box = self.gui.add_checkbox(name, on)
+        may_wrap = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", name)  # where words meet
+        box = self.gui.add_checkbox(may_wrap, on)
         _answer(box, lambda: self.model.apply(lambda s: s.with_transform(name, bool(box.value))))
 
     def _look(self, curve: Curve) -> None:
@@ -157,14 +161,13 @@ class _Panel:
         self.value = self.gui.add_number("value", curve.values[0])
         self.color = self.gui.add_rgb("color", _rgb(curve, 0))
         self.opacity = self.gui.add_slider("opacity", 0.0, 1.0, 0.001, curve.opacity(0))
-        more = self.gui.add_button("add a point behind it")
-        less = self.gui.add_button("remove it")
+        number = self.gui.add_button_group("points", (ADD, REMOVE))
         _answer(self.point, self._refresh)
         _answer(self.value, lambda: self._edit(lambda c: c.changed(self._at, value=self.value.value)))
         _answer(self.opacity, lambda: self._edit(lambda c: c.changed(self._at, opacity=self.opacity.value)))
         _answer(self.color, lambda: self._edit(lambda c: c.changed(self._at, color=_unit(self.color.value))))
-        more.on_click(_async(lambda: self._edit(lambda c: c.split(self._at))))
-        less.on_click(_async(lambda: self._edit(lambda c: c.without(self._at))))
+        change = {ADD: Curve.split, REMOVE: Curve.without}
+        number.on_click(_async(lambda: self._edit(lambda c: change[number.value](c, self._at))))
 
     @property
     def _at(self) -> int:
