@@ -6,7 +6,6 @@ composited front to back into a `Rendering`.
 """
 
 from . import bricks as bricks, datasets as datasets, lighting as lighting, metrics as metrics
-from ._util.programs import keep_programs as keep_programs
 from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
 from .camera import Camera as Camera
 from .compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
@@ -53,6 +52,7 @@ from .phantoms import (
 )
 from .planning import Plan as Plan
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
+from .programs import keep_programs as keep_programs
 from .projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays

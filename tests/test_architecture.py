@@ -18,6 +18,7 @@ ROOT = Path(jv.__file__).parent
 
 ORDER = [
     "_util",
+    "programs",
     "volume",
     "occupancy",
     "variation",

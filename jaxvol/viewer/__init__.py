@@ -6,12 +6,12 @@ while it changes and fine at rest) has two faces, `notebook` and `page`, which o
 
 from typing import TYPE_CHECKING, Any
 
-from .._util.programs import keep_programs_by_default
 from ..camera import Camera
 from ..compositing import Compositing
 from ..lighting.shading import Lighting
 from ..march import March
 from ..modes import Mode
+from ..programs import keep_programs_by_default
 from ..transfer import TransferFunction
 from ..volume import Volume
 from .start import begin

@@ -89,7 +89,11 @@ def test_changes_need_no_other_program(shown):
     before = Drawing(content, state)
     before.tile(Grid(1, 1, (SIDE, SIDE)), 0, 0)
     compiled: list[str] = []
-    jax.monitoring.register_event_duration_secs_listener(lambda event, _, **__: compiled.append(event))
+
+    def note(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
     after = Drawing(content, changed, 4.0)
     pixels = after.tile(Grid.fine(changed.size), 1, 1)
     assert after.program == before.program
@@ -184,7 +188,7 @@ def test_grids_cover_the_view_without_gaps():
 
 def test_the_pace_settles_on_what_is_fast_enough():
     def settled(seconds_per_tile):
-        pace = Pace()
+        pace, taken = Pace(), 0.0
         for _ in range(20):
             taken = pace.tiles * seconds_per_tile * (0.4 + 0.6 / pace.coarser)
             pace.took(taken, 100)

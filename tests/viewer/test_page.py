@@ -11,6 +11,7 @@ import jaxvol as jv
 
 viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
 client = pytest.importorskip("websockets.sync.client")
+exceptions = pytest.importorskip("websockets.exceptions")
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def received(page, origin: str) -> int:
                 count += 1
         except TimeoutError:
             return count
-        except client.ConnectionClosed if hasattr(client, "ConnectionClosed") else Exception:
+        except exceptions.ConnectionClosed:
             return -1 if count == 0 else count
         return count
 
@@ -49,7 +50,7 @@ def test_it_is_bound_to_this_machine_alone(page):
     with socket.create_connection(("127.0.0.1", page.port), timeout=5):
         pass
     # an address of this machine, too, but not the one that it is bound to
-    with pytest.raises(OSError, match="refused|timed out"):
+    with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.2", page.port), timeout=5)
 
 
