@@ -3,9 +3,9 @@ viewer take to start, with and without kept programs?
 
 Headless Chromium shows each face, on the same machine as the viewer: it draws without a GPU and takes its
 share of the cores. A move of the pointer is timed from the browser's event until the next coarse image is
-there: in the notebook, until the `<img>` has loaded it; on the page, until it has arrived (the browser decodes
-it and draws it after that). Moves come at rest; while a fine image is being drawn; and 60 times a second, in
-a drag.
+there: in the notebook, until the `<img>` has loaded it; on the page, until it has arrived (the browser
+decodes it and draws it after that). Moves come at rest; while a fine image is being drawn; and 60 times a
+second, in a drag.
 """
 
 import json
@@ -45,8 +45,9 @@ addEventListener('pointermove', () => moves.push(performance.now()), true);
 const arrived = width => requestAnimationFrame(() => images.push([performance.now(), width]));
 const watched = image => image.addEventListener('load', () => arrived(image.naturalWidth));
 const jpegWidth = bytes => {
-  for (let i = 2; i + 9 < bytes.length; i += 2 + bytes[i + 2] * 256 + bytes[i + 3])
-    if (bytes[i] == 0xff && bytes[i + 1] >= 0xc0 && bytes[i + 1] <= 0xc2) return bytes[i + 7] * 256 + bytes[i + 8];
+  let i = 2;
+  while (bytes[i + 1] < 0xc0 || bytes[i + 1] > 0xc2) i += 2 + bytes[i + 2] * 256 + bytes[i + 3];
+  return bytes[i + 7] * 256 + bytes[i + 8];
 };
 const messages = data => Array.isArray(data) ? data : data?.messages ?? [data];
 window.Worker = class extends Worker {
@@ -71,10 +72,18 @@ jv.keep_programs(sys.argv[3])
 volume = jv.load(sys.argv[2])
 how = {"lighting": None, "lit": True, "compositing": "over", "background": (1, 1, 1), "size": (640, 480)}
 scene = begin(volume, jv.preset("head", unit_distance=0.01), None, None, **how)
-ready = time.time()
-model = Model(*scene, lambda frame: (print(time.time() - begun, ready - begun, flush=True), model.close()), print)
+seconds = []
+
+
+def show(frame):
+    seconds.append(time.time() - begun)
+    model.close()
+
+
+model = Model(*scene, show, lambda text: None)
 model.draw()
 model._worker._thread.join()
+print(seconds[0])
 """
 
 
@@ -196,7 +205,7 @@ def starts(file: Path, repetitions: int) -> dict[str, Any]:
                     text=True,
                     check=True,
                 )
-                taken.append(float(next(w for w in ran.stdout.splitlines() if w[:1].isdigit()).split()[0]))
+                taken.append(float(ran.stdout))
     return {name: summary(taken) for name, taken in seconds.items()}
 
 
@@ -213,7 +222,7 @@ def main(chosen: Namespace) -> common.Answer:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         head = jv.phantom("head", resolution)
-        file = jv.save(folder / "head.npz", head)
+        file = jv.save(head, folder / "head.npz")
         begun = {} if chosen.quick else starts(file, 3)
         for face, shown in FACES.items():
             found[face] = {}
@@ -222,9 +231,7 @@ def main(chosen: Namespace) -> common.Answer:
                 own.mkdir()
                 with shown(file, own, lit=lit) as watched:
                     found[face][light] = watched.measure(repetitions)
-                print(
-                    face, light, json.dumps({k: v for k, v in found[face][light].items()})[:400], flush=True
-                )
+                print(face, light, json.dumps(found[face][light])[:400], flush=True)
     result = {"voxels": resolution, "goal": GOAL, "faces": found, "seconds until the first image": begun}
     return result, lambda path: draw(result, path)
 
