@@ -171,9 +171,7 @@ def on_page(file: Path, folder: Path, *, lit: bool) -> Iterator[Watched]:
         assert server.stdout is not None
         url = server.stdout.readline().split()[1]
         # the panel takes 384 pixels
-        with opened("about:blank", 640 + 384, 480 + 140) as page:
-            page.call("Page.addScriptToEvaluateOnNewDocument", source=HOOK)
-            page.call("Page.navigate", url=url)
+        with opened(url, 640 + 384, 480 + 140, HOOK) as page:
             page.wait_for("document.body.innerText.includes('march and light')", SECONDS)
             yield Watched(page, _middle(page, "document.querySelector('canvas')"))
     finally:
@@ -214,7 +212,7 @@ def starts(file: Path, repetitions: int) -> dict[str, Any]:
     "How long after the pointer moves does the viewer's coarse image follow?",
     __doc__,
     resolution=256,
-    repetitions=15,
+    repetitions=12,
 )
 def main(chosen: Namespace) -> common.Answer:
     resolution, repetitions = (48, 2) if chosen.quick else (chosen.resolution, chosen.repetitions)
@@ -223,7 +221,7 @@ def main(chosen: Namespace) -> common.Answer:
         folder = Path(name)
         head = jv.phantom("head", resolution)
         file = jv.save(head, folder / "head.npz")
-        begun = {} if chosen.quick else starts(file, 3)
+        begun = {} if chosen.quick else starts(file, 2)
         for face, shown in FACES.items():
             found[face] = {}
             for light, lit in (("unlit", False), ("lit", True)):

@@ -123,8 +123,9 @@ class Page:
 
 
 @contextmanager
-def opened(page: Path | str, width: int = 1400, height: int = 1000) -> Iterator[Page]:
-    """The page, loaded: a file, without a network; or the address of a server."""
+def opened(page: Path | str, width: int = 1400, height: int = 1000, script: str = "") -> Iterator[Page]:
+    """The page, loaded: a file, without a network; or the address of a server. `script`: JavaScript that runs
+    before its own."""
     assert CHROMIUM is not None
     to_browser, writing = os.pipe()
     reading, from_browser = os.pipe()
@@ -151,6 +152,8 @@ def opened(page: Path | str, width: int = 1400, height: int = 1000) -> Iterator[
             if isinstance(page, Path):
                 offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
                 browser.call("Network.emulateNetworkConditions", **offline)
+            browser.call("Page.enable")
+            browser.call("Page.addScriptToEvaluateOnNewDocument", source=script)
             url = page.resolve().as_uri() if isinstance(page, Path) else page
             browser.call("Page.navigate", url=url)
             loaded = f"{url.partition(':')[0]}:complete"
