@@ -36,6 +36,7 @@ from . import (
     shading,
     speed,
     stability,
+    viewer_latency,
 )
 from .command import command
 
@@ -69,6 +70,7 @@ DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "shading": lambda result, path: shading.draw(result["scenes"], path),
     "speed": speed.draw,
     "stability": stability.draw_chart,
+    "viewer_latency": viewer_latency.draw,
 }
 """By the name of a record, what draws its result."""
 

@@ -53,6 +53,7 @@ from .phantoms import (
 )
 from .planning import Plan as Plan
 from .presets import PRESETS as PRESETS, colormap as colormap, preset as preset
+from .programs import keep_programs as keep_programs
 from .projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
@@ -71,4 +72,5 @@ from .transforms import (
     SpaceLeaping as SpaceLeaping,
     ToroidalMap as ToroidalMap,
 )
+from .viewer import serve as serve, view as view
 from .volume import Field as Field, Volume as Volume

@@ -20,6 +20,7 @@ from .commands.plan import add_plan
 from .commands.recorded import own_version
 from .commands.render import add_render
 from .commands.settings import parsed
+from .commands.view import add_view
 from .figures import add_figures
 
 
@@ -119,4 +120,5 @@ def _parser() -> argparse.ArgumentParser:
     add_figures(commands, shared)
     add_info(commands, shared)
     add_datasets(commands, shared)
+    add_view(commands, shared)
     return parser

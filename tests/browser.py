@@ -1,19 +1,24 @@
-"""Opens a page in headless Chromium, and points and clicks at it.
+"""Opens a page in headless Chromium, points, clicks and drags, and looks at it.
 
 Chromium is driven by its own protocol (JSON messages that end in a zero byte) over two pipes, its file
 descriptors 3 and 4, so that no driver and no port is needed.
 """
 
+import base64
+import io
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from skimage.io import imread
 
 
 NAMES = "chromium", "chromium-browser", "google-chrome"
@@ -76,15 +81,57 @@ class Page:
             how = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **how)
 
+    def wait_for(self, expression: str, seconds: float = 120) -> Any:
+        """Wait until a JavaScript expression is true. Returns its value."""
+        end = time.monotonic() + seconds
+        while not (value := self.evaluate(expression)):
+            assert time.monotonic() < end, f"not within {seconds} s: {expression}"
+            time.sleep(0.05)
+        return value
+
+    def mouse(self, kind: str, x: float, y: float, **how: Any) -> None:
+        """A mouse event: `"Moved"`, `"Pressed"`, `"Released"` or `"Wheel"`."""
+        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **how)
+
+    def drag(self, start: tuple[float, float], by: tuple[float, float], steps: int = 10) -> None:
+        """Drag with the left button, in equal steps of 20 ms."""
+        (x, y), (dx, dy) = start, by
+        self.mouse("Moved", x, y)
+        self.mouse("Pressed", x, y, button="left", buttons=1, clickCount=1)
+        for step in range(1, steps + 1):
+            self.mouse("Moved", x + dx * step / steps, y + dy * step / steps, button="left", buttons=1)
+            time.sleep(0.02)
+        self.mouse("Released", x + dx, y + dy, button="left", clickCount=1)
+
+    def write(self, selector: str, text: str) -> None:
+        """Write text in the first element that matches, in place of what is there, and press Enter."""
+        select = "e => {e.focus(); e.select ? e.select() : getSelection().selectAllChildren(e)}"
+        self.evaluate(f"({select})(document.querySelector({json.dumps(selector)}))")
+        self.call("Input.insertText", text=text)
+        enter = {"key": "Enter", "code": "Enter", "windowsVirtualKeyCode": 13}
+        for kind in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, **enter, **({"text": "\r"} if kind == "keyDown" else {})
+            )
+
+    def screenshot(self, path: Path | None = None) -> Any:
+        """The window as an array (height, width, 3) of 8 bits; written to `path` if given."""
+        png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        if path is not None:
+            path.write_bytes(png)
+        return imread(io.BytesIO(png))[..., :3]
+
 
 @contextmanager
-def opened(page: Path, width: int = 1400, height: int = 1000) -> Iterator[Page]:
-    """The page, loaded, without a network."""
+def opened(page: Path | str, width: int = 1400, height: int = 1000, script: str = "") -> Iterator[Page]:
+    """The page, loaded: a file, without a network; or the address of a server. `script`: JavaScript that runs
+    before its own."""
     assert CHROMIUM is not None
     to_browser, writing = os.pipe()
     reading, from_browser = os.pipe()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         switches = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe"]
+        switches += ["--enable-unsafe-swiftshader"]  # WebGL without a GPU
         switches += [f"--user-data-dir={profile}", f"--window-size={width},{height}"]
         ends = to_browser, from_browser
         program = subprocess.Popen(
@@ -102,10 +149,15 @@ def opened(page: Path, width: int = 1400, height: int = 1000) -> Iterator[Page]:
             browser.session = attached["sessionId"]
             browser.call("Runtime.enable")
             browser.call("Network.enable")
-            offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
-            browser.call("Network.emulateNetworkConditions", **offline)
-            browser.call("Page.navigate", url=page.resolve().as_uri())
-            while browser.evaluate("location.protocol + document.readyState") != "file:complete":
+            if isinstance(page, Path):
+                offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+                browser.call("Network.emulateNetworkConditions", **offline)
+            browser.call("Page.enable")
+            browser.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+            url = page.resolve().as_uri() if isinstance(page, Path) else page
+            browser.call("Page.navigate", url=url)
+            loaded = f"{url.partition(':')[0]}:complete"
+            while browser.evaluate("location.protocol + document.readyState") != loaded:
                 pass
             yield browser
         finally:

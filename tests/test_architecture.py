@@ -18,6 +18,7 @@ ROOT = Path(jv.__file__).parent
 
 ORDER = [
     "_util",
+    "programs",
     "volume",
     "occupancy",
     "variation",
@@ -53,6 +54,7 @@ ORDER = [
     "bricks",
     "fitting",
     "unseen",
+    "viewer",
     "figures",
     "commands",
     "cli",

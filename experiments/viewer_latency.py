@@ -1,0 +1,263 @@
+"""How long after the pointer moves does the viewer's coarse image follow, in either face, and how long does a
+viewer take to start, with and without kept programs?
+
+Headless Chromium shows each face, on the same machine as the viewer: it draws without a GPU and takes its
+share of the cores. A move of the pointer is timed from the browser's event until the next coarse image is
+there: in the notebook, until the `<img>` has loaded it; on the page, until it has arrived (the browser
+decodes it and draws it after that). Moves come at rest; while a fine image is being drawn; and 60 times a
+second, in a drag.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.viewer.tiles import SIDE
+from tests.browser import Page, opened
+from tests.viewer.notebook_server import notebook
+
+from . import common
+from .common import plt
+
+
+GOAL = 0.15
+"""Seconds."""
+
+SECONDS = 300
+"""Longest wait."""
+
+REST = "document.body.innerText.includes('(estimate)')"
+
+HOOK = """
+window.moves = []; window.images = [];
+addEventListener('pointermove', () => moves.push(performance.now()), true);
+const arrived = width => requestAnimationFrame(() => images.push([performance.now(), width]));
+const watched = image => image.addEventListener('load', () => arrived(image.naturalWidth));
+const jpegWidth = bytes => {
+  let i = 2;
+  while (bytes[i + 1] < 0xc0 || bytes[i + 1] > 0xc2) i += 2 + bytes[i + 2] * 256 + bytes[i + 3];
+  return bytes[i + 7] * 256 + bytes[i + 8];
+};
+const messages = data => Array.isArray(data) ? data : data?.messages ?? [data];
+window.Worker = class extends Worker {
+  constructor(...how) {
+    super(...how);
+    this.addEventListener('message', event => {
+      for (const each of messages(event.data))
+        if (each?.type == 'BackgroundImageMessage') arrived(jpegWidth(each.rgb_data));
+    });
+  }
+};
+"""
+"""Notes when the pointer moves and when images arrive, and how wide these are."""
+
+START = """
+import sys, time
+begun = float(sys.argv[1])
+import jaxvol as jv
+from jaxvol.viewer.model import Model
+from jaxvol.viewer.start import begin
+jv.keep_programs(sys.argv[3])
+volume = jv.load(sys.argv[2])
+how = {"lighting": None, "lit": True, "compositing": "over", "background": (1, 1, 1), "size": (640, 480)}
+scene = begin(volume, jv.preset("head", unit_distance=0.01), None, None, **how)
+seconds = []
+
+
+def show(frame):
+    seconds.append(time.time() - begun)
+    model.close()
+
+
+model = Model(*scene, show, lambda text: None)
+model.draw()
+model._worker._thread.join()
+print(seconds[0])
+"""
+
+
+class Watched:
+    """A face that is timed. `middle`: of its image, (x, y)."""
+
+    def __init__(self, page: Page, middle: tuple[float, float]):
+        self.page, self.middle = page, middle
+
+    def rest(self) -> None:
+        self.page.wait_for(REST, SECONDS)
+        time.sleep(1)
+
+    def move(self, x: float) -> None:
+        """Move the pointer to this many pixels beside the middle; the button is down."""
+        self.page.mouse("Moved", self.middle[0] + x, self.middle[1], button="left", buttons=1)
+
+    def measure(self, repetitions: int) -> dict[str, Any]:
+        """Seconds until coarse images follow."""
+        self.rest()
+        self.page.mouse("Pressed", *self.middle, button="left", buttons=1, clickCount=1)
+        for number in range(40):  # until the pace has settled
+            self.move(number % 20)
+            time.sleep(0.05)
+        found: dict[str, Any] = {}
+        for name, pause in (("at rest", None), ("while a fine image is drawn", 0.4)):
+            seconds = []
+            for number in range(repetitions):
+                self.rest() if pause is None else time.sleep(pause)
+                seconds.append(self._follows(15 * (1 + number % 2)))
+            found[name] = summary(seconds)
+        found["between images of a drag"] = summary(self._drag())
+        self.page.mouse("Released", *self.middle, button="left", clickCount=1)
+        widths = [width for _, width in self.page.evaluate("images") if width % SIDE == 0]
+        return found | {"coarse images are this wide": max(set(widths), key=widths.count)}
+
+    def _follows(self, x: float) -> float:
+        self.page.evaluate("moves.length = images.length = 0")
+        self.move(x)
+        coarse = f"images.find(each => each[0] > moves[0] && each[1] % {SIDE} == 0)"
+        arrived, _ = self.page.wait_for(coarse, SECONDS)
+        return (arrived - self.page.evaluate("moves[0]")) / 1000
+
+    def _drag(self) -> list[float]:
+        self.page.evaluate("moves.length = images.length = 0")
+        begun = time.monotonic()
+        for number in range(180):
+            self.move(number / 2)
+            time.sleep(max(0, begun + (number + 1) / 60 - time.monotonic()))
+        images = self.page.evaluate("images.filter(each => each[0] < moves.at(-1)).map(each => each[0])")
+        return (np.diff(images) / 1000).tolist()
+
+
+def summary(seconds: list[float]) -> dict[str, Any]:
+    low, middle, high = np.quantile(seconds, (0.1, 0.5, 0.9))
+    numbers = {"median": middle, "10 %": low, "90 %": high, "most": max(seconds)}
+    return {k: round(float(v), 4) for k, v in numbers.items()} | {"all": [round(s, 4) for s in seconds]}
+
+
+@contextmanager
+def in_notebook(file: Path, folder: Path, *, lit: bool) -> Iterator[Watched]:
+    look = 'jv.preset("head", unit_distance=0.01)'
+    cells = ["import jaxvol as jv", f"v = jv.view(jv.load({str(file)!r}), {look}, lit={lit})", "v"]
+    with notebook(cells, folder) as page:
+        page.wait_for("document.querySelector('.renderview-view') && true", SECONDS)
+        image = "document.querySelector('.renderview-view')"
+        page.evaluate(f"{image}.scrollIntoView({{block: 'center'}})")
+        page.evaluate(f"{HOOK}; watched({image}); 1")
+        yield Watched(page, _middle(page, image))
+
+
+@contextmanager
+def on_page(file: Path, folder: Path, *, lit: bool) -> Iterator[Watched]:
+    transfer = jv.write_transfer(folder / "look.json", jv.preset("head", unit_distance=0.01))
+    command = [
+        "view",
+        str(file),
+        "--transfer",
+        str(transfer),
+        "--no-browser",
+        *([] if lit else ["--no-shade"]),
+    ]
+    server = subprocess.Popen([sys.executable, "-m", "jaxvol", *command], stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        url = server.stdout.readline().split()[1]
+        # the panel takes 384 pixels
+        with opened(url, 640 + 384, 480 + 140, HOOK) as page:
+            page.wait_for("document.body.innerText.includes('march and light')", SECONDS)
+            yield Watched(page, _middle(page, "document.querySelector('canvas')"))
+    finally:
+        server.kill()
+        server.wait()
+
+
+def _middle(page: Page, element: str) -> tuple[float, float]:
+    x, y, width, height = page.evaluate(
+        f"(r => [r.x, r.y, r.width, r.height])({element}.getBoundingClientRect())"
+    )
+    return x + width / 2, y + height / 2
+
+
+FACES = {"notebook": in_notebook, "page": on_page}
+
+
+def starts(file: Path, repetitions: int) -> dict[str, Any]:
+    """Seconds from the start of a process until its first image, as a model without a face shows it."""
+    seconds: dict[str, list[float]] = {"nothing kept": [], "kept programs": []}
+    settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    for _ in range(repetitions):
+        with tempfile.TemporaryDirectory() as folder:
+            for taken in seconds.values():
+                ran = subprocess.run(
+                    [sys.executable, "-c", START, str(time.time()), str(file), folder],
+                    env=settings,
+                    capture_output=True,
+                    text=True,
+                    check=True,
+                )
+                taken.append(float(ran.stdout))
+    return {name: summary(taken) for name, taken in seconds.items()}
+
+
+@common.experiment(
+    "viewer_latency",
+    "How long after the pointer moves does the viewer's coarse image follow?",
+    __doc__,
+    resolution=256,
+    repetitions=12,
+)
+def main(chosen: Namespace) -> common.Answer:
+    resolution, repetitions = (48, 2) if chosen.quick else (chosen.resolution, chosen.repetitions)
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        head = jv.phantom("head", resolution)
+        file = jv.save(head, folder / "head.npz")
+        begun = {} if chosen.quick else starts(file, 2)
+        for face, shown in FACES.items():
+            found[face] = {}
+            for light, lit in (("unlit", False), ("lit", True)):
+                own = folder / f"{face} {light}"
+                own.mkdir()
+                with shown(file, own, lit=lit) as watched:
+                    found[face][light] = watched.measure(repetitions)
+                print(face, light, json.dumps(found[face][light])[:400], flush=True)
+    result = {"voxels": resolution, "goal": GOAL, "faces": found, "seconds until the first image": begun}
+    return result, lambda path: draw(result, path)
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    """A dot for each time, a bar at the median."""
+    figure, panel = plt.subplots(figsize=(9, 4.2), layout="constrained")
+    labels, place = [], 0
+    for face, lights in result["faces"].items():
+        for light, kinds in lights.items():
+            for kind in ("at rest", "while a fine image is drawn", "between images of a drag"):
+                seconds = 1000 * np.array(kinds[kind]["all"])
+                panel.plot(seconds, np.full(len(seconds), place), "o", color="tab:blue", alpha=0.35, ms=5)
+                panel.plot(np.median(seconds), place, "|", color="black", ms=16, mew=2)
+                labels.append(f"{face}, {light}: {kind}")
+                place += 1
+    panel.axvline(1000 * result["goal"], color="tab:red", ls="--")
+    panel.text(1000 * result["goal"], -0.7, " goal", color="tab:red", va="center")
+    panel.set_yticks(range(len(labels)), labels)
+    panel.invert_yaxis()
+    panel.set_xlim(left=0)
+    panel.set_xlabel(
+        "milliseconds from a move of the pointer to the next coarse image; in a drag, from image to image"
+    )
+    voxels = result["voxels"]
+    panel.set_title(f"How soon the viewer follows: head phantom, {voxels}³ voxels (black: median)")
+    common.save(figure, path)
+
+
+if __name__ == "__main__":
+    main()

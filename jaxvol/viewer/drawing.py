@@ -1,0 +1,105 @@
+"""How is a tile drawn, and how far is the image from the converged one?"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from ..camera import Camera
+from ..compositing import Compositing
+from ..display import to_srgb
+from ..metrics import rmse
+from ..render import render
+from ..volume import Volume
+from .state import Choices, State
+from .tiles import SIDE, Grid
+
+
+Pixels = UInt8[np.ndarray, "height width 3"]
+"""sRGB of a view or a part of it."""
+
+LEFT_ORDER, OTHER_ORDER = 1, 2
+"""With which power of the step the error of a march falls."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What does not change while a volume is looked at.
+
+    - `compositing`: how cells become a pixel. `background`: linear RGB.
+    """
+
+    volume: Volume
+    choices: Choices
+    compositing: Compositing[Any]
+    background: tuple[float, float, float]
+
+
+class Drawing:
+    """One state of a viewer, ready to be drawn. `coarser`: how many times as long as the state's the steps
+    are."""
+
+    def __init__(self, content: Content, state: State, coarser: float = 1.0):
+        self.content, self.state = content, state
+        self.march = content.choices.march(state, coarser)
+        self.lighting = content.choices.light(state)
+        self.transfer = state.curve.padded()
+
+    @property
+    def program(self) -> tuple[Any, ...]:
+        """What another program must be compiled for."""
+        return (self.state.on, self.state.lit, self.transfer.values.shape)
+
+    def tile(self, grid: Grid, column: int, row: int) -> Pixels:
+        """The pixels of a tile."""
+        rgba = self._rgba(grid, column, row)
+        return np.asarray(_displayed(rgba, np.asarray(self.content.background, np.float32)))
+
+    def image(self, grid: Grid) -> Pixels:
+        """All tiles."""
+        width, height = grid.size
+        pixels = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.uint8)
+        for column, row in grid.inside_out():
+            pixels[place(column, row)] = self.tile(grid, column, row)
+        return pixels[:height, :width]
+
+    def error(self) -> float:
+        """How far the image's linear colours are from the converged ones because of the step, as an RMSE: an
+        estimate, from one tile stretched over the view, and the same with steps of half the length.
+
+        It takes the error to fall with the square of the step, and with the step under
+        `quadrature="left"`; where steps are longer than what is seen, it falls by other amounts. What
+        `EarlyTermination` adds is not in it."""
+        whole = Grid(1, 1, (SIDE, SIDE))
+        finer = Drawing(self.content, self.state, 0.5)
+        images = [np.asarray(each._rgba(whole, 0, 0)) for each in (self, finer)]
+        order = LEFT_ORDER if self.content.choices.quadrature == "left" else OTHER_ORDER
+        background = np.asarray(self.content.background, np.float32)
+        over = [image[..., :3] + (1 - image[..., 3:]) * background for image in images]
+        return float(rmse(*over)) * 2**order / (2**order - 1)
+
+    def camera(self, grid: Grid, column: int, row: int) -> Camera:
+        """The camera of a tile."""
+        width, height = self.state.size
+        window = grid.window(column, row, width / height)
+        return self.state.orbit.camera((SIDE, SIDE), window, (column * SIDE, row * SIDE))
+
+    def _rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
+        camera = self.camera(grid, column, row)
+        how = {"compositing": self.content.compositing, "lighting": self.lighting, "outputs": "rgba"}
+        return render(self.content.volume, self.transfer, camera, self.march, **how).rgba
+
+
+def place(column: int, row: int) -> tuple[slice, slice]:
+    """Where the pixels of a tile lie in the image."""
+    return slice(row * SIDE, (row + 1) * SIDE), slice(column * SIDE, (column + 1) * SIDE)
+
+
+@partial(jax.jit)
+def _displayed(rgba: Float[Array, "height width 4"], background: Float[Array, "3"]) -> UInt8[Array, "..."]:
+    linear = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None, :]
+    return jnp.round(255 * to_srgb(linear)).astype(jnp.uint8)

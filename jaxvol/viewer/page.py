@@ -1,0 +1,224 @@
+"""A viewer as a page of its own, by viser: it turns the camera in the browser, and the image is what lies
+behind its scene, which is empty."""
+
+import contextlib
+import io
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import viser
+
+from .curve import Curve
+from .drawing import Content
+from .model import Frame, Model
+from .orbit import Orbit
+from .state import State
+
+
+HOST = "127.0.0.1"
+
+OWN_NAMES = {HOST, "localhost"}
+
+ADD, REMOVE = "add behind", "remove"
+
+JPEG = {"coarse": 85, "drawing": 88, "fine": 94}
+"""Quality of the images that are sent."""
+
+
+class _Server(viser.ViserServer):
+    """viser's server without what leaves this machine."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """None: no tunnel to a public address, which any client could ask for otherwise."""
+        return None
+
+
+class Page:
+    """What `serve` returns: a server of pages on which a volume is looked at.
+
+    Each page (tab of a browser) has a view of its own.
+
+    - `url`: to open in a browser. `port`: on which it is served.
+    - `models`: of the pages that are open, by viser's numbers of clients.
+    - `close()` ends it.
+    """
+
+    def __init__(self, content: Content, state: State, *, port: int = 8080, title: str = "jaxvol"):
+        self._content, self._state = content, state
+        low, high = (np.asarray(corner, np.float64) for corner in content.volume.corners)
+        # viser's cameras have limits that suit scenes of about this size
+        self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
+        self.models: dict[int, Model] = {}
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
+            self._server = _Server(host=HOST, port=port, label=title, verbose=False)
+        self.port = self._server.get_port()
+        self.url = f"http://localhost:{self.port}"
+        self._server._websock_server.on_client_connect(self._only_own_pages)
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self._server.gui.main_panel.dock_right()
+        self._server.scene.set_up_direction(tuple(state.orbit.view_up))
+        first = self._server.initial_camera
+        first.up = tuple(state.orbit.view_up)
+        first.position, first.look_at = (
+            self._shown(state.orbit.position),
+            self._shown(state.orbit.focal_point),
+        )
+        first.fov = math.radians(state.orbit.view_angle)
+        self._server.on_client_connect(self._opened)
+        self._server.on_client_disconnect(self._closed)
+
+    def close(self) -> None:
+        """Serve no more."""
+        for model in list(self.models.values()):
+            model.close()
+        self._server.stop()
+
+    async def _only_own_pages(self, connection: Any) -> None:
+        """Any page that a browser shows may connect to a port of this machine; viser takes them all."""
+        socket = self._server._websock_server._live_connections[connection.client_id]
+        request = socket.request
+        origin = urlsplit(request.headers.get("Origin", "") if request else "")
+        if origin.hostname not in OWN_NAMES or origin.port != self.port:
+            await socket.close(1008, "this viewer is shown by its own pages only")
+
+    def _shown(self, point: np.ndarray) -> np.ndarray:
+        """A world point in viser's scene."""
+        return (point - self._center) / self._radius
+
+    def _orbit(self, camera: viser.CameraHandle) -> Orbit:
+        """The camera of a page."""
+        position, focal = (self._center + self._radius * v for v in (camera.position, camera.look_at))
+        return Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
+
+    async def _opened(self, client: viser.ClientHandle) -> None:
+        panel = _Panel(client, self._content, self._state)
+        self.models[client.client_id] = panel.model
+
+        @client.camera.on_update
+        async def _(camera: viser.CameraHandle) -> None:
+            panel.look(self._orbit(camera), camera.image_width, camera.image_height)
+
+        panel.look(self._orbit(client.camera), client.camera.image_width, client.camera.image_height)
+
+    async def _closed(self, client: viser.ClientHandle) -> None:
+        model = self.models.pop(client.client_id, None)
+        if model is not None:
+            model.close()
+
+
+class _Panel:
+    """The controls of one page."""
+
+    def __init__(self, client: viser.ClientHandle, content: Content, state: State):
+        self.client, self.gui = client, client.gui
+        self.status = self.gui.add_markdown("starting …  \n")
+        self.model = Model(content, state, self._show, self._tell)
+        with self.gui.add_folder("transfer function"):
+            self._look(state.curve)
+        with self.gui.add_folder("march and light"):
+            self._march(state)
+
+    def look(self, orbit: Orbit, width: float, height: float) -> None:
+        """From where, and at how many pixels."""
+        self.model.apply(lambda state: replace(state.with_size(width, height), orbit=orbit))
+
+    def _show(self, frame: Frame) -> None:
+        self.client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=JPEG[frame.stage])
+        self.client.flush()
+
+    def _tell(self, text: str) -> None:
+        self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
+
+    def _march(self, state: State) -> None:
+        step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
+        _answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
+        for name in self.model.content.choices.names:
+            self._switch(name, name in state.on)
+        light = self.gui.add_checkbox("light", state.lit)
+        _answer(light, lambda: self.model.change(lit=bool(light.value)))
+
+    def _switch(self, name: str, on: bool) -> None:
+        may_wrap = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", name)  # where words meet
+        box = self.gui.add_checkbox(may_wrap, on)
+        _answer(box, lambda: self.model.apply(lambda s: s.with_transform(name, bool(box.value))))
+
+    def _look(self, curve: Curve) -> None:
+        wide = max(curve.window, 1e-12)
+        low, high = curve.values[0] - wide, curve.values[-1] + wide
+        self.window = self.gui.add_slider("window", wide / 100, 4 * wide, wide / 100, wide)
+        self.level = self.gui.add_slider("level", low, high, wide / 100, curve.level)
+        for each in (self.window, self.level):
+            _answer(each, lambda: self._edit(lambda c: c.over(self.window.value, self.level.value)))
+        if not curve.editable:
+            self.gui.add_markdown(f"{len(curve)} points: too many to edit")
+            return
+        self.point = self.gui.add_dropdown("point", _names(curve))
+        self.value = self.gui.add_number("value", curve.values[0])
+        self.color = self.gui.add_rgb("color", _rgb(curve, 0))
+        self.opacity = self.gui.add_slider("opacity", 0.0, 1.0, 0.001, curve.opacity(0))
+        number = self.gui.add_button_group("points", (ADD, REMOVE))
+        _answer(self.point, self._refresh)
+        _answer(self.value, lambda: self._edit(lambda c: c.changed(self._at, value=self.value.value)))
+        _answer(self.opacity, lambda: self._edit(lambda c: c.changed(self._at, opacity=self.opacity.value)))
+        _answer(self.color, lambda: self._edit(lambda c: c.changed(self._at, color=_unit(self.color.value))))
+        change = {ADD: Curve.split, REMOVE: Curve.without}
+        number.on_click(_async(lambda: self._edit(lambda c: change[number.value](c, self._at))))
+
+    @property
+    def _at(self) -> int:
+        """Index of the point that is chosen."""
+        return int(self.point.value.partition(":")[0]) - 1
+
+    def _edit(self, change: Callable[[Curve], Curve]) -> None:
+        """Change the curve, and let the controls show it."""
+        self.model.apply(lambda state: replace(state, curve=change(state.curve)))
+        curve = self.model.state.curve
+        self.window.value, self.level.value = curve.window, curve.level
+        if curve.editable:
+            index = min(self._at, len(curve) - 1)
+            self.point.options = _names(curve)
+            self.point.value = _names(curve)[index]
+            self._refresh()
+
+    def _refresh(self) -> None:
+        """Show the point that is chosen."""
+        curve, index = self.model.state.curve, self._at
+        self.value.value, self.color.value = curve.values[index], _rgb(curve, index)
+        self.opacity.value = curve.opacity(index)
+
+
+def _answer(control: Any, call: Callable[[], Any]) -> None:
+    """Call when a control was changed in the browser; not when this program changed it."""
+
+    @control.on_update
+    async def _(event: Any) -> None:
+        if event.client is not None:
+            call()
+
+
+def _async(call: Callable[[], Any]) -> Callable[[Any], Any]:
+    # viser runs coroutines in its loop, one after the other, and plain functions in any order
+    async def called(_: Any) -> None:
+        call()
+
+    return called
+
+
+def _names(curve: Curve) -> tuple[str, ...]:
+    """Of its points."""
+    return tuple(f"{index + 1}: {value:.5g}" for index, value in enumerate(curve.values))
+
+
+def _rgb(curve: Curve, index: int) -> tuple[int, int, int]:
+    r, g, b = (round(255 * channel) for channel in curve.display_color(index))
+    return r, g, b
+
+
+def _unit(color: tuple[int, int, int]) -> tuple[float, float, float]:
+    r, g, b = (channel / 255 for channel in color)
+    return r, g, b

@@ -1,0 +1,136 @@
+"""How does a viewer begin? A scene as `render` takes it becomes what is shown and what can be changed."""
+
+from typing import Any
+
+import numpy as np
+from skimage.filters import threshold_otsu
+
+from .._util.checks import described
+from ..arguments import check_arguments
+from ..camera import Camera
+from ..compositing import Compositing
+from ..display import from_srgb
+from ..lighting import Phong
+from ..lighting.shading import Lighting
+from ..march import March, Transform
+from ..modes import Mode, compositing_of
+from ..occupancy import BLOCK
+from ..space import node_distance
+from ..transfer import TransferFunction, extinction_of
+from ..transforms import (
+    AdaptiveSampling,
+    AlphaCorrection,
+    EarlyTermination,
+    EmptySpaceJitter,
+    Jitter,
+    SpaceLeaping,
+)
+from ..volume import Volume
+from .curve import Curve
+from .drawing import Content
+from .orbit import Orbit
+from .state import Choices, State
+
+
+OFFERED: tuple[Transform, ...] = (
+    EmptySpaceJitter(seed=0),
+    Jitter(seed=0),
+    AdaptiveSampling(0.005),
+    AlphaCorrection(),
+    SpaceLeaping(),
+    EarlyTermination(1 / 256),
+)
+"""Transforms that can be turned on, beside those that are given."""
+
+ON = AlphaCorrection, SpaceLeaping, EarlyTermination
+"""Those that are on where no march is given."""
+
+STEP = 0.5
+"""Voxels between the samples of a fine image where no march is given."""
+
+SAMPLED = 2_000_000
+"""Voxels at most that a range of values is found from."""
+
+
+def begin(
+    volume: Volume | Any,
+    transfer: TransferFunction | Any | None,
+    camera: Camera | Any | None,
+    march: March | Any | None,
+    *,
+    lighting: Lighting | Any | None,
+    lit: bool,
+    compositing: Mode | Compositing[Any] | Any,
+    background: Any,
+    size: tuple[int, int],
+) -> tuple[Content, State]:
+    """What is looked at, and how at first. Arguments as for `view`.
+
+    **Raises:** `ValueError` as `render` does, for a transfer function that is no `TransferFunction`, and for
+    an orthographic camera."""
+    if transfer is not None and not isinstance(transfer, TransferFunction):
+        raise ValueError(f"the viewer shows a TransferFunction; got {described(transfer)}.")
+    if not isinstance(volume, Volume):
+        check_arguments("view(volume, transfer, camera, march)", volume=volume)
+    seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
+    given = March(1.0) if march is None else march
+    transfer = default_transfer(volume) if transfer is None else transfer
+    check_arguments(
+        "view(volume, transfer, camera, march)",
+        volume=volume,
+        transfer=transfer,
+        camera=seen,
+        march=given,
+        lighting=lighting,
+    )
+    color = tuple(map(float, np.asarray(background, np.float64)))
+    if len(color) != 3 or not np.isfinite(color).all():
+        raise ValueError(f"background must be linear RGB; got {background!r}.")
+    own = {type(transform) for transform in given.transforms}
+    others = tuple(transform for transform in OFFERED if type(transform) not in own)
+    on = own if march is not None else set(ON)
+    voxel = _voxel(volume, given)
+    choices = Choices(
+        (*given.transforms, *others),
+        Phong() if lighting is None else lighting,
+        "midpoint" if march is None else given.quadrature,
+        voxel,
+        given.max_samples,
+    )
+    step = STEP if march is None else float(given.step) / voxel
+    state = State(
+        Orbit.of(seen),
+        Curve.of(transfer, voxel),
+        (1, 1),
+        1.0,
+        frozenset(kind.__name__ for kind in on),
+        lit or lighting is not None,
+    )
+    state = state.with_step(step).with_size(*size)
+    return Content(volume, choices, compositing_of(compositing), (color[0], color[1], color[2])), state
+
+
+def _voxel(volume: Volume, march: March) -> float:
+    """World length between nodes: the median, over the volume, of the least distance."""
+    blocks = tuple(-(-n // BLOCK) for n in volume.shape)
+    return float(np.median(np.asarray(node_distance(march.locate(volume), blocks))))
+
+
+def default_transfer(volume: Volume) -> TransferFunction:
+    """A transfer function for a volume of which nothing is known: transparent up to Otsu's threshold between
+    the values of what is there and of what is around it; from there on, from a dark and thin foot, which
+    draws contours, to bright and dense."""
+    data = np.asarray(volume.data)
+    values = data.ravel()[:: max(1, data.size // SAMPLED)].astype(np.float32)
+    low, high = float(values.min()), float(np.percentile(values, 99.9))
+    high = high if high > low else low + 1
+    foot = float(threshold_otsu(values)) if values.max() > low else low
+    foot = min(max(foot, low), low + 0.95 * (high - low))
+    parts = (0, 0.12, 0.4, 1)
+    colors = ((0.25, 0.15, 0.1), (0.6, 0.4, 0.3), (0.95, 0.85, 0.7), (1, 1, 1))
+    opacities = (0.0, 0.04, 0.25, 0.8)
+    unit = float(np.min(np.asarray(volume.spacing)))
+    linear = from_srgb(np.asarray(colors, np.float32))
+    return TransferFunction(
+        [foot + part * (high - foot) for part in parts], linear, extinction_of(opacities, unit)
+    )

@@ -1,0 +1,77 @@
+"""Who may connect to the page of `jaxvol view`, and what can a client make it do?"""
+
+import socket
+import time
+
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+
+viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
+client = pytest.importorskip("websockets.sync.client")
+exceptions = pytest.importorskip("websockets.exceptions")
+
+
+@pytest.fixture(scope="module")
+def page():
+    volume = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
+    served = jv.serve(volume, jv.colormap("gray", (0, 26), n_colors=4), port=18080)
+    yield served
+    served.close()
+
+
+def received(page, origin: str) -> int:
+    """Messages that a client from a page of this origin receives within a second; -1: it was sent away."""
+    protocol = f"viser-v{viser.__version__}"
+    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=[protocol]) as connection:
+        count, end = 0, time.monotonic() + 1
+        try:
+            while (left := end - time.monotonic()) > 0:
+                connection.recv(timeout=left)
+                count += 1
+        except TimeoutError:
+            return count
+        except exceptions.ConnectionClosed:
+            return -1 if count == 0 else count
+        return count
+
+
+def test_only_its_own_pages_may_connect(page):
+    """Any page that the browser shows may open a connection to a port of this machine."""
+    assert received(page, page.url) > 0
+    assert received(page, f"http://127.0.0.1:{page.port}") > 0
+    for origin in ("https://example.org", f"http://example.org:{page.port}", "http://localhost:1", "null"):
+        assert received(page, origin) == -1
+
+
+def test_it_is_bound_to_this_machine_alone(page):
+    with socket.create_connection(("127.0.0.1", page.port), timeout=5):
+        pass
+    # an address of this machine, too, but not the one that it is bound to
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.2", page.port), timeout=5)
+
+
+def test_no_client_can_publish_it(page):
+    """A message of viser's asks for a tunnel to a public address."""
+    assert page._server.request_share_url() is None
+    assert page._server._share_tunnel is None
+
+
+def test_paths_outside_of_the_client_are_not_served(page):
+    for path in ("/../../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd"):
+        with socket.create_connection(("127.0.0.1", page.port), timeout=5) as connection:
+            connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            answer = connection.recv(1 << 16)
+        assert b"root:" not in answer
+        assert not answer.startswith(b"HTTP/1.1 200")
+
+
+def test_the_camera_of_a_page_is_that_of_the_volume(page):
+    """viser's scene has the size of 1, whatever the volume's."""
+    orbit = page._state.orbit
+    again = page._center + page._radius * page._shown(orbit.position)
+    np.testing.assert_allclose(again, orbit.position)
+    assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
