@@ -188,7 +188,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set_xlabel(f"time of an image / that of jaxvol, {pixels} x {pixels} pixels", fontsize=9)
         panel.text(GOAL, -0.55, " goal", va="top", fontsize=8)
         panel.set_title(
-            "Right of 1: slower than jaxvol, whose own time and\nerror stand below each scene; bars: 95 % intervals",
+            "Right of 1: slower than jaxvol, whose own time and\n"
+            "error stand below a scene; bars: 95 % intervals",
             fontsize=9,
         )
     shown = [name for name in PEERS if any(name in r for v in volumes.values() for r in v.values())]
