@@ -186,15 +186,14 @@ def draw(result: dict[str, Any], path: Path) -> None:
             if key == "loads":
                 panel.set_xscale("log", base=2)
                 panel.xaxis.set_major_formatter("{x:g}")
-        theirs.set_xlabel("printed overlap, %" if key == "overlap" else "number of bricks", fontsize=8)
+        of_paper = "printed overlap, %" if key == "overlap" else "number of bricks"
+        theirs.set_xlabel(f"{of_paper} (names: bricks along β, σ and γ)", fontsize=8)
         ours.set_xlabel("overlap by the formula, %" if key == "overlap" else "bricks read", fontsize=8)
         if key == "overlap":
             for panel in (theirs, ours):
                 panel.axvline(3, color="0.7", linewidth=0.8)
     axes[0, 0].set_title("the paper's rates; its rule: overlap below 3 % (grey line)", fontsize=9)
-    axes[0, 1].set_title(
-        "the paper's rates; named (bricks along each axis): slow although below 3 %", fontsize=9
-    )
+    axes[0, 1].set_title("the paper's rates; named: slow although below 3 %", fontsize=9)
     for panel in axes[1]:
         panel.set_title("measured here", fontsize=9)
     common.save(figure, path)

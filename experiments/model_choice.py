@@ -190,7 +190,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
             truths = [c["truth"] for c in counts.values()]
             right.bar(places, more, width, truths, color="none", edgecolor=f"C{shift + 4}", hatch="////")
         right.set(xticks=range(len(RULES)), ylabel="trials")
-        right.set_title("filled: the truth was chosen; hatched: more than it has", fontsize=9)
+        right.set_title("filled: truth chosen; hatched: too many", fontsize=9)
         right.set_xticklabels(["choose", "BIC", "least held-out loss"], fontsize=8)
         right.set_ylim(0, 1.25 * right.get_ylim()[1])
         right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)

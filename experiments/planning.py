@@ -315,10 +315,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set_xticks(range(len(TOLERANCES)), [f"{t:g}" for t in TOLERANCES])
         panel.set_xlabel("tolerance (RMSE of the image)", fontsize=9)
         panel.set_xlim(-0.5, len(TOLERANCES) - 0.5)
-    errors.set_title(
-        f"{len(result['scenes'])} random scenes, side by side; below 1: within the tolerance", fontsize=9
-    )
-    times.set_title("some of them, beside an exhaustive search; below 1: faster than it found", fontsize=9)
+    errors.set_title(f"{len(result['scenes'])} random scenes; below 1: within the tolerance", fontsize=9)
+    times.set_title("some of them; below 1: faster than a search found", fontsize=9)
     common.save(figure, path)
 
 
