@@ -128,15 +128,16 @@ def test_images_are_shown_side_by_side_pixel_by_pixel(monkeypatch):
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     monkeypatch.setattr(plt, "show", lambda: None)
     ramp = np.linspace(0, 1, 20 * 30 * 3, dtype=np.float32).reshape(20, 30, 3)
     grey = np.random.default_rng(0).random((16, 24), np.float32)
     jv.show_images({"ramp": ramp, "grey": grey, "again": ramp[::-1]}, columns=2)
-    figure = plt.gcf()
-    figure.canvas.draw()
-    page = np.asarray(figure.canvas.buffer_rgba())[..., :3]
-    plt.close(figure)
+    canvas = FigureCanvasAgg(plt.gcf())
+    canvas.draw()
+    page = np.asarray(canvas.buffer_rgba())[..., :3]
+    plt.close()
 
     row = 20 + display.TITLE + display.GAP
     assert page.shape == (2 * row, 2 * (30 + display.GAP) + display.GAP, 3)
