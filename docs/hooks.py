@@ -24,6 +24,7 @@ OUTSIDE = (
     "CONTRIBUTING.md",
     "CITATION.cff",
     "jaxvol/**/*.py",
+    "notebooks/*.ipynb",
     "experiments/**/*.py",
     "experiments/results/*.md",
     "experiments/results/*.png",

@@ -166,6 +166,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         for method, of in (("overlap", "proposed"), ("reload", "reload")):
             at = [p["overlap"] if key == "overlap" else rows[n]["bricks"] for n, p in paper.items()]
             theirs.plot(at, [p[of] for p in paper.values()], styles[method], label=f"paper, {of}", alpha=0.7)
+        theirs.margins(x=0.12)  # room for names
         for name, p in paper.items():
             if p["overlap"] < 3 and p["proposed"] < 10:
                 x = p["overlap"] if key == "overlap" else rows[name]["bricks"]
@@ -175,7 +176,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
             rates = [1 / row[method]["seconds"] for row in rows.values()]
             ours.plot(at, rates, style, label=method, alpha=0.7)
         whole_ = [1 / row[WHOLE]["seconds"] for row in rows.values()]
-        ours.axhline(float(np.median(whole_)), color="0.5", linestyle="--", label="whole")
+        ours.axhline(float(np.median(whole_)), color="0.5", linestyle="--", label="the whole volume at once")
         for panel in (theirs, ours):
             panel.set_yscale("log")
             panel.set_ylabel("frames per second", fontsize=8)
@@ -185,12 +186,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
             if key == "loads":
                 panel.set_xscale("log", base=2)
                 panel.xaxis.set_major_formatter("{x:g}")
-        theirs.set_xlabel("printed overlap, %" if key == "overlap" else "number of bricks", fontsize=8)
+        of_paper = "printed overlap, %" if key == "overlap" else "number of bricks"
+        theirs.set_xlabel(f"{of_paper} (names: bricks along β, σ and γ)", fontsize=8)
         ours.set_xlabel("overlap by the formula, %" if key == "overlap" else "bricks read", fontsize=8)
         if key == "overlap":
             for panel in (theirs, ours):
                 panel.axvline(3, color="0.7", linewidth=0.8)
-    axes[0, 0].set_title("the paper's rates; its rule: overlap below 3 % (line)", fontsize=9)
+    axes[0, 0].set_title("the paper's rates; its rule: overlap below 3 % (grey line)", fontsize=9)
     axes[0, 1].set_title("the paper's rates; named: slow although below 3 %", fontsize=9)
     for panel in axes[1]:
         panel.set_title("measured here", fontsize=9)

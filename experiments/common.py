@@ -4,6 +4,7 @@ import math
 import os
 from argparse import Namespace
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,7 +21,6 @@ from .scenes import Scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.ticker import NullFormatter
 
 
 FINER = 8
@@ -119,13 +119,14 @@ def plain_numbers(panel: Any) -> None:
     for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
         if axis.get_scale() == "log" and low > 0:
             axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(_few if high / low < 30 else NullFormatter())
+            leads = (2, 3, 5, 7) if high / low < 6 else (2, 5) if high / low < 30 else ()
+            axis.set_minor_formatter(partial(_labelled, leads))
 
 
-def _few(value: float, _: Any) -> str:
-    """Labels at 2 and 5 between powers of ten."""
+def _labelled(leads: tuple[int, ...], value: float, _: Any) -> str:
+    """The label of a value that is one of these digits times a power of ten; of others, none."""
     lead = value / 10 ** math.floor(math.log10(value))
-    return f"{value:g}" if round(lead, 6) in (2, 5) else ""
+    return f"{value:g}" if round(lead, 6) in leads else ""
 
 
 def save(figure: Any, path: Path) -> None:

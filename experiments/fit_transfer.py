@@ -125,7 +125,8 @@ def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
         len(result), 2, figsize=(9, 3 * len(result)), squeeze=False, layout="constrained"
     )
     for (left, right), (scene, rows) in zip(axes, result.items(), strict=True):
-        right.plot(rows["truth"]["values"], rows["truth"]["extinction"], "k-", linewidth=3, alpha=0.3)
+        truth = rows["truth"]
+        right.plot(truth["values"], truth["extinction"], "k-", linewidth=3, alpha=0.3, label="the truth")
         for name, style in ((KNOWN, "C0.-"), (EVEN, "C3.-")):
             row = rows[name]
             least = min(row["psnr held out"])
@@ -136,7 +137,7 @@ def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
         left.axhline(GOAL, color="k", linestyle=":", linewidth=0.8)
         left.text(0.99, GOAL, f"goal, {GOAL:g} dB", transform=left.get_yaxis_transform(), **UNDER)
         left.set(xlabel="step of the fit", ylabel=f"{scene}\nPSNR of the views seen, dB")
-        right.set(xlabel="value", ylabel="extinction, 1/length (grey: the truth)")
+        right.set(xlabel="value", ylabel="extinction, 1/length")
         right.legend(fontsize=8)
     common.save(figure, path)
 

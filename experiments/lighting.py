@@ -29,7 +29,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
-from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
 from jaxvol.lighting import (
@@ -47,7 +46,7 @@ from jaxvol.metrics import rmse
 from . import common, timing
 from .common import plt
 from .light_filter import filtered
-from .scenes import Scene, skin_head
+from .scenes import SKIN, Scene, skin_head
 
 
 GOALS = {"templates": 2.2, "baked": 1.2}
@@ -214,15 +213,13 @@ def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str,
 
 
 def pictures(templates: int, seed: int, path: Path, size: int, resolution: int) -> None:
-    """Save the head without light and with it, side by side, under skin that nothing shows through."""
+    """Save the head without light and with it, side by side, under skin that nothing shows through: where
+    bone lies just below the surface, it has the colour of skin, too."""
     scene = skin_head(size, resolution)
-    # at 8 bits and a border of one voxel, normals follow the grid, and shaded they show rings
-    smooth = gaussian_filter(np.asarray(scene.volume.data, np.float32), 1.0)
-    volume = jv.Volume(smooth, scene.volume.spacing, scene.volume.origin)
-    # of one colour, since bones come within a voxel of the surface
-    colors = jnp.broadcast_to(scene.transfer.colors[1], scene.transfer.colors.shape)
+    foot, skin = scene.transfer.colors[0], scene.transfer.colors[1]
+    colors = jnp.stack([(foot + skin) / 2, *[skin] * (len(SKIN) - 1)])  # the foot draws the outlines
     opaque = replace(scene.transfer, colors=colors, extinction=OPAQUE * scene.transfer.extinction)
-    scene = scene._replace(volume=volume, transfer=opaque, step=scene.step / 4)
+    scene = scene._replace(transfer=opaque, step=scene.step / 4)
     lit = ScattererTemplates(FLESH, LIGHTS, templates=templates, blend=True)
     figure, axes = plt.subplots(1, 2, figsize=(2 * size / 90, size / 90 + 0.4), layout="constrained")
     titles = {
@@ -237,7 +234,7 @@ def pictures(templates: int, seed: int, path: Path, size: int, resolution: int) 
 
 
 OPAQUE = 10.0
-"""Times the extinction of the skin that is measured, through which bones shine."""
+"""Times the extinction of the skin that is measured, through which bones shine, in the picture."""
 
 
 ASIDE = {

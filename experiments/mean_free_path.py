@@ -182,13 +182,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
     left.set(
         xlabel="step of the fit",
         ylabel="mean squared difference of the images",
-        title="three materials, from three times off",
+        title="λ of three materials, from starts 3 times off",
     )
     rows = result["one ball"]
     names = {
-        "templates": "renders of templates",
-        KNOWN: f"path traced, {KNOWN}",
-        TIED: f"path traced, {TIED}",
+        "templates": "from images by templates",
+        KNOWN: f"from path-traced images, {KNOWN}",
+        TIED: f"from path-traced images, {TIED}",
     }
     for (name, label), mark in zip(names.items(), ("ko", "C0s", "C3^"), strict=True):
         known = [row for row in rows if not row[name]["undetermined"] and np.isfinite(row[name]["ratio"])]
@@ -197,10 +197,16 @@ def draw(result: dict[str, Any], path: Path) -> None:
         )
     lost = [row["thickness"] for row in rows if row["templates"]["undetermined"]]
     if lost:
-        right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label="said to be undetermined")
+        right.plot(
+            lost,
+            np.ones(len(lost)),
+            "kx",
+            markersize=9,
+            label="from images by templates: said to be undetermined",
+        )
     right.axhline(1, color="k", linewidth=0.8)
     right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
-    right.set_title("one ball, in two views")
+    right.set_title("λ of one ball, from two views")
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     common.save(figure, path)
 

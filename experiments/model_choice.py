@@ -169,16 +169,17 @@ def draw(result: dict[str, Any], path: Path) -> None:
     for (left, middle, right), (name, problem) in zip(axes, problems.items(), strict=True):
         numbers = [row["numbers"] for row in next(iter(problem["trials"].values()))[0]["candidates"]]
         for axis, (noise, trials) in zip((left, middle), problem["trials"].items(), strict=True):
+            seen = "images without noise" if float(noise) == 0 else f"images with noise of {noise}"
             for trial in trials:
                 losses = [max(row["held_out_loss"], LEAST) for row in trial["candidates"]]
                 color, at = f"C{trial['truth']}", trial["chosen"]
                 axis.plot(losses, f"{color}-", linewidth=0.8, alpha=0.6)
                 axis.plot(at, losses[at], f"{color}o" if at == trial["truth"] else f"{color}X", markersize=6)
             axis.set(yscale="log", xticks=range(len(numbers)), xticklabels=problem["labels"])
-            axis.set(xlabel=name, ylabel="held-out loss", title=f"images with noise of {noise}")
+            axis.set(xlabel=f"{name} of the fitted model", ylabel="loss in held-out views", title=seen)
         for truth, label in enumerate(problem["labels"][:TRUTHS]):
             left.plot([], [], f"C{truth}o-", label=f"truth {label}")
-        left.legend(fontsize=7, title="marker: chosen", title_fontsize=7)
+        left.legend(fontsize=7, title="marker: chosen\n(a cross: not the truth)", title_fontsize=7)
         width = 0.35
         for shift, (noise, counts) in enumerate(problem["summary"].items()):
             places = np.arange(len(RULES)) + (shift - 0.5) * width
@@ -189,7 +190,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
             truths = [c["truth"] for c in counts.values()]
             right.bar(places, more, width, truths, color="none", edgecolor=f"C{shift + 4}", hatch="////")
         right.set(xticks=range(len(RULES)), ylabel="trials")
-        right.set_title("filled: truth chosen; hatched: more", fontsize=9)
+        right.set_title("filled: truth chosen; hatched: too many", fontsize=9)
         right.set_xticklabels(["choose", "BIC", "least held-out loss"], fontsize=8)
         right.set_ylim(0, 1.25 * right.get_ylim()[1])
         right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)

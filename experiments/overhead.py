@@ -43,6 +43,8 @@ CONDITIONS = {
     "all samples": Condition((), 1.02),
     "as in the paper": Condition((jv.SpaceLeaping(), jv.EarlyTermination(ENDED)), 1.05),
 }
+SHOWN = {"as in the paper": "leaps and early ends, as in the paper"}
+"""How a condition is called in the chart, where not as in the record."""
 
 
 def measure(scene: Scene, repetitions: int, seed: int, condition: Condition) -> dict[str, Any]:
@@ -80,7 +82,9 @@ def draw(conditions: dict[str, Any], sizes: Sequence[int], path: Path) -> None:
                 panel.plot(ratio["median"], y, "o", color=color, label=label)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(goal, color="k", linewidth=0.8, linestyle=":")
-        panel.set_title(f"{condition}, {pixels} x {pixels} pixels; dotted: goal, {goal}", fontsize=9)
+        panel.set_title(
+            f"{SHOWN.get(condition, condition)}, {pixels} x {pixels} pixels; dotted: goal, {goal}", fontsize=9
+        )
         panel.set_yticks(range(volumes), list(measured))
     axes[0, 0].invert_yaxis()
     figure.supxlabel(

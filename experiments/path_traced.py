@@ -23,6 +23,15 @@ from . import common, timing
 from .common import plt
 
 
+EXPLAINED = (
+    "The head phantom, lit from the left.\n"
+    "hard, soft: scatterer templates under\nhard and soft occlusion, one of several\nfor each pixel; "
+    "blended: all of them;\nbaked: light computed once, on a grid.\n"
+    "error: RMSE of the radiance against the\npath-traced image, after the one factor\n"
+    "that brings the image nearest to it.\n"
+    "noise: standard error of a pixel.\nWhite is the same radiance in all."
+)
+"""The text beside the images."""
 TRACED, UNLIT = "path traced", "unlit"
 LIGHTS = (DirectionalLight((0.9, 0.2, -0.5), (2.0, 2.0, 1.9)), ConstantLight((0.12, 0.12, 0.14)))
 MATERIALS = (
@@ -95,14 +104,15 @@ def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> Non
     figure, axes = plt.subplots(2, columns, figsize=(3 * columns, 7.4), layout="constrained")
     for axis in axes.flat[len(images) :]:
         axis.set_axis_off()
+    axes.flat[-1].text(0, 1, EXPLAINED, va="top", fontsize=9, linespacing=1.5, wrap=True)
     white = np.quantile(images[TRACED], 0.995)  # shown as white in all images
     for axis, (name, image) in zip(axes.flat, images.items(), strict=False):
         axis.imshow(jv.to_srgb(np.clip(image / white, 0, 1)))
         row = rows[name]
         caption = (
-            f"error {row['rmse']:.3f}\n{row['ratio']['median']:.1f} × unlit"
+            f"error {row['rmse']:.3f}, {row['ratio']['median']:.1f} × the time unlit"
             if "rmse" in row
-            else (f"noise {row['standard error']:.3f}\n{row['seconds']:.1f} s, first image")
+            else f"noise {row['standard error']:.3f}, {row['seconds']:.1f} s with compilation"
         )
         axis.set(title=name, xlabel=caption, xticks=[], yticks=[])
     common.save(figure, path)
@@ -113,7 +123,7 @@ def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> Non
     "How near do scatterer templates come to path tracing, and in what time?",
     __doc__,
     repetitions=3,
-    size=128,
+    size=256,
     resolution=96,
     paths=128,
     templates={"type": int, "default": 8, "help": "for each material"},

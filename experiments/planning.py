@@ -316,7 +316,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set_xlabel("tolerance (RMSE of the image)", fontsize=9)
         panel.set_xlim(-0.5, len(TOLERANCES) - 0.5)
     errors.set_title(f"{len(result['scenes'])} random scenes; below 1: within the tolerance", fontsize=9)
-    times.set_title("some of them, searched exhaustively", fontsize=9)
+    times.set_title("some of them; below 1: faster than a search found", fontsize=9)
     common.save(figure, path)
 
 

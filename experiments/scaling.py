@@ -131,11 +131,12 @@ def draw(found: dict[str, Any], path: Path) -> None:
             "devices, parts of one host" if found["platform"] == "cpu" else "devices", fontsize=9
         )
         panel.tick_params(labelsize=8)
-        panel.legend(fontsize=8)
+        if panel is strong:
+            panel.legend(fontsize=8)
         panel.grid(alpha=0.3)
     strong.set_title(f"one image of {found['pixels']}² pixels", fontsize=9)
     strong.set_ylabel("time over that without devices=", fontsize=9)
-    weak.set_title(f"{found['pixels a device']}² pixels for each device", fontsize=9)
+    weak.set_title(f"an image of {found['pixels a device']}² pixels for each device", fontsize=9)
     weak.set_ylabel("time over that of one device", fontsize=9)
     common.save(figure, path)
 

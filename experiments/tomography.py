@@ -194,14 +194,20 @@ def measure(truth: Density, views: int, photons: float | None, setting: Setting,
 
 def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
-    size = (12.4, 3.3 * len(result) + 3.2)
+    size = (13.4, 3.5 * len(result) + 3.2)
     figure = plt.figure(figsize=size, layout=ConstrainedLayoutEngine(h_pad=0.08))
-    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(3.3 * len(result), 3))
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(3.5 * len(result), 3))
+    white = 0.8 * truth.max()
+    upper.suptitle(
+        f"The middle slice of {truth.shape[2]}; grey: density, from 0 to {white:.2g} / voxel. "
+        "The errors are of the whole volume; beside RMSE stands PSNR.",
+        fontsize=9,
+    )
     shown = upper.subplots(len(result), 1 + len(METHODS), squeeze=False)
     for number, (line, (photons, rows)) in enumerate(zip(shown, result.items(), strict=True)):
         pictures = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}
         for panel, (name, picture) in zip(line, pictures.items(), strict=True):
-            panel.imshow(picture, cmap="gray", vmin=0, vmax=0.8 * truth.max())
+            panel.imshow(picture, cmap="gray", vmin=0, vmax=white)
             panel.set(xticks=[], yticks=[])
             caption = f"RMSE {rows[name]['rmse']:.5f}, {rows[name]['psnr']:.1f} dB" if name in rows else ""
             panel.set_xlabel(caption, fontsize=9)
@@ -216,7 +222,9 @@ def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
             by_time.loglog([row["seconds"] for row in rows[name]["all"]], errors, color + line)
         for panel in (by_count, by_time):
             panel.axhline(rows[FBP]["rmse"], color="0.5", linestyle=line, label=f"{FBP}, {photons}")
-    by_count.set(xlabel="sweep over all views (SART), evaluation (jaxvol)", ylabel="RMSE, 1/voxel")
+    by_count.set(
+        xlabel="sweep over all views (SART), evaluation (jaxvol)", ylabel="RMSE of the density, 1/voxel"
+    )
     by_time.set(xlabel="seconds, compilation left out")
     by_count.legend(fontsize=7)
     common.save(figure, path)

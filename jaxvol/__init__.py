@@ -14,6 +14,7 @@ from .display import (
     from_srgb as from_srgb,
     save_image as save_image,
     save_png as save_png,
+    show_images as show_images,
     to_srgb as to_srgb,
 )
 from .fitting import (

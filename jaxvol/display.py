@@ -1,14 +1,16 @@
-"""How is linear colour saved as an image file? The sRGB curve, and the file formats."""
+"""How is linear colour shown, and saved as an image file? The sRGB curve, and the file formats."""
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from ._util.checks import Arrayable, described, output_file
+from ._util.checks import Arrayable, described, integer, output_file
 from ._util.whole_files import whole_file
 
 
@@ -109,6 +111,64 @@ def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")
     return save_image(path, linear)
+
+
+GAP, TITLE = 6, 20
+"""Pixels between images that are shown side by side, and of the line above each that names it."""
+
+
+def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -> None:
+    """Draw linear images side by side, each under its name, with matplotlib: one pixel of the page for each
+    of theirs, since resampling would hide what samples do. It is for notebooks, where the picture appears
+    under the cell.
+
+    **Arguments:**
+
+    - `images`: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
+      Values outside of [0, 1] are clipped. Sizes may differ.
+    - `columns`: how many images stand in a row at most.
+
+    **Raises:** `ValueError` for no image, an image of another shape, NaN, and a number of columns below 1.
+    """
+    if not isinstance(images, Mapping) or not images:
+        raise ValueError(
+            f"images must be a dict of at least one image, such as {{'head': ...}}; got {described(images)}."
+        )
+    shown = {str(name): _displayed(name, image) for name, image in images.items()}
+    columns = min(integer("columns", columns, 1), len(shown))
+    rows = math.ceil(len(shown) / columns)
+    height, width = (max(image.shape[axis] for image in shown.values()) for axis in (0, 1))
+    across, down = columns * (width + GAP) + GAP, rows * (height + TITLE + GAP)
+
+    import matplotlib.pyplot as plt  # here: slow to import, and only pictures need it
+
+    figure = plt.figure(figsize=(across / 100, down / 100), dpi=100)
+    for place, (name, image) in enumerate(shown.items()):
+        row, column = divmod(place, columns)
+        left, top = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE
+        box = left, down - top - image.shape[0], image.shape[1], image.shape[0]
+        axes = figure.add_axes(np.divide(box, (across, down, across, down)).tolist())
+        axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="none")
+        axes.set_axis_off()
+        axes.set_title(name, fontsize=9, loc="left", pad=3)
+    plt.show()
+
+
+def _displayed(name: Any, image: Any) -> Float[np.ndarray, "height width *channels"]:
+    try:
+        linear = np.asarray(image, np.float32)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(
+            f"images[{name!r}] must be an array of numbers; got {described(image)}. For a Rendering, pass "
+            "rendering.image()."
+        ) from fault
+    if 0 in linear.shape or (linear.ndim != 2 and linear.shape[2:] != (3,)):
+        raise ValueError(
+            f"images[{name!r}] must have shape (height, width, 3) or (height, width); got {linear.shape}."
+        )
+    if np.isnan(linear).any():
+        raise ValueError(f"images[{name!r}] must not be NaN; {np.isnan(linear).sum()} of its values are.")
+    return np.asarray(to_srgb(linear))
 
 
 CHANNELS: dict[str, tuple[int, ...]] = {

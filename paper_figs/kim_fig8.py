@@ -25,7 +25,7 @@ EYE = (0.0, -290.0, 40.0)
 TITLES = {"naive": "no overlap, each read once", "overlap": "overlap"}
 
 
-@figure(__doc__, resolution=240, size=240)
+@figure(__doc__, resolution=240)
 def main(chosen: Namespace) -> None:
     volume, probe = phantom(chosen.resolution, "uint8")
     transfer = jv.TransferFunction.from_points(FLESH)

@@ -31,7 +31,7 @@ def draw(measured: dict[str, Any], path: Path) -> None:
         float(np.median([1 / rows[n][WHOLE]["seconds"] for n in names])),
         color="0.5",
         linestyle="--",
-        label="whole",
+        label="the whole volume at once",
     )
     best = ",".join(map(str, BEST))
     for panel, title in ((theirs, "the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels"), (ours, None)):

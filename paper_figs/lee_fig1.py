@@ -39,7 +39,10 @@ def draw(axes: Axes, template: ScattererTemplate) -> None:
 @figure(__doc__)
 def main(chosen: Namespace) -> None:
     skin = jv.Material(OPACITY, 1.0, INDEX)
-    page, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
+    page, axes = plt.subplots(1, 2, figsize=(9, 4.6), layout="constrained")
+    page.suptitle(
+        "Discs: photons, as large as their light; +: the sample; red ring: the centre of light", fontsize=9
+    )
     for panel, packets, title in zip(axes, (1, 4), ("one packet", "four packets"), strict=True):
         template = jv.scatterer_template(skin, 0, packets=packets, threshold=THRESHOLD)
         draw(panel, template)

@@ -83,6 +83,10 @@ def veiled(place: Place, voxel: float) -> np.ndarray:
     return np.maximum(ball(place, voxel), VEIL * veil)
 
 
+TITLE = (
+    "Lee, Kwon and Shin: the steps of shading, one at a time. "
+    "Numbers: mean linear red, green and blue of what is visible"
+)
 STEPS: dict[str, tuple[Look, Look]] = {
     "1: photons nearer to the light": (
         Look("a sky, nearer to all", ball, lights=(ConstantLight((4.0, 4.0, 4.0)),)),
@@ -139,7 +143,7 @@ def render(look: Look, resolution: int, size: int) -> tuple[np.ndarray, np.ndarr
 
 @figure(__doc__, resolution=96)
 def main(chosen: Namespace) -> None:
-    page = Page(len(STEPS), 2, chosen.size, "Lee, Kwon and Shin: the steps of shading, one at a time")
+    page = Page(len(STEPS), 2, chosen.size, TITLE)
     for column, (title, looks) in enumerate(STEPS.items()):
         for row, look in enumerate(looks):
             image, visible = render(look, chosen.resolution, chosen.size)

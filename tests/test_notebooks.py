@@ -1,5 +1,6 @@
-"""Do the notebooks run from the first cell to the last?"""
+"""Do the notebooks run from the first cell to the last, and are their pictures large enough?"""
 
+import re
 import sys
 from pathlib import Path
 
@@ -10,8 +11,8 @@ nbformat = pytest.importorskip("nbformat", reason="pip install -e '.[notebooks]'
 nbclient = pytest.importorskip("nbclient", reason="pip install -e '.[notebooks]'")
 pytest.importorskip("ipykernel", reason="pip install -e '.[notebooks]'")
 
-FOLDER = Path(__file__).parent.parent / "notebooks"
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 @pytest.fixture
@@ -24,16 +25,49 @@ def this_python(tmp_path, monkeypatch):
     monkeypatch.setattr(KernelSpecManager, "get_kernel_spec", lambda self, name: spec)
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    for scheme in ("http_proxy", "https_proxy"):  # data that are not here are not fetched
+        monkeypatch.setenv(scheme, "http://127.0.0.1:9")
 
 
-def test_there_are_notebooks():
-    assert NOTEBOOKS
+LARGE = """
+import numpy
+from matplotlib.backend_bases import FigureCanvasBase
+
+_print_figure = FigureCanvasBase.print_figure
+
+
+def _checked(self, *args, **kwargs):
+    self.figure.draw_without_rendering()
+    for axes in self.figure.axes:
+        for image in axes.images:
+            box, shape = axes.get_window_extent(), numpy.shape(image.get_array())
+            assert min(box.width, box.height) > 255.5, f"a picture is drawn {box.width} x {box.height} large"
+            assert len(shape) == 2 or min(shape[:2]) >= 256, f"a picture has {shape} pixels"
+    return _print_figure(self, *args, **kwargs)
+
+
+FigureCanvasBase.print_figure = _checked
+"""
+"""Refuses pictures of scenes that have fewer than 256 x 256 pixels, and any that are drawn smaller than that.
+(Data that are drawn as they are, such as a fan of ultrasound, have one channel, and as many samples as they
+have.)"""
+
+
+OWN = {"write_a_transform": ["class BallCut(jv.Transform):"]}
+"""Classes that notebooks define, where that is what they are about."""
+
+
+def test_every_notebook_is_in_the_list_of_the_documentation():
+    text = (ROOT / "docs" / "notebooks.md").read_text(encoding="utf-8")
+    listed = re.findall(r"\(\.\./notebooks/(\w+)\.ipynb\)", text)
+    assert sorted(listed) == [path.stem for path in NOTEBOOKS]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, this_python, tmp_path):
     notebook = nbformat.read(path, as_version=4)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(LARGE))
     nbclient.NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
     ).execute()  # raises a failing cell's error, with its source
@@ -47,4 +81,5 @@ def test_notebook_is_kept_without_outputs_and_defines_no_library(path):
     notebook = nbformat.read(path, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(not cell.outputs and cell.execution_count is None for cell in code)
-    assert not any(line.startswith("class ") for cell in code for line in cell.source.splitlines())
+    defined = [line for cell in code for line in cell.source.splitlines() if line.startswith("class ")]
+    assert defined == OWN.get(path.stem, [])
