@@ -33,7 +33,7 @@ from .common import plt
 OFF, GOAL, NOISE = 0.2, 0.005, 0.01
 VOXELS = 0.5
 """Step of the fit, in voxels along a beam. At two voxels, speckle is sampled so sparsely that a derivative
-does not tell how blurred images change: 1 of 5 fits of all numbers stalled far from the truth."""
+does not tell how blurred images change."""
 BLURS = (1 / 8, 1 / 32, None)
 """From coarse to fine. The last one is without blur, since neighbouring pixels of blurred noise are not
 independent, as the covariance supposes."""
@@ -231,12 +231,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[0].plot(at, likely, "k_", markersize=26, label="standard error by the covariance (median)")
     axes[0].axhline(100 * OFF, color="k", linestyle=":", linewidth=1, label="at the start")
     axes[0].axhline(100 * GOAL, color="k", linestyle="--", linewidth=1, label="goal")
-    axes[0].set(
-        yscale="log",
-        xticks=at,
-        xticklabels=NAMES,
-        ylabel="error, % of the number (angles: of half their range)",
-    )
+    ylabel = "error, % of the number (angles: of half their range)"
+    axes[0].set(yscale="log", xticks=at, xticklabels=NAMES, ylabel=ylabel)
     common.plain_numbers(axes[0])
     axes[0].set_title("numbers of the probe, found from images", fontsize=9)
     axes[0].legend(fontsize=7, loc="center right")
@@ -256,7 +252,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     "probe_geometry",
     "Is the geometry of a swept probe found from images, and what do the images leave open?",
     __doc__,
-    size=24,
+    size=32,
     resolution=64,
     starts=5,
     threads=3,
