@@ -143,12 +143,13 @@ def measure(echo: np.ndarray) -> dict[str, Any]:
 
 def references(echo: np.ndarray, size: int, noise: float, seed: int) -> dict[str, Any]:
     """Images of the scan under either reading, and what a fit finds that starts from the other."""
-    scene = probe_geometry.Scene(jv.Volume(echo), jv.colormap("gray", (60, 200), (0.0, 0.1)), 2.0)
+    step = probe_geometry.VOXELS * SPAN / (SHAPE[2] - 1)
+    scene = probe_geometry.Scene(jv.Volume(echo), jv.colormap("gray", (60, 200), (0.0, 0.1)), step)
     probes = {name: probe_of(half) for name, half in READINGS.items()}
     found = {}
     for name, truth in probes.items():
         start = next(probe for other, probe in probes.items() if other != name)
-        targets = probe_geometry.views(scene, truth, size, noise, seed)
+        targets = probe_geometry.views(scene, truth, size, noise, seed, common.FINER)
         found[name] = probe_geometry.recovered(scene, targets, truth, start)
     return found
 
