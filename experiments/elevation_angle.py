@@ -170,8 +170,8 @@ def draw(result: dict[str, Any], slices: dict[str, np.ndarray], path: Path) -> N
         for style, (name, half) in zip(("-", "--"), READINGS.items(), strict=True):
             left = np.asarray(bowed) - best(np.asarray(bowed), half, SHAPES[COSINE])
             axes[3].plot(plane, left, f"C{number}{style}", label=f"samples {window}, {name}")
-    axes[2].set_title("shells come later by, samples", fontsize=9)
-    axes[3].set_title("and than the best cosine, samples", fontsize=9)
+    axes[2].set_title("depth of the shells over that in the middle plane,\nsamples", fontsize=9)
+    axes[3].set_title("what the best cosine under each reading leaves of it,\nsamples", fontsize=9)
     for axis in axes[2:]:
         axis.set_xlabel("plane of the sweep, from first to last", fontsize=8)
         axis.legend(fontsize=7)
