@@ -143,12 +143,13 @@ def measure(echo: np.ndarray) -> dict[str, Any]:
 
 def references(echo: np.ndarray, size: int, noise: float, seed: int) -> dict[str, Any]:
     """Images of the scan under either reading, and what a fit finds that starts from the other."""
-    scene = probe_geometry.Scene(jv.Volume(echo), jv.colormap("gray", (60, 200), (0.0, 0.1)), 2.0)
+    step = probe_geometry.VOXELS * SPAN / (SHAPE[2] - 1)
+    scene = probe_geometry.Scene(jv.Volume(echo), jv.colormap("gray", (60, 200), (0.0, 0.1)), step)
     probes = {name: probe_of(half) for name, half in READINGS.items()}
     found = {}
     for name, truth in probes.items():
         start = next(probe for other, probe in probes.items() if other != name)
-        targets = probe_geometry.views(scene, truth, size, noise, seed)
+        targets = probe_geometry.views(scene, truth, size, noise, seed, common.FINER)
         found[name] = probe_geometry.recovered(scene, targets, truth, start)
     return found
 
@@ -169,8 +170,8 @@ def draw(result: dict[str, Any], slices: dict[str, np.ndarray], path: Path) -> N
         for style, (name, half) in zip(("-", "--"), READINGS.items(), strict=True):
             left = np.asarray(bowed) - best(np.asarray(bowed), half, SHAPES[COSINE])
             axes[3].plot(plane, left, f"C{number}{style}", label=f"samples {window}, {name}")
-    axes[2].set_title("shells come later by, samples", fontsize=9)
-    axes[3].set_title("and than the best cosine, samples", fontsize=9)
+    axes[2].set_title("depth of the shells over that in the middle plane,\nsamples", fontsize=9)
+    axes[3].set_title("what the best cosine under each reading leaves of it,\nsamples", fontsize=9)
     for axis in axes[2:]:
         axis.set_xlabel("plane of the sweep, from first to last", fontsize=8)
         axis.legend(fontsize=7)

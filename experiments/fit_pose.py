@@ -46,21 +46,18 @@ def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, lis
         for _ in range(starts):
             turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
             off = {"rotation": np.deg2rad(ANGLE) * turn, "translation": SHIFT * shift}
-            camera, losses, found = pose.forward(jax.tree.map(jnp.float32, off)), [], None
+            camera = pose.forward(jax.tree.map(jnp.float32, off))
             begun = time.perf_counter()
-            for sigma in sigmas:
-                residual = jv.ImageResidual(scene, [(truth, target)], blur=sigma)
-                found = jv.fit(residual, camera, max_steps=STEPS)
-                camera = found.parameters
-                losses += found.losses.tolist()
-            assert found is not None
-            left = pose.inverse(camera)
+            residual = jv.ImageResidual(scene, [(truth, target)])
+            fits = jv.fit_coarse_to_fine(residual, camera, blurs=sigmas, max_steps=STEPS)
+            losses = np.concatenate([found.losses for found in fits]).tolist()
+            left = pose.inverse(fits[-1].parameters)
             rows[name].append(
                 {
                     "degrees": float(np.rad2deg(np.linalg.norm(left["rotation"]))),
                     "shift": float(np.linalg.norm(left["translation"])),
                     "steps": len(losses),
-                    "message": found.message,
+                    "message": fits[-1].message,
                     "seconds": round(time.perf_counter() - begun, 3),
                     "losses": losses,
                 }

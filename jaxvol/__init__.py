@@ -30,6 +30,7 @@ from .fitting import (
     UnitInterval as UnitInterval,
     choose as choose,
     fit as fit,
+    fit_coarse_to_fine as fit_coarse_to_fine,
     flat_grey as flat_grey,
     nested_materials as nested_materials,
     nested_points as nested_points,

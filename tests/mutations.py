@@ -1528,6 +1528,20 @@ MUTATIONS = [
         "for axis, n in enumerate((height,)):",
         ("fitting/test_probe_geometry.py::test_the_loss_of_blurred_images_is_that_of_scipys_blur",),
     ),
+    Mutation(
+        "coarse to fine: every fit begins at the start",
+        "fitting/coarse_to_fine.py",
+        "        parameters = fits[-1].parameters\n",
+        "",
+        ("fitting/test_probe_geometry.py::test_coarse_to_fine_is_one_fit_after_the_other",),
+    ),
+    Mutation(
+        "coarse to fine: nothing is blurred",
+        "fitting/coarse_to_fine.py",
+        "fit(residual.blurred(blur), parameters",
+        "fit(residual.blurred(None), parameters",
+        ("fitting/test_probe_geometry.py::test_coarse_to_fine_is_one_fit_after_the_other",),
+    ),
     # choices among models
     Mutation(
         "choice: the largest candidate, always",

@@ -15,6 +15,7 @@ from .candidates import (
     refined as refined,
 )
 from .choice import Choice as Choice, Evidence as Evidence, choose as choose
+from .coarse_to_fine import fit_coarse_to_fine as fit_coarse_to_fine
 from .driver import Fit as Fit, Outcome as Outcome, fit as fit
 from .files import (
     read_transfer as read_transfer,

@@ -125,9 +125,8 @@ class ImageResidual(Residual):
       `background`, or (height, width, 4), as `Rendering.rgba`.
     - `background`: linear RGB behind the volume, for three-channel images.
     - `compositing`: as in `render`.
-    - `blur`: compare blurred images: standard deviation of a Gaussian, in parts of the image's height. From
-      coarse to fine, such as 1/16, 1/48 and None, each fit from where the last one ended, a fit finds a
-      geometry whose start is off by more than the size of features, which a derivative cannot see. Whole
+    - `blur`: compare blurred images: standard deviation of a Gaussian, in parts of the image's height.
+      `fit_coarse_to_fine` finds a geometry whose start is off by more than the size of features. Whole
       images are then differentiated at once. Pixels beyond the border do not count. The noise of blurred
       pixels is not independent, as `Fit.uncertainty` supposes: its standard errors are too small, several
       times under noise of single pixels. Those of a last fit without blur are right.
@@ -173,6 +172,11 @@ class ImageResidual(Residual):
             )
             for group in by_kind.values()
         ]
+
+    def blurred(self, blur: Arrayable | None) -> "ImageResidual":
+        """The same residual, of images blurred otherwise."""
+        sigma = None if blur is None else _not_negative("blur", blur)
+        return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
 
     def count(self) -> int:
         return sum(group.images.size for group in self.groups)
