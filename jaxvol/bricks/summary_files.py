@@ -80,8 +80,8 @@ def _path(beside: Path, cell: int, cache: str | os.PathLike[str] | Any) -> Path:
         raise ValueError(f'cache must be "beside", a folder, or None; got {described(cache)}.')
     if not (folder := Path(cache)).absolute().parent.is_dir():
         raise ValueError(
-            f"cache: there is no folder {folder.absolute().parent} in which {folder.name} could be made. Check "
-            "the spelling, or make it."
+            f"cache: there is no folder {folder.absolute().parent} in which {folder.name} could be made. "
+            "Check the spelling, or make it."
         )
     # data of the same name may lie in different folders
     return folder / f"{hashlib.blake2b(str(beside).encode(), digest_size=4).hexdigest()}-{name}"
