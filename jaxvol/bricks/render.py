@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._util.checks import Arrayable, described, integer, is_traced, number
+from .._util.checks import Arrayable, described, integer, is_traced, number, shortened
 from .._util.memory import memory_of_device
 from .._util.trees import PyTree, strong
 from .._util.xla import compiled
@@ -108,8 +108,9 @@ def render_bricks(
       (`bricks.level_for`). Under a `ToroidalMap` it is the finest, 0: its ranges are those of the finest
       level's nodes, and the nodes of the others lie elsewhere.
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
-      first image; see `bricks.summary_of`. With `tolerance` it is over all levels. What nobody knows to be
-      unchanged, an array or a memory map open for writing, has it in each image.
+      first image: `"beside"` the data, in a folder, or nowhere (None); see `bricks.summary_of`. With
+      `tolerance` it is over all levels. What nobody knows to be unchanged, an array or a memory map open for
+      writing, has it in each image.
     - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
       anything visible. The former may end below the latter, where bricks are not needed, or above it, where
       they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
@@ -372,7 +373,7 @@ def _level(
 ) -> VoxelSource:
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
     if level != "auto":
-        chosen = integer("level", level, 0, len(levels) - 1)
+        chosen = integer("level", level, 0, len(levels) - 1, otherwise=', or "auto"')
         if mapped and chosen:
             raise ValueError(
                 "level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got "
@@ -397,11 +398,12 @@ def _counts(bricks: Any) -> tuple[int, int, int] | None:
         return None
     try:
         x, y, z = bricks
+        return integer("x", x, 1), integer("y", y, 1), integer("z", z, 1)
     except (TypeError, ValueError) as fault:
         raise ValueError(
-            f"bricks must be three numbers of bricks, along x, y and z; got {described(bricks)}."
+            "bricks must be three numbers of bricks, along x, y and z, each an integer of at least 1, such "
+            f"as (2, 2, 1); got {shortened(bricks)}."
         ) from fault
-    return integer("bricks", x, 1), integer("bricks", y, 1), integer("bricks", z, 1)
 
 
 def _check(

@@ -40,13 +40,15 @@ def summary_of(
 
     - `source`: the voxels.
     - `cell`, `memory`, `progress`: see `summary.scan`. `progress` is called only in a pass.
-    - `cache`: where files lie. `"beside"`: beside the data, `NAME.jaxvol-summary-CELL.npz`; a folder: in it;
-      None: nowhere. Arrays in memory have no files, and neither has a memory map that is open for writing.
+    - `cache`: where files lie. `"beside"`: beside the data, `NAME.jaxvol-summary-CELL.npz`; a folder: in it,
+      and it is made if it is not there, but not those above it; None: nowhere. Arrays in memory have no
+      files, and neither has a memory map that is open for writing.
 
     **Returns:** the summary.
 
-    **Raises:** `ValueError` as `summary.scan` does, and if the source changes during the pass. A file that
-    cannot be written is a warning. A pass that is interrupted leaves files as they were.
+    **Raises:** `ValueError` as `summary.scan` does, for a `cache` that lies in no folder, and if the source
+    changes during the pass. A file that cannot be written is a warning. A pass that is interrupted leaves
+    files as they were.
     """
     cell = integer("cell", cell, BLOCK)
     before = None if cache is None or source.beside is None else source.fingerprint()
@@ -76,8 +78,13 @@ def _path(beside: Path, cell: int, cache: str | os.PathLike[str] | Any) -> Path:
         return beside.with_name(name)
     if not isinstance(cache, str | os.PathLike):
         raise ValueError(f'cache must be "beside", a folder, or None; got {described(cache)}.')
+    if not (folder := Path(cache)).absolute().parent.is_dir():
+        raise ValueError(
+            f"cache: there is no folder {folder.absolute().parent} in which {folder.name} could be made. "
+            "Check the spelling, or make it."
+        )
     # data of the same name may lie in different folders
-    return Path(cache) / f"{hashlib.blake2b(str(beside).encode(), digest_size=4).hexdigest()}-{name}"
+    return folder / f"{hashlib.blake2b(str(beside).encode(), digest_size=4).hexdigest()}-{name}"
 
 
 def _about(source: VoxelSource, fingerprint: dict[str, Any], cell: int) -> dict[str, Any]:
@@ -93,7 +100,7 @@ def _write(path: Path, ranges: dict[str, np.ndarray], about: dict[str, Any]) -> 
         name: part if part.dtype.kind in "iuf" else part.view(np.uint16) for name, part in ranges.items()
     }
     arrays["about"] = told
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(exist_ok=True)
     with whole_file(path) as part, part.open("xb") as file:
         with zipfile.ZipFile(file, "w") as archive:
             for name, array in arrays.items():

@@ -24,8 +24,11 @@ Triple: TypeAlias = tuple[float, float, float]
 
 SPACE = ("x", "y", "z")
 
-AT_ONCE = 2**24
+AT_ONCE = 2**22
 """Bytes of decoded chunks that are read at a time, if a layer of single chunks has no more."""
+
+DECODERS = min(os.cpu_count() or 1, 8)
+"""Threads that read files, and threads that decode them."""
 
 
 class ZarrSource(VoxelSource):
@@ -105,6 +108,8 @@ class ZarrSource(VoxelSource):
         }
 
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        import tensorstore
+
         # layer by layer: tensorstore holds all chunks of what it is asked for at once
         axis, ends = self._layers(low, high)
         voxels = empty_box(low, high, np.dtype(self._store.dtype.numpy_dtype))
@@ -113,7 +118,9 @@ class ZarrSource(VoxelSource):
                 layer = [slice(a, b) for a, b in zip(low, high, strict=True)]
                 layer[axis] = slice(begin, end)
                 part = voxels[_along(axis, begin - low[axis], end - low[axis])]
-                part[...] = self._store[tuple(layer)].read().result()
+                # from the decoded chunks to their place, without another copy
+                there = tensorstore.array(part, copy=False, write=True)
+                there.write(self._store[tuple(layer)].translate_to[0, 0, 0]).result()
             return voxels
         except ValueError as fault:  # what tensorstore raises for all faults of files
             cure = (
@@ -184,7 +191,14 @@ def _opened(path: Path, version: Literal[2, 3], *, fill: bool, cache: int) -> An
         "kvstore": {"driver": "file", "path": f"{path}{os.sep}"},
         "fill_missing_data_reads": fill,
     }
-    context = tensorstore.Context({"cache_pool": {"total_bytes_limit": cache}})
+    # each thread that decodes keeps what it freed, up to tens of MiB, out of the reach of `give_back`
+    context = tensorstore.Context(
+        {
+            "cache_pool": {"total_bytes_limit": cache},
+            "data_copy_concurrency": {"limit": DECODERS},
+            "file_io_concurrency": {"limit": DECODERS},
+        }
+    )
     try:
         return tensorstore.open(spec, open=True, read=True, context=context).result()
     except ValueError as fault:

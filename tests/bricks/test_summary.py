@@ -350,12 +350,16 @@ def test_where_files_lie(tmp_path, reads):
     source = data_file(tmp_path, voxels("uint8", SHAPE))
     summary_of(source, cache=None)
     assert summary_files_in(tmp_path) == []
-    summary_of(source, cache=tmp_path / "new" / "folder")
-    (name,) = summary_files_in(tmp_path / "new" / "folder")
+    summary_of(source, cache=tmp_path / "new")
+    (name,) = summary_files_in(tmp_path / "new")
     assert name.endswith("-data.raw.jaxvol-summary-4.npz")
     del reads[:]
-    summary_of(source, cache=str(tmp_path / "new" / "folder"))
+    summary_of(source, cache=str(tmp_path / "new"))
     assert reads == []
+    with pytest.raises(ValueError, match=r"cache: there is no folder .*missing in which folder"):
+        summary_of(source, cache=tmp_path / "missing" / "folder")
+    assert reads == []
+    assert not (tmp_path / "missing").exists()
     with pytest.raises(ValueError, match="cache must be"):
         summary_of(source, cache=3)
     summary_of(source_of(voxels("uint8", SHAPE)))
@@ -366,7 +370,7 @@ def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path):
     source = data_file(tmp_path, voxels("uint8", SHAPE))
     (tmp_path / "file").write_text("")
     with pytest.warns(UserWarning, match=r"cannot be written .* Pass cache="):
-        found = summary_of(source, cache=tmp_path / "file" / "folder")
+        found = summary_of(source, cache=tmp_path / "file")
     assert_same(found, scan(source))
 
 
