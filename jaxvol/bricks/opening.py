@@ -104,7 +104,8 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
         return (npy(path, **place),)
     raise ValueError(
         f"path: {path} is not of a kind that is read in parts: .raw, .npy, or the folder of a Zarr array or "
-        "an OME-Zarr image. Pass jv.load(path), if it fits into memory."
+        "an OME-Zarr image. If it fits into memory, pass jv.load(path), or for ultrasound the volume and "
+        "the map that jv.load_ultrasound(path) returns."
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .._util.checks import Arrayable
+from .._util.checks import Arrayable, described
 from .._util.files import Header
 from .._util.npy import read_npy, read_npz
 from ..transforms import ToroidalMap
@@ -186,6 +186,8 @@ def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:
 
 
 def _existing(path: str | os.PathLike[str]) -> Path:
+    if not isinstance(path, (str, os.PathLike)):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ValueError(f"path must be a str or a path; got {described(path)}.")
     path = Path(path)
     if not path.exists():
         raise ValueError(

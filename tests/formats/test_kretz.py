@@ -199,6 +199,11 @@ def test_load_points_to_the_reader_that_returns_the_probe_too(tmp_path):
         jv.load(write(tmp_path, kretz()))
 
 
+def test_a_path_of_another_type_is_refused():
+    with pytest.raises(ValueError, match="path must be a str or a path; got 3"):
+        jv.load_ultrasound(3)
+
+
 def test_a_missing_file_and_a_directory_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"there is no file .*scan\.vol"):
         jv.load_ultrasound(tmp_path / "scan.vol")
