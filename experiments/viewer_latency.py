@@ -45,6 +45,7 @@ addEventListener('pointermove', () => moves.push(performance.now()), true);
 const arrived = width => requestAnimationFrame(() => images.push([performance.now(), width]));
 const watched = image => image.addEventListener('load', () => arrived(image.naturalWidth));
 const jpegWidth = bytes => {
+  if (!bytes) return 0;
   let i = 2;
   while (bytes[i + 1] < 0xc0 || bytes[i + 1] > 0xc2) i += 2 + bytes[i + 2] * 256 + bytes[i + 3];
   return bytes[i + 7] * 256 + bytes[i + 8];
