@@ -45,6 +45,7 @@ addEventListener('pointermove', () => moves.push(performance.now()), true);
 const arrived = width => requestAnimationFrame(() => images.push([performance.now(), width]));
 const watched = image => image.addEventListener('load', () => arrived(image.naturalWidth));
 const jpegWidth = bytes => {
+  if (!bytes) return 0;
   let i = 2;
   while (bytes[i + 1] < 0xc0 || bytes[i + 1] > 0xc2) i += 2 + bytes[i + 2] * 256 + bytes[i + 3];
   return bytes[i + 7] * 256 + bytes[i + 8];
@@ -247,15 +248,16 @@ def draw(result: dict[str, Any], path: Path) -> None:
                 labels.append(f"{face}, {light}: {kind}")
                 place += 1
     panel.axvline(1000 * result["goal"], color="tab:red", ls="--")
-    panel.text(1000 * result["goal"], -0.7, " goal", color="tab:red", va="center")
+    panel.text(1000 * result["goal"], -0.8, "goal", color="tab:red", ha="center")
     panel.set_yticks(range(len(labels)), labels)
     panel.invert_yaxis()
     panel.set_xlim(left=0)
-    panel.set_xlabel(
-        "milliseconds from a move of the pointer to the next coarse image; in a drag, from image to image"
-    )
+    panel.set_xlabel("milliseconds (black: median)")
     voxels = result["voxels"]
-    panel.set_title(f"How soon the viewer follows: head phantom, {voxels}³ voxels (black: median)")
+    figure.suptitle(
+        f"From a move of the pointer to the viewer's next coarse image, {voxels}³ voxels on two cores;\n"
+        "in a drag, from one image to the next"
+    )
     common.save(figure, path)
 
 

@@ -1179,6 +1179,28 @@ MUTATIONS = [
         "if True:  #",
         ("lighting/test_lighting.py::test_light_that_was_baked_inside_a_program_serves_outside",),
     ),
+    # viewer
+    Mutation(
+        "viewer: a drag turns what is seen against the pointer",
+        "viewer/orbit.py",
+        "angle = -math.pi * right",
+        "angle = math.pi * right",
+        ("viewer/test_orbit.py::test_the_front_of_what_is_seen_follows_a_drag",),
+    ),
+    Mutation(
+        "viewer: a fine image is finished before a newer request is drawn",
+        "viewer/worker.py",
+        "            if self._newer():\n                break",
+        "            pass",
+        ("viewer/test_worker.py::test_a_newer_request_cancels_a_fine_image_between_two_parts",),
+    ),
+    Mutation(
+        "viewer: pages of others may connect",
+        "viewer/page.py",
+        "if origin.hostname not in OWN_NAMES or origin.port != self.port:",
+        "if origin.port is not None and origin.port != self.port:",
+        ("viewer/test_page.py::test_only_its_own_pages_may_connect",),
+    ),
     # projections and isosurfaces
     Mutation(
         "maximum: leaps over what may win, since it is invisible",

@@ -1,7 +1,7 @@
 """How is a tile drawn, and how far is the image from the converged one?"""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -44,7 +44,7 @@ class Drawing:
     are."""
 
     def __init__(self, content: Content, state: State, coarser: float = 1.0):
-        self.content, self.state = content, state
+        self.content, self.state, self.coarser = content, state, coarser
         self.march = content.choices.march(state, coarser)
         self.lighting = content.choices.light(state)
         self.transfer = state.curve.padded()
@@ -57,7 +57,7 @@ class Drawing:
     def tile(self, grid: Grid, column: int, row: int) -> Pixels:
         """The pixels of a tile."""
         rgba = self._rgba(grid, column, row)
-        return np.asarray(_displayed(rgba, np.asarray(self.content.background, np.float32)))
+        return np.asarray(_displayed(rgba, self._background))
 
     def image(self, grid: Grid) -> Pixels:
         """All tiles."""
@@ -67,20 +67,29 @@ class Drawing:
             pixels[place(column, row)] = self.tile(grid, column, row)
         return pixels[:height, :width]
 
-    def error(self) -> float:
+    def error(self) -> Iterator[float | None]:
         """How far the image's linear colours are from the converged ones because of the step, as an RMSE: an
-        estimate, from one tile stretched over the view, and the same with steps of half the length.
+        estimate, from one tile stretched over the view, and the same with steps of twice the length. It comes
+        last; None before, so that a drag need not wait for it.
 
         It takes the error to fall with the square of the step, and with the step under
         `quadrature="left"`; where steps are longer than what is seen, it falls by other amounts. What
         `EarlyTermination` adds is not in it."""
-        whole = Grid(1, 1, (SIDE, SIDE))
-        finer = Drawing(self.content, self.state, 0.5)
-        images = [np.asarray(each._rgba(whole, 0, 0)) for each in (self, finer)]
-        order = LEFT_ORDER if self.content.choices.quadrature == "left" else OTHER_ORDER
-        background = np.asarray(self.content.background, np.float32)
-        over = [image[..., :3] + (1 - image[..., 3:]) * background for image in images]
-        return float(rmse(*over)) * 2**order / (2**order - 1)
+        whole, order = Grid(1, 1, (SIDE, SIDE)), LEFT_ORDER if self._left else OTHER_ORDER
+        images = []
+        for drawing in (self, Drawing(self.content, self.state, 2 * self.coarser)):
+            rgba = np.asarray(drawing._rgba(whole, 0, 0))
+            images.append(rgba[..., :3] + (1 - rgba[..., 3:]) * self._background)
+            yield None
+        yield float(rmse(*images)) / (2**order - 1)
+
+    @property
+    def _left(self) -> bool:
+        return self.content.choices.quadrature == "left"
+
+    @property
+    def _background(self) -> Float[np.ndarray, "3"]:
+        return np.asarray(self.content.background, np.float32)
 
     def camera(self, grid: Grid, column: int, row: int) -> Camera:
         """The camera of a tile."""
@@ -99,7 +108,7 @@ def place(column: int, row: int) -> tuple[slice, slice]:
     return slice(row * SIDE, (row + 1) * SIDE), slice(column * SIDE, (column + 1) * SIDE)
 
 
-@partial(jax.jit)
+@jax.jit
 def _displayed(rgba: Float[Array, "height width 4"], background: Float[Array, "3"]) -> UInt8[Array, "..."]:
     linear = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None, :]
     return jnp.round(255 * to_srgb(linear)).astype(jnp.uint8)

@@ -58,7 +58,7 @@ class Model:
         rest: float = REST,
     ):
         self.content, self.state = content, state
-        self._show, self._tell = show, tell
+        self._faces = show, tell
         self._pace: dict[Any, Pace] = {}
         self._last: Frame | None = None
         self._worker = Worker(self._coarse, self._fine, self._failed, rest)
@@ -97,9 +97,18 @@ class Model:
         """Wait until the state is drawn, fine; False if that takes longer."""
         return self._worker.wait(seconds)
 
-    def close(self) -> None:
-        """Draw no more."""
-        self._worker.close()
+    def close(self, *, wait: bool = True) -> None:
+        """Draw no more, and show no more. `wait` until a part that was begun is finished."""
+        self._worker.close(wait=wait)
+
+    def _show(self, frame: Frame) -> None:
+        self._last = frame
+        if not self._worker.closed:
+            self._faces[0](frame)
+
+    def _tell(self, text: str) -> None:
+        if not self._worker.closed:
+            self._faces[1](text)
 
     def _coarse(self, state: State, asked: float) -> None:
         drawing = Drawing(self.content, state)
@@ -115,9 +124,9 @@ class Model:
         pixels = Drawing(self.content, state, coarser).image(Grid.coarse(state.size, pace.tiles))
         done = time.perf_counter()
         pace.took(done - begun, len(fine))
-        self._last = Frame(pixels, "coarse", state, done - begun, done - asked, state.step * coarser)
-        self._show(self._last)
-        self._tell(_timing(self._last))
+        frame = Frame(pixels, "coarse", state, done - begun, done - asked, state.step * coarser)
+        self._show(frame)
+        self._tell(_timing(frame))
 
     def _fine(self, state: State) -> Iterator[None]:
         drawing, grid, begun = Drawing(self.content, state), Grid.fine(state.size), time.perf_counter()
@@ -129,7 +138,6 @@ class Model:
         def show(stage: Literal["drawing", "fine"], more: str) -> None:
             took = time.perf_counter() - begun
             frame = Frame(pixels[:height, :width].copy(), stage, state, took, took, state.step)
-            self._last = frame
             self._show(frame)
             self._tell(f"{_timing(frame)}{more}")
 
@@ -140,8 +148,11 @@ class Model:
             pixels[place(column, row)] = drawing.tile(grid, column, row)
             yield
         show("fine", ", estimating its error …")
-        yield
-        self._tell(f"{_timing(self._last)}, RMSE {drawing.error():.2g} (estimate)")
+        fine = self._last
+        for error in drawing.error():
+            yield
+            if error is not None:
+                self._tell(f"{_timing(fine)}, RMSE {error:.2g} (estimate)")
 
     def _failed(self, fault: Exception) -> None:
         self._tell(f"not drawn:\n{' '.join(str(fault).split())}")

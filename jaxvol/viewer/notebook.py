@@ -42,7 +42,7 @@ class NotebookView(ipywidgets.HBox):
             self._loop = asyncio.get_running_loop()
         self._frame: Frame | None = None
         self._quiet = False
-        self.canvas = RenderCanvas(size=state.size, max_fps=60)
+        self.canvas = RenderCanvas(size=state.size, max_fps=120)
         self._context = self.canvas.get_bitmap_context()
         self.canvas.request_draw(self._present)
         self.canvas.add_event_handler(self._pointed, "pointer_down", "pointer_move", "pointer_up", "wheel")

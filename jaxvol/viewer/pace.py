@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 
-BUDGET = 0.09
+BUDGET = 0.06
 """Seconds that a coarse image may take: of the 150 ms in which it is to follow the pointer, what is left
-once it was sent to the browser, and a tile that was being drawn is finished."""
+once a tile that was being drawn is finished, and the image was encoded and sent to the browser."""
 
 LADDER = ((1, 4.0), (1, 2.0), (1, 1.0), (2, 1.0), (4, 1.0), (6, 1.0), (9, 1.0), (16, 1.0))
 """Coarse images, from the coarsest on: tiles, and how many times as long their steps are. One takes up to

@@ -3,6 +3,7 @@ behind its scene, which is empty."""
 
 import contextlib
 import io
+import logging
 import math
 import re
 from collections.abc import Callable
@@ -38,6 +39,11 @@ class _Server(viser.ViserServer):
         return None
 
 
+def _unless_never_opened(record: logging.LogRecord) -> bool:
+    # browsers open connections in advance, and close those that they do not need
+    return record.getMessage() != "opening handshake failed"
+
+
 class Page:
     """What `serve` returns: a server of pages on which a volume is looked at.
 
@@ -54,6 +60,7 @@ class Page:
         # viser's cameras have limits that suit scenes of about this size
         self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
         self.models: dict[int, Model] = {}
+        logging.getLogger("websockets.server").addFilter(_unless_never_opened)
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self._server = _Server(host=HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
@@ -108,7 +115,7 @@ class Page:
     async def _closed(self, client: viser.ClientHandle) -> None:
         model = self.models.pop(client.client_id, None)
         if model is not None:
-            model.close()
+            model.close(wait=False)  # viser's loop must not wait
 
 
 class _Panel:

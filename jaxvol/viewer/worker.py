@@ -45,12 +45,17 @@ class Worker(Generic[T]):
             self._next, self._idle = (request, time.perf_counter()), False
             self._changed.notify_all()
 
-    def close(self) -> None:
-        """Draw no more, and wait until a part that was begun is finished."""
+    @property
+    def closed(self) -> bool:
+        """Whether it draws no more."""
+        return self._closed
+
+    def close(self, *, wait: bool = True) -> None:
+        """Draw no more. `wait` until a part that was begun is finished."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        if threading.current_thread() is not self._thread:
+        if wait and threading.current_thread() is not self._thread:
             self._thread.join()
 
     def wait(self, seconds: float) -> bool:
