@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped
 from ._util.checks import described, is_traced
 from .display import from_srgb
 from .labels import LabelTransferFunction
-from .transfer import TransferFunction, extinction_of
+from .transfer import Transfer, TransferFunction, extinction_of
 from .volume import Volume
 
 
@@ -184,14 +184,15 @@ STRAYS = 0.3
 """Percent of the visible voxels that may lie outside on each side."""
 
 
-def visible_box(volume: Volume, transfer: TransferFunction | LabelTransferFunction) -> Volume:
+def visible_box(volume: Volume, transfer: Transfer) -> Volume:
     """The box in which nearly all lies that a transfer function shows, as a volume of 2³ voxels to look at:
-    that of the whole volume, where nothing is visible."""
+    that of the whole volume, where nothing is visible. Transfer functions are those made here."""
     stride = _stride(volume.shape)
     data = np.asarray(volume.data)[::stride, ::stride, ::stride]
     if isinstance(transfer, LabelTransferFunction):
         seen = data > INSIDE / 2
     else:
+        assert isinstance(transfer, TransferFunction)
         extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
         seen = -np.expm1(-extinction * _unit(volume)) > SEEN
     places = [stride * axis for axis in np.nonzero(seen)]
