@@ -107,11 +107,13 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
         first, second = threshold_multiotsu(kept, 3, nbins=BINS)
     except ValueError:  # of fewer than three values
         first, second = low + (high - low) / 3, low + 2 * (high - low) / 3
-    classes = [kept[kept <= first], kept[(kept > first) & (kept <= second)], kept[kept > second]]
-    if min(map(len, classes)) == 0:
-        return float(first), float(second)
-    means = [float(each.mean(dtype=np.float64)) for each in classes]
-    return (means[0] + means[1]) / 2, (means[1] + means[2]) / 2
+    for _ in range(3):  # strays at the edge of a class join the nearer one
+        classes = [kept[kept <= first], kept[(kept > first) & (kept <= second)], kept[kept > second]]
+        if min(map(len, classes)) == 0:
+            break
+        means = [float(each.mean(dtype=np.float64)) for each in classes]
+        first, second = (means[0] + means[1]) / 2, (means[1] + means[2]) / 2
+    return float(first), float(second)
 
 
 FEWEST_FLAT = 0.8
