@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped
 from ._util.checks import described, is_traced
 from .display import from_srgb
 from .labels import LabelTransferFunction
-from .transfer import TransferFunction, extinction_of
+from .transfer import Transfer, TransferFunction, extinction_of
 from .volume import Volume
 
 
@@ -107,11 +107,13 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
         first, second = threshold_multiotsu(kept, 3, nbins=BINS)
     except ValueError:  # of fewer than three values
         first, second = low + (high - low) / 3, low + 2 * (high - low) / 3
-    classes = [kept[kept <= first], kept[(kept > first) & (kept <= second)], kept[kept > second]]
-    if min(map(len, classes)) == 0:
-        return float(first), float(second)
-    means = [float(each.mean(dtype=np.float64)) for each in classes]
-    return (means[0] + means[1]) / 2, (means[1] + means[2]) / 2
+    for _ in range(3):  # strays at the edge of a class join the nearer one
+        classes = [kept[kept <= first], kept[(kept > first) & (kept <= second)], kept[kept > second]]
+        if min(map(len, classes)) == 0:
+            break
+        means = [float(each.mean(dtype=np.float64)) for each in classes]
+        first, second = (means[0] + means[1]) / 2, (means[1] + means[2]) / 2
+    return float(first), float(second)
 
 
 FEWEST_FLAT = 0.8
@@ -184,14 +186,15 @@ STRAYS = 0.3
 """Percent of the visible voxels that may lie outside on each side."""
 
 
-def visible_box(volume: Volume, transfer: TransferFunction | LabelTransferFunction) -> Volume:
+def visible_box(volume: Volume, transfer: Transfer) -> Volume:
     """The box in which nearly all lies that a transfer function shows, as a volume of 2³ voxels to look at:
-    that of the whole volume, where nothing is visible."""
+    that of the whole volume, where nothing is visible. Transfer functions are those made here."""
     stride = _stride(volume.shape)
     data = np.asarray(volume.data)[::stride, ::stride, ::stride]
     if isinstance(transfer, LabelTransferFunction):
         seen = data > INSIDE / 2
     else:
+        assert isinstance(transfer, TransferFunction)
         extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
         seen = -np.expm1(-extinction * _unit(volume)) > SEEN
     places = [stride * axis for axis in np.nonzero(seen)]

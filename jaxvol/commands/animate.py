@@ -1,9 +1,11 @@
 """`jaxvol animate`: a volume file seen from a camera that turns about it, as GIF, MP4 or a folder of PNGs."""
 
 import argparse
+import importlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -103,14 +105,18 @@ def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
     first.save(path, save_all=True, append_images=pictures, duration=milliseconds, loop=0, disposal=1)
 
 
-def _check_mp4(size: Any) -> None:
+def _ffmpeg() -> ModuleType:
     try:
-        import imageio_ffmpeg  # noqa: F401  (imageio's plug-in)
+        return importlib.import_module("imageio_ffmpeg")
     except ImportError as fault:
         raise ImportError(
             '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a '
             "folder of PNGs."
         ) from fault
+
+
+def _check_mp4(size: Any) -> None:
+    _ffmpeg()
     if any(side % 2 for side in size):
         raise ValueError(
             f"--size: an .mp4 has an even number of pixels on each side; got {size[0]} {size[1]}."
@@ -119,11 +125,9 @@ def _check_mp4(size: Any) -> None:
 
 def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
     """H.264 with colours at half the resolution, which every player shows."""
-    import imageio_ffmpeg
-
     first = next(images)
     height, width, _ = first.shape
-    writer = imageio_ffmpeg.write_frames(
+    writer = _ffmpeg().write_frames(
         *(str(path), (width, height)),
         fps=fps,
         codec="libx264",

@@ -103,7 +103,7 @@ def _grain(options: argparse.Namespace, save: Save) -> dict[str, str]:
     # fraction of a step, which shows as terraces unless the cell is cut at the exit.
     cube = phantom("linear", 64)
     transfer = TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
-    camera = Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=tuple(options.size)).zoom(1.1)
+    camera = Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=tuple(options.size)).zoom(1.05)
     for name, transforms in (("before", ()), ("after", (AlphaCorrection(),))):
         image = _image(options, name, Frames(cube, transfer, March(0.25, transforms), OVER, None), camera)
         save(name, image.image((0, 0, 0)))

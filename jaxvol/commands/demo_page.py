@@ -52,7 +52,7 @@ jv.save_png("head.png", rendering.image(background=(1, 1, 1)))""",
         """\
 cube = jv.phantom("linear", 64)
 look = jv.TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
-camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0)).zoom(1.1)
+camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0)).zoom(1.05)
 for transforms in ((), (jv.AlphaCorrection(),)):
     rendering = jv.render(cube, look, camera, jv.March(0.25, transforms))""",
     ),

@@ -81,7 +81,7 @@ def test_a_gif_holds_all_frames(volume_file, tmp_path, monkeypatch):
     assert len(traced) == 8
     assert programs() - count == first  # one program for all frames
     with Image.open(output) as picture:
-        assert picture.n_frames == 6
+        assert getattr(picture, "n_frames") == 6  # noqa: B009  (of GIFs alone)
         assert picture.info["duration"] == 200
         assert picture.info["loop"] == 0
         frames = []
