@@ -235,7 +235,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[0].set(yscale="log", xticks=at, xticklabels=NAMES, ylabel=ylabel)
     common.plain_numbers(axes[0])
     axes[0].set_title("numbers of the probe, found from images", fontsize=9)
-    axes[0].legend(fontsize=7, loc="center right")
+    axes[0].legend(fontsize=7, loc="upper right", bbox_to_anchor=(1, 0.95))
     cases = result["left open"]
     table = np.array([[row["standard errors"][name] for name in NAMES] for row in cases.values()])
     known = np.isfinite(table)
@@ -244,7 +244,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         text = f"{100 * table[i, j]:.2g}" if known[i, j] else "open"
         axes[1].text(j, i, text, ha="center", va="center", fontsize=8)
     axes[1].set(xticks=at, xticklabels=NAMES, yticks=range(len(cases)), yticklabels=list(cases))
-    axes[1].set_title("standard error by the covariance, %; open: not determined by the images", fontsize=9)
+    axes[1].set_title("standard error by the covariance, %; open: not determined", fontsize=9)
     common.save(figure, path)
 
 
