@@ -13,6 +13,7 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
+from itertools import starmap
 from pathlib import Path
 from types import ModuleType
 
@@ -24,6 +25,7 @@ from .contents import ENTRIES, PAPERS, Entry
 
 STYLE = """
 body { font: 16px/1.45 sans-serif; max-width: 74rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+nav { font-size: 0.9rem } nav p { margin: 0.3rem 0 }
 h2 { border-bottom: 1px solid #bbb; margin-top: 3rem } h3 { margin: 2.2rem 0 0.4rem }
 .said { display: grid; grid-template-columns: 1fr 1fr; gap: 0 2rem } .said p { margin: 0.2rem 0 0.8rem }
 .said b { display: block; font-size: 0.8rem; color: #666 }
@@ -32,6 +34,18 @@ table { border-collapse: collapse; font-size: 0.8rem } td, th { padding: 0.15rem
 tr:nth-child(even) { background: #f3f3f3 } small { color: #666 } code { font-size: 0.85em }
 @media (max-width: 50rem) { .said { grid-template-columns: 1fr } }
 """
+
+
+KEPT = (
+    "Each figure and table stands below what its paper reports, and what to look at in ours. Charts and "
+    "tables are made from the records of experiments; pictures of scenes, which take minutes to render, are "
+    "those that were kept. `jaxvol figures --run` measures and renders all of it anew."
+)
+ANEW = (
+    "Each figure and table stands below what its paper reports, and what to look at in ours. All of it was "
+    "measured and rendered for this page."
+)
+"""The first lines of the page."""
 
 
 def make(
@@ -94,14 +108,21 @@ def _script(package: str, name: str) -> ModuleType:
 
 
 def _page(entries: Sequence[Entry], folder: Path, results: Path, run: bool) -> str:
-    body = ["<h1>Figures and tables of the papers</h1>", f"<p>{' '.join((__doc__ or '').split()[16:])}</p>"]
-    for paper, title in PAPERS.items():
-        of_paper = [entry for entry in entries if entry.paper == paper]
-        if of_paper:
-            body += [f"<h2>{html.escape(title)}</h2>", *(_section(e, folder, results, run) for e in of_paper)]
+    of_papers = {title: [e for e in entries if e.paper == paper] for paper, title in PAPERS.items()}
+    of_papers = {title: found for title, found in of_papers.items() if found}
+    body = ["<h1>Figures and tables of the papers</h1>", f"<p>{_text(ANEW if run else KEPT)}</p>"]
+    body += [f"<nav>{''.join(starmap(_links, of_papers.items()))}</nav>"]
+    for title, found in of_papers.items():
+        body += [f"<h2>{html.escape(title)}</h2>", *(_section(e, folder, results, run) for e in found)]
     head = f'<meta charset="utf-8"><title>jaxvol: figures of the papers</title><style>{STYLE}</style>'
     text = "\n".join(body)
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{text}\n</body></html>\n'
+
+
+def _links(title: str, entries: Sequence[Entry]) -> str:
+    """A paper's line in the contents: links to its figures and tables."""
+    links = (f'<a href="#{e.name}">{html.escape(e.title.split(":")[0])}</a>' for e in entries)
+    return f"<p>{html.escape(title)}<br>{', '.join(links)}</p>\n"
 
 
 def _section(entry: Entry, folder: Path, results: Path, run: bool) -> str:
@@ -129,7 +150,7 @@ def origin(entry: Entry, results: Path, run: bool) -> str:
         )
     if entry.source == "formula":
         return f"{command}, computed for this page."
-    return f"{command}, rendered for this page." if run else f"{command}; the kept picture."
+    return f"{command}, rendered for this page." if run else f"A picture that was kept; {command} renders it."
 
 
 def _text(text: str) -> str:
