@@ -132,10 +132,10 @@ def plan(
 
     - where the volume and what `render` makes of it fit into `memory` (IN_MEMORY bytes for each byte of
       voxels), it is read, and planned as a `Volume`;
-    - otherwise it is rendered by `render_bricks`. The march is planned on a copy of every n-th voxel along each
-      axis that fits, read slab by slab, and its step divided by n: as many steps a voxel as the copy needs.
-      That is cautious where the volume is smooth, but the error is that of the copy: detail finer than n
-      voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
+    - otherwise it is rendered by `render_bricks`. The march is planned on a copy of every n-th voxel along
+      each axis that fits, read slab by slab, and its step divided by n: as many steps a voxel as the copy
+      needs. That is cautious where the volume is smooth, but the error is that of the copy: detail finer than
+      n voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
       that `AlphaCorrection` and `SpaceLeaping` are kept. What is read around a brick is a number of steps:
       where the smallest bricks do not fit, the step is halved, up to HALVED times.
 
