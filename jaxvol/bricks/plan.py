@@ -22,11 +22,16 @@ from ..volume import Volume
 from .opening import Openable, levels_of
 from .render import bricks_of, budget, render_bricks
 from .sources import VoxelSource
+from .split import TooLittleMemory
 
 
 IN_MEMORY = 9
 """Bytes for each byte of voxels, or less, that `render` takes: the voxels as read and in the device, a packed
 copy of 8-bit ones, what finding the extremes of blocks takes, and slopes."""
+
+
+HALVED = 4
+"""How often a step may be halved so that bricks fit."""
 
 
 class BudgetPlan(NamedTuple):
@@ -131,7 +136,8 @@ def plan(
       each axis that fits, read slab by slab, and its step divided by n: as many steps a voxel as the copy
       needs. That is cautious where the volume is smooth, but the error is that of the copy: detail finer than
       n voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
-      that `AlphaCorrection` and `SpaceLeaping` are kept.
+      that `AlphaCorrection` and `SpaceLeaping` are kept. What is read around a brick is a number of steps:
+      where the smallest bricks do not fit, the step is halved, up to HALVED times.
 
     **Arguments:**
 
@@ -167,13 +173,16 @@ def plan(
     if stride == 1:
         return BudgetPlan(found, opened, room, 1, None, 0, opened.nbytes, compositing, cache)
     march, parts = _finer(found.march, stride), _parts(found.parts)
-    stream = bricks_of(
-        *(opened, transfer, camera, march),
-        memory=room,
-        compositing=compositing,
-        lighting=found.lighting,
-        cache=cache,
-    )
+    how = {"compositing": compositing, "lighting": found.lighting, "cache": cache}
+    halved = 0
+    while True:
+        try:
+            stream = bricks_of(opened, transfer, camera, march, memory=room, **how)
+            break
+        except TooLittleMemory:  # what is read around a brick is a number of steps
+            if halved == HALVED:
+                raise
+            halved, march = halved + 1, March(march.step / 2, march.transforms, march.quadrature)
     loads = int(stream.visible.sum())
     nbytes = loads * int(np.prod(stream.stored)) * opened.dtype.itemsize
     found = found._replace(march=march, parts=parts, probed=time.perf_counter() - begun)

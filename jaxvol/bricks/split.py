@@ -28,6 +28,10 @@ COPIES = 3
 extremes of blocks takes, less than one."""
 
 
+class TooLittleMemory(ValueError):
+    """The smallest bricks, with what is read around them, do not fit into the budget."""
+
+
 @dataclass(frozen=True)
 class Margin:
     """What is read around a brick.
@@ -128,7 +132,7 @@ def split(
     what is read around them, are shorter than the volume. There are at least `least`, unless they would be
     smaller than bricks are.
 
-    **Raises:** `ValueError` if the smallest ones do not fit."""
+    **Raises:** `TooLittleMemory` if the smallest ones do not fit."""
     memory = integer("memory", memory, 1)
     cells = [n - 1 for n in shape]
     x, y, z = (min(EDGE, c) for c in cells)
@@ -144,7 +148,7 @@ def split(
             return grid
         if smallest:
             check_part(stored)
-            raise ValueError(
+            raise TooLittleMemory(
                 f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
                 f"{' x '.join(map(str, size))} cells and what is read around them; got {memory}."
             )
