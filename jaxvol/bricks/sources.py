@@ -5,7 +5,6 @@ data[x, y, z], whatever the order of axes in a file.
 """
 
 import math
-import mmap
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -26,8 +25,8 @@ Result = TypeVar("Result")
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
 
-LARGE = 2**22
-"""Bytes of an array from which on the system may give memory in pages of 2 MiB (as NumPy has it)."""
+ALIGNED = 64
+"""Bytes, of whose multiples the addresses of JAX's arrays are."""
 
 _READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
@@ -142,20 +141,14 @@ class ArraySource(VoxelSource):
         return self._data[tuple(map(slice, low, high))]
 
 
-def empty_box(low: Corner, high: Corner, dtype: np.dtype, value: Any = None) -> np.ndarray:
-    """An array for the voxels of a box, full of `value` if there is one. It begins with a page of
-    memory, so that `jax.device_put` uses it in place where the device is the CPU."""
+def empty_box(low: Corner, high: Corner, dtype: np.dtype) -> np.ndarray:
+    """An array for the voxels of a box. It is aligned as JAX aligns its own, so that `jax.device_put` uses it
+    in place where the device is the CPU."""
     shape = tuple(int(b) - int(a) for a, b in zip(low, high, strict=True))
     size = math.prod(shape) * dtype.itemsize
-    # Not from the C library, which may keep it when it is free. The system takes it back at once, and gives
-    # it, full of 0, page by page as it is used.
-    memory = mmap.mmap(-1, max(size, 1))
-    if size >= LARGE and hasattr(mmap, "MADV_HUGEPAGE"):
-        memory.madvise(mmap.MADV_HUGEPAGE)
-    voxels = np.frombuffer(memory, dtype, size // dtype.itemsize).reshape(shape)
-    if value is not None and value != 0:
-        voxels[...] = value
-    return voxels
+    memory = np.empty(size + ALIGNED, np.uint8)
+    start = -memory.ctypes.data % ALIGNED
+    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def check_known(thing: Any) -> None:

@@ -25,11 +25,9 @@ from ..rendering import BrickReport
 from ..space import Ray, Space
 from ..transforms import ToroidalMap
 from ..volume import Volume, part_of
-from .dtypes import Box
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
-from .shown import Shown
-from .sources import Corner, VoxelSource, in_background
+from .sources import VoxelSource, in_background
 from .split import Margin, bytes_of, check_part, fits, split, stored_of, stored_shape
 from .summary import Summary
 
@@ -59,8 +57,7 @@ class Stream:
     """The bricks of a scene.
 
     - `scene`: with a volume without its voxels.
-    - `visible`: for each brick, whether anything may be visible in it. `shown`: of which voxels; None for
-      all.
+    - `visible`: for each brick, whether anything may be visible in it.
     - `straight`: whether rays are straight in the grid.
     - `done`: bricks that were rendered. `loads`: those whose reading has begun.
     - `stored`: nodes along each axis that are read at a time. `alone`: as many suffice for each brick without
@@ -76,7 +73,6 @@ class Stream:
     margin: Margin
     order: list[int]
     visible: np.ndarray
-    shown: Shown | None
     straight: bool
     alone: Node
     stored: Node
@@ -125,7 +121,6 @@ class Stream:
         assert isinstance(marched.source, Camera)
         summary = summary_of()
         order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
-        shown = Shown.of(marched, summary, margin.cells)
         return cls(
             *(
                 source,
@@ -137,7 +132,6 @@ class Stream:
                 margin,
                 order,
                 visible,
-                shown,
                 straight,
                 alone,
                 stored,
@@ -306,32 +300,19 @@ class Stream:
         shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
         first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
         assert np.all(np.minimum(high, shape - 1) < first + stored), (low, high, first, stored)
-        low, high = first, first + stored
-        self.loads.append(brick)
-        boxes = None if self.shown is None else self.shown.boxes(low, high, self.source.chunks)
-        voxels = sum(int(np.prod(np.subtract(b, a))) for a, b in ([(low, high)] if boxes is None else boxes))
-        self.bytes_read += voxels * self.source.dtype.itemsize
         x, y, z = first.tolist()
-        return (x, y, z), in_background(self._read, low, high, boxes)
+        self.loads.append(brick)
+        self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
+        return (x, y, z), in_background(self._read, first, first + stored)
 
-    def _read(self, low: np.ndarray, high: np.ndarray, boxes: list[Box] | None) -> np.ndarray:
-        """The voxels between these nodes, `high` exclusive, or of those only the ones in boxes."""
-        if self.shown is None or boxes is None:
-            return self._checked(low, high)
-        voxels = self.shown.unread(low, high)
-        for box in boxes:
-            place = tuple(slice(a - o, b - o) for a, b, o in zip(*box, low.tolist(), strict=True))
-            voxels[place] = self._checked(*box)
-        return voxels
-
-    def _checked(self, low: Corner, high: Corner) -> np.ndarray:
+    def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """The voxels of a box, whose range tells whether they are those of the summary."""
         voxels = self.source.read(low, high)
         least, most = self.summary.range_of(low, high)
         if float(voxels.min()) < least or float(voxels.max()) > most:
             raise ValueError(
                 f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
-                f"{most} in the box {tuple(map(int, low))} to {tuple(map(int, high))}, and now "
+                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now "
                 f"{voxels.min()} to {voxels.max()}. Delete the file of ranges beside it (`cache`), or pass "
                 "cache=None, and open it again."
             )
