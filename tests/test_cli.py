@@ -47,7 +47,7 @@ def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
     assert sorted(re.findall(r'src="([^"]+)"', page)) == ["after.png", "before.png", "head.png"]
     assert "http" not in page  # no network
     assert main(["render", "--like", str(tmp_path / "demo" / "head.png")]) == 2
-    assert "was made by: jaxvol demo --size 40 30 --resolution 24 --only head grain. Run that." in (
+    assert "was made by: jaxvol demo --only head grain --resolution 24 --size 40 30. Run that." in (
         capsys.readouterr().err
     )
 
