@@ -33,6 +33,8 @@ class NotebookView(ipywidgets.HBox):
     - `model`: the viewer's state, `model.state`; `model.wait()` waits until it is drawn.
     - `canvas`: the image, a canvas of rendercanvas.
     - `close()` ends the viewer's thread. A cell that shows another viewer does not.
+
+    **Arguments:** `content`, `state`: what is looked at, and how at first. `view` makes them.
     """
 
     def __init__(self, content: Content, state: State):
@@ -79,7 +81,8 @@ class NotebookView(ipywidgets.HBox):
     def close(self) -> None:
         """Remove the widget, and end its thread."""
         self.model.close()
-        self.canvas.close()
+        self.canvas._is_closed = True  # its scheduler ends; in rendercanvas 2.7, its `close` calls itself
+        ipywidgets.Widget.close(self.canvas)
         super().close()
 
     # The thread that draws calls these two; widgets belong to the thread of the event loop.

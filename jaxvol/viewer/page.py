@@ -52,6 +52,9 @@ class Page:
     - `url`: to open in a browser. `port`: on which it is served.
     - `models`: of the pages that are open, by viser's numbers of clients.
     - `close()` ends it.
+
+    **Arguments:** `content`, `state`: what is looked at, and how at first; `serve` makes them. `port`, `title`:
+    as for `serve`.
     """
 
     def __init__(self, content: Content, state: State, *, port: int = 8080, title: str = "jaxvol"):

@@ -159,7 +159,9 @@ def test_the_error_is_about_that_of_the_image(shown):
     content, state = begun(jv.March(0.8, MARCH.transforms, "midpoint"))
     whole = Grid(1, 1, (SIDE, SIDE))
     drawing, truth = Drawing(content, state), Drawing(content, state, 1 / 16)
-    images = [jv.display.from_srgb(jnp.asarray(d.tile(whole, 0, 0)) / 255.0) for d in (drawing, truth)]
+    rgba = [np.asarray(each._rgba(whole, 0, 0)) for each in (drawing, truth)]
+    background = np.float32(content.background)
+    images = [each[..., :3] + (1 - each[..., 3:]) * background for each in rgba]
     *before, error = drawing.error()
     assert before == [None, None]
     assert error == pytest.approx(float(rmse(*images)), rel=0.5)
