@@ -22,6 +22,7 @@ from .commands.render import add_render
 from .commands.settings import parsed
 from .commands.view import add_view
 from .figures import add_figures
+from .programs import SHORTEST
 
 
 EXAMPLES = """\
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = parsed(_parser, arguments)
         jax.config.update("jax_compilation_cache_dir", str(options.programs))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         _run_in_thread(options)
         sys.stdout.flush()
     except BrokenPipeError:

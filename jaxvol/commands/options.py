@@ -1,11 +1,11 @@
 """Which options do several commands share? Where programs are kept, what a scene is, how it is looked at."""
 
 import argparse
-import os
 from pathlib import Path
 
 from ..modes import MODES
 from ..presets import PRESETS, SHADED
+from ..programs import default_programs
 from .data import add_data_options
 
 
@@ -21,18 +21,11 @@ def shared_options() -> argparse.ArgumentParser:
     shared.add_argument(
         "--programs",
         type=Path,
-        default=_programs(),
+        default=default_programs(),
         metavar="FOLDER",
         help="cache of compiled programs (default: %(default)s)",
     )
     return shared
-
-
-def _programs() -> Path:
-    """The compilation cache folder: JAX's own if that is set, else one in the user's cache."""
-    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(chosen) if chosen else caches / "jaxvol" / "programs"
 
 
 def scene_options() -> argparse.ArgumentParser:

@@ -53,8 +53,8 @@ class Page:
     - `models`: of the pages that are open, by viser's numbers of clients.
     - `close()` ends it.
 
-    **Arguments:** `content`, `state`: what is looked at, and how at first; `serve` makes them. `port`, `title`:
-    as for `serve`.
+    **Arguments:** `content`, `state`: what is looked at, and how at first; `serve` makes them. `port` and
+    `title`: as for `serve`.
     """
 
     def __init__(self, content: Content, state: State, *, port: int = 8080, title: str = "jaxvol"):

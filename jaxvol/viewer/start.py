@@ -3,20 +3,19 @@
 from typing import Any
 
 import numpy as np
-from skimage.filters import threshold_otsu
 
 from .._util.checks import described
 from ..arguments import check_arguments
+from ..automatic import automatic_transfer
 from ..camera import Camera
 from ..compositing import Compositing
-from ..display import from_srgb
 from ..lighting import Phong
 from ..lighting.shading import Lighting
 from ..march import March, Transform
 from ..modes import Mode, compositing_of
 from ..occupancy import BLOCK
 from ..space import node_distance
-from ..transfer import TransferFunction, extinction_of
+from ..transfer import TransferFunction
 from ..transforms import (
     AdaptiveSampling,
     AlphaCorrection,
@@ -48,9 +47,6 @@ ON = AlphaCorrection, SpaceLeaping, EarlyTermination
 STEP = 0.5
 """Voxels between the samples of a fine image where no march is given."""
 
-SAMPLED = 2_000_000
-"""Voxels at most that a range of values is found from."""
-
 
 def begin(
     volume: Volume | Any,
@@ -74,7 +70,7 @@ def begin(
         check_arguments("view(volume, transfer, camera, march)", volume=volume)
     seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
     given = March(1.0) if march is None else march
-    transfer = default_transfer(volume) if transfer is None else transfer
+    transfer = automatic_transfer(volume) if transfer is None else transfer
     check_arguments(
         "view(volume, transfer, camera, march)",
         volume=volume,
@@ -114,23 +110,3 @@ def _voxel(volume: Volume, march: March) -> float:
     """World length between nodes: the median, over the volume, of the least distance."""
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     return float(np.median(np.asarray(node_distance(march.locate(volume), blocks))))
-
-
-def default_transfer(volume: Volume) -> TransferFunction:
-    """A transfer function for a volume of which nothing is known: transparent up to Otsu's threshold between
-    the values of what is there and of what is around it; from there on, from a dark and thin foot, which
-    draws contours, to bright and dense."""
-    data = np.asarray(volume.data)
-    values = data.ravel()[:: max(1, data.size // SAMPLED)].astype(np.float32)
-    low, high = float(values.min()), float(np.percentile(values, 99.9))
-    high = high if high > low else low + 1
-    foot = float(threshold_otsu(values)) if values.max() > low else low
-    foot = min(max(foot, low), low + 0.95 * (high - low))
-    parts = (0, 0.12, 0.4, 1)
-    colors = ((0.25, 0.15, 0.1), (0.6, 0.4, 0.3), (0.95, 0.85, 0.7), (1, 1, 1))
-    opacities = (0.0, 0.04, 0.25, 0.8)
-    unit = float(np.min(np.asarray(volume.spacing)))
-    linear = from_srgb(np.asarray(colors, np.float32))
-    return TransferFunction(
-        [foot + part * (high - foot) for part in parts], linear, extinction_of(opacities, unit)
-    )

@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,7 +14,7 @@ from jaxvol.viewer.curve import Curve
 from jaxvol.viewer.drawing import Drawing
 from jaxvol.viewer.model import Model
 from jaxvol.viewer.pace import BUDGET, LADDER, Pace
-from jaxvol.viewer.start import begin, default_transfer
+from jaxvol.viewer.start import begin
 from jaxvol.viewer.tiles import SIDE, Grid
 
 
@@ -160,10 +159,10 @@ def test_the_error_is_about_that_of_the_image(shown):
     whole = Grid(1, 1, (SIDE, SIDE))
     drawing, truth = Drawing(content, state), Drawing(content, state, 1 / 16)
     rgba = [np.asarray(each._rgba(whole, 0, 0)) for each in (drawing, truth)]
-    background = np.float32(content.background)
+    background = np.asarray(content.background, np.float32)
     images = [each[..., :3] + (1 - each[..., 3:]) * background for each in rgba]
-    *before, error = drawing.error()
-    assert before == [None, None]
+    first, second, error = drawing.error()
+    assert first is second is None
     assert error == pytest.approx(float(rmse(*images)), rel=0.5)
 
 
@@ -211,13 +210,10 @@ def test_the_pace_settles_on_what_is_fast_enough():
     assert small.tiles == 1
 
 
-def test_the_default_transfer_function_shows_what_is_there_and_not_what_is_around_it():
-    transfer = default_transfer(BALL)
-    background, inside = float(BALL.data[0, 0, 0]), float(BALL.data[12, 12, 12])
-    assert float(transfer(jnp.asarray(background))[1]) == 0
-    assert float(transfer(jnp.asarray(inside))[1]) > 0.1
-    flat = default_transfer(jv.Volume(np.full((3, 3, 3), 7, np.uint8)))
-    assert np.isfinite(np.asarray(flat.values)).all()
+def test_a_viewer_begins_with_the_automatic_transfer_function():
+    _, state = begin(BALL, None, None, None, **HOW)
+    _, same = begin(BALL, jv.automatic_transfer(BALL), None, None, **HOW)
+    assert state.curve == same.curve
 
 
 def test_what_the_viewer_does_not_show_is_refused():
