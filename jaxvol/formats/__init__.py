@@ -154,7 +154,7 @@ def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
     )
 
 
-def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:
+def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
     """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world.
 
     | ending | what |
@@ -185,8 +185,8 @@ def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:
     return Volume(data), probe
 
 
-def _existing(path: str | os.PathLike[str]) -> Path:
-    if not isinstance(path, (str, os.PathLike)):  # pyright: ignore[reportUnnecessaryIsInstance]
+def _existing(path: str | os.PathLike[str] | Any) -> Path:
+    if not isinstance(path, str | os.PathLike):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
     path = Path(path)
     if not path.exists():

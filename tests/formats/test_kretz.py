@@ -201,7 +201,7 @@ def test_load_points_to_the_reader_that_returns_the_probe_too(tmp_path):
 
 def test_a_path_of_another_type_is_refused():
     with pytest.raises(ValueError, match="path must be a str or a path; got 3"):
-        jv.load_ultrasound(3)  # pyright: ignore[reportArgumentType]
+        jv.load_ultrasound(3)
 
 
 def test_a_missing_file_and_a_directory_are_refused(tmp_path):
