@@ -46,7 +46,7 @@ READERS: dict[str, Reader] = {
 
 
 def load(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Any,
     *,
     shape: Sequence[int] | Any | None = None,
     dtype: str | Any | None = None,
