@@ -389,7 +389,7 @@ def test_a_plan_with_memory_is_by_bricks_where_the_volume_does_not_fit(volume_fi
 
 
 def test_files_that_are_not_read_in_parts_are_named(tmp_path, capsys):
-    jv.save(jv.phantom("linear", 4), tmp_path / "v.npz")
+    jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
     assert main(["render", str(tmp_path / "v.npz"), "--memory", "1M"]) == 2
     assert "is not of a kind that is read in parts" in capsys.readouterr().err
 

@@ -57,10 +57,13 @@ def _animate(options: argparse.Namespace) -> None:
     count = integer("--frames", options.frames, 1)
     if not 0 < options.fps <= 240:
         raise ValueError(f"--fps must be above 0, and 240 at most; got {options.fps:g}.")
-    output_file("--output", options.output)
-    kind = options.output.suffix.lower()
+    folder = options.output.is_dir()
+    output_file("--output", options.output / "frame_0000.png" if folder else options.output)
+    kind = "" if folder else options.output.suffix.lower()
     if kind not in ("", ".gif", ".mp4"):
         raise ValueError(f"--output: must end in .gif or .mp4, or be a folder; got {options.output}.")
+    if not kind and options.output.is_file():
+        raise ValueError(f"--output: {options.output} is a file, and no folder for frames.")
     if kind == ".mp4":
         _check_mp4(options.size)
     scene = scene_of(options)
