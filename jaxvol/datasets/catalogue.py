@@ -4,6 +4,7 @@ The list is that of the Open SciVis Datasets (klacansky.com/open-scivis-datasets
 `open_scivis.json` names.
 """
 
+import difflib
 import json
 import math
 from dataclasses import dataclass
@@ -96,4 +97,6 @@ def info(name: str | Any) -> Dataset:
     for dataset in catalogue().values():
         if wanted in (dataset.name, dataset.title.lower()):
             return dataset
-    raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.")
+    near = difflib.get_close_matches(str(name), names(), 1)
+    meant = f" Did you mean {near[0]}?" if near else ""
+    raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.{meant}")

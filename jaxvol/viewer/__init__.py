@@ -6,6 +6,7 @@ while it changes and fine at rest) has two faces, `notebook` and `page`, which o
 
 from typing import TYPE_CHECKING, Any
 
+from .._util.checks import integer
 from ..camera import Camera
 from ..compositing import Compositing
 from ..lighting.shading import Lighting
@@ -83,7 +84,7 @@ def serve(
     lit: bool = True,
     compositing: Mode | Compositing[Any] | Any = "over",
     background: Any = (1.0, 1.0, 1.0),
-    port: int = 8080,
+    port: int | Any = 8080,
     title: str = "jaxvol",
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
@@ -95,7 +96,7 @@ def serve(
     **Arguments:** as for `view`, except:
 
     - `volume`, `transfer`, `camera`, `march`, `lighting`, `lit`, `compositing`, `background`: the same.
-    - `port`: if it is taken, the next free one.
+    - `port`: from 1 to 65535; if it is taken, the next free one.
     - `title`: of the page's panel.
 
     **Returns:** the `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
@@ -106,6 +107,7 @@ def serve(
         from .page import Page
     except ImportError as fault:
         raise ImportError(f"serve needs {fault.name}: pip install jaxvol[view]") from fault
+    port = integer("port", port, 1, 65535)
     keep_programs_by_default()
     how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
     return Page(*begin(volume, transfer, camera, march, size=(640, 480), **how), port=port, title=title)

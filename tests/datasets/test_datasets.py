@@ -249,4 +249,6 @@ def test_the_command_lists_and_fetches(server, tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[0] == str(tmp_path / NOISE.file)
     assert (tmp_path / NOISE.file).read_bytes() == CONTENT
     assert main(["datasets", "fetch", "nois", *folder]) == 2
-    assert "jaxvol datasets: error: name must be one of" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "jaxvol datasets: error: name must be one of" in told
+    assert "got 'nois'. Did you mean" in told

@@ -75,3 +75,9 @@ def test_the_camera_of_a_page_is_that_of_the_volume(page):
     again = page._center + page._radius * page._shown(orbit.position)
     np.testing.assert_allclose(again, orbit.position)
     assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
+
+
+@pytest.mark.parametrize("port", [99999, 0, -5, "x"])
+def test_a_port_that_is_none_is_named(port):
+    with pytest.raises(ValueError, match="port must be an integer from 1 to 65535; got"):
+        jv.serve(jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3)), port=port)
