@@ -40,7 +40,7 @@ def levels_of(
     origin: Arrayable | None = None,
     shape: Sequence[int] | None = None,
     dtype: str | Any | None = None,
-    axes: str | Sequence[str] | None = None,
+    axes: str | Sequence[str] | Any | None = None,
     index: Mapping[str, int] | None = None,
     missing: Literal["error", "fill"] | Any | None = None,
 ) -> tuple[VoxelSource, ...]:

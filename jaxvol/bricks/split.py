@@ -150,7 +150,8 @@ def split(
             check_part(stored)
             raise TooLittleMemory(
                 f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
-                f"{' x '.join(map(str, size))} cells and what is read around them; got {memory}."
+                f"{' x '.join(map(str, size))} cells and what is read around them, less for a "
+                f"shorter step; got {memory}."
             )
         parts[max(left, key=lambda axis: (short[axis], size[axis]))] += 1
 

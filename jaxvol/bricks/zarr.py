@@ -59,7 +59,7 @@ class ZarrSource(VoxelSource):
         self,
         path: Path,
         *,
-        axes: str | Sequence[str] | None = None,
+        axes: str | Sequence[str] | Any | None = None,
         index: Mapping[str, int] | None = None,
         missing: Literal["error", "fill"] | Any = "error",
         spacing: Triple | None = None,
@@ -205,7 +205,7 @@ def _opened(path: Path, version: Literal[2, 3], *, fill: bool, cache: int) -> An
         raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
 
 
-def _axes(path: Path, axes: str | Sequence[str] | None, metadata: dict[str, Any], rank: int) -> list[str]:
+def _axes(path: Path, axes: Any, metadata: dict[str, Any], rank: int) -> list[str]:
     """A name for each axis of an array, x, y and z among them."""
     attributes = metadata.get("attributes") or {}
     told = metadata.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS")
@@ -213,7 +213,7 @@ def _axes(path: Path, axes: str | Sequence[str] | None, metadata: dict[str, Any]
         axes = told
     if axes is None and rank == 3:
         axes = SPACE
-    names = None if axes is None else list(axes)
+    names = list(axes) if isinstance(axes, Sequence) else None
     if names is None or len(names) != rank or len({*names}) != rank or not {*SPACE} <= {*names}:
         raise ValueError(
             f"axes must name each of the {rank} axes of {path} once, x, y and z among them, such as "

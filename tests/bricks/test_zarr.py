@@ -121,7 +121,7 @@ def test_an_index_chooses_along_other_axes(tmp_path):
             source_of(path, index=index)
 
 
-@pytest.mark.parametrize("axes", ["zy", "zzx", "zyxc", "abc", ["z", "y"]])
+@pytest.mark.parametrize("axes", ["zy", "zzx", "zyxc", "abc", ["z", "y"], 3])
 def test_axes_that_do_not_fit_are_refused(axes, tmp_path):
     path = written(tmp_path / "a.zarr", voxels("uint8"))
     with pytest.raises(ValueError, match="axes must name each of the 3 axes"):
