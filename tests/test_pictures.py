@@ -36,7 +36,6 @@ PANELS = {
 """How many pictures of scenes stand side by side, and below each other, on pages of several."""
 
 STALE = {
-    "paper_figs/output/gallery.png",
     "experiments/results/path_traced.png",
     "experiments/results/tomography.png",
 }
