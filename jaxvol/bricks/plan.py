@@ -137,7 +137,7 @@ def plan(
       needs. That is cautious where the volume is smooth, but the error is that of the copy: detail finer than
       n voxels has been seen in samples only. Whether faces and blocks are empty is not proven by a copy, so
       that `AlphaCorrection` and `SpaceLeaping` are kept. What is read around a brick is a number of steps:
-      where the smallest bricks do not fit, the step is halved, up to HALVED times.
+      where the smallest bricks do not fit, the step is halved, up to four times.
 
     **Arguments:**
 
@@ -182,7 +182,7 @@ def plan(
         except TooLittleMemory:  # what is read around a brick is a number of steps
             if halved == HALVED:
                 raise
-            halved, march = halved + 1, March(march.step / 2, march.transforms, march.quadrature)
+            halved, march = halved + 1, _finer(march, 2)
     loads = int(stream.visible.sum())
     nbytes = loads * int(np.prod(stream.stored)) * opened.dtype.itemsize
     found = found._replace(march=march, parts=parts, probed=time.perf_counter() - begun)
