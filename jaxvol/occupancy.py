@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
-from ._util.frame import Frame
+from ._util.frame import Frame, Order
 from ._util.memo import memoized
 from ._util.platform import while_loop
 from ._util.sharding import varying
@@ -151,7 +151,7 @@ class Occupancy(eqx.Module):
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
     size: Vec3
-    frame: Frame | None = None
+    frame: Frame | Order | None = None
 
     def sums(self) -> Sums:
         """For queries about boxes."""

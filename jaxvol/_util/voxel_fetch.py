@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
+from .axes import Axes
 from .vec3 import Scalar, Vec3
 from .xla import gather
 
@@ -29,11 +30,13 @@ SLOPE_BITS = 10
 class Window(eqx.Module):
     """The box of a grid that is in memory. Beyond it nothing is known: there its faces are read.
 
-    - `first`: node at which the box begins. `whole`: number of nodes of the grid.
+    - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both are along the axes of
+      the data. `axes`: along which axes of the world these run.
     """
 
     first: Int[Array, "3"]
     whole: tuple[int, int, int] = eqx.field(static=True)
+    axes: Axes = eqx.field(static=True)
 
 
 class Fetch(eqx.Module):

@@ -28,8 +28,9 @@ def voxel_type(stored: np.dtype) -> np.dtype:
     return np.dtype(np.float32) if stored.kind in "iu" else np.dtype(jnp.result_type(float))
 
 
-def converted(voxels: np.ndarray, box: Box, what: str) -> np.ndarray:
-    """Voxels as `voxel_type` says, and C-contiguous. `box`: what they were read from.
+def converted(voxels: np.ndarray, box: Box, axes: tuple[int, int, int], what: str) -> np.ndarray:
+    """Voxels as `voxel_type` says, and C-contiguous. `box`: what they were read from. `axes`: of the box, in
+    their order.
 
     **Raises:** `ValueError` for NaN, infinity, and integers that float32 does not hold exactly, with the
     place of the first.
@@ -54,7 +55,7 @@ def converted(voxels: np.ndarray, box: Box, what: str) -> np.ndarray:
     if not fine:
         wrong = ~(abs(voxels) < np.inf)
         first = np.unravel_index(np.argmax(wrong), voxels.shape)
-        place = tuple(int(i) + start for i, start in zip(first, box[0], strict=True))
+        place = tuple(start + int(first[axes.index(axis)]) for axis, start in enumerate(box[0]))
         raise ValueError(
             f"{what}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite in the "
             f"box {box[0]} to {box[1]}, the first at {place}. Replace them first."

@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from .._util.axes import XYZ, Axes
 from .._util.checks import finite_array
 from .._util.files import Header, check_size, decoding, file_size
 from .._util.npy import npy_header
 from .._util.voxels import check_shape
 from ..formats.raw import raw_header
 from .dtypes import voxel_type
-from .sources import VoxelSource, empty_box
+from .sources import VoxelSource, by_stride, empty_box
 
 
 GAP = 2**14
@@ -80,7 +81,7 @@ class FileSource(VoxelSource):
                 f"path: {path} is cut short: it holds {size} bytes, and its last voxel ends at {end}. Check "
                 "shape and dtype, or fetch the file again."
             )
-        slow, *_ = self._order = sorted(range(3), key=lambda axis: -self._strides[axis])
+        slow, *_ = self.order = by_stride(self._strides)
         x, y, z = (1 if axis == slow else n for axis, n in enumerate(self.shape))
         self.chunks = (x, y, z)
         self._state = self._state_of(os.stat(self.path))
@@ -113,38 +114,45 @@ class FileSource(VoxelSource):
             x, y, z = ((n - 1) * piece // (SAMPLES - 1) for n in self.shape)
             nx, ny, nz = self.shape
             low, high = (x, y, z), (min(x + 8, nx), min(y + 8, ny), min(z + 8, nz))
-            own, given = self._stored(low, high), array[tuple(map(slice, low, high))]
+            own, given = self._stored(low, high, XYZ), array[tuple(map(slice, low, high))]
             if own.tobytes() != given.astype(own.dtype).tobytes():
                 return False
         return True
 
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
-        order, size = self._order, self._type.itemsize
-        first, b, c = (low[axis] for axis in order)
-        count, rows, row = (high[axis] - low[axis] for axis in order)
-        plane_stride, row_stride, _ = (self._strides[axis] for axis in order)
-        whole_rows = row_stride - row * size <= GAP
-        run = memoryview(bytearray((rows - 1) * row_stride + row * size if whole_rows else row * size))
-        together = max(1, min(count, AT_ONCE // (rows * row * size)))
-        planes = np.empty((together, rows, row), self._type)
-        voxels = empty_box(low, high, self._type.newbyteorder("="))
-        ordered = voxels.transpose(order)
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
+        voxels = empty_box(low, high, axes, self._type.newbyteorder("="))
+        ordered = voxels.transpose([axes.index(axis) for axis in self.order])
+        count, rows, row = ordered.shape
         with self._opened() as file:
-            for begin in range(0, count, together):
-                some = planes[: count - begin]
-                for number, plane in enumerate(some):
-                    at = self._start + (first + begin + number) * plane_stride + b * row_stride + c * size
-                    if whole_rows:
-                        self._fill(file, at, run)
-                        plane[:] = np.ndarray((rows, row), self._type, run, 0, (row_stride, size))
-                        continue
-                    for of_plane in range(rows):
-                        self._fill(file, at + of_plane * row_stride, run)
-                        plane[of_plane] = np.frombuffer(run, self._type)
+            if ordered.flags.c_contiguous:
+                self._planes(file, low, 0, ordered.view(self._type))
+                return voxels if self._type.isnative else voxels.byteswap(inplace=True)
+            some = np.empty((max(1, min(count, AT_ONCE // ordered[0].nbytes)), rows, row), self._type)
+            for begin in range(0, count, len(some)):
+                planes = some[: count - begin]
+                self._planes(file, low, begin, planes)
                 # one row of all planes after the other: NumPy transposes two axes fast, and three slowly
-                for of_plane in range(rows):
-                    ordered[begin : begin + len(some), of_plane] = some[:, of_plane]
+                for number in range(rows):
+                    ordered[begin : begin + len(planes), number] = planes[:, number]
         return voxels
+
+    def _planes(self, file: FileIO, low: tuple[int, int, int], begin: int, planes: np.ndarray) -> None:
+        """Reads planes of a box, in the order of storage, from the one numbered `begin` in the box on."""
+        size, (_, rows, row) = self._type.itemsize, planes.shape
+        plane_stride, row_stride, _ = (self._strides[axis] for axis in self.order)
+        gap = row_stride - row * size
+        run = memoryview(bytearray((rows - 1) * row_stride + row * size if gap <= GAP else 0))
+        at = self._start + sum(first * stride for first, stride in zip(low, self._strides, strict=True))
+        for number, plane in enumerate(planes, begin):
+            start = at + number * plane_stride
+            if not gap:
+                self._fill(file, start, _bytes_of(plane))
+            elif gap <= GAP:
+                self._fill(file, start, run)
+                plane[:] = np.ndarray((rows, row), self._type, run, 0, (row_stride, size))
+            else:
+                for of_plane, one in enumerate(plane):
+                    self._fill(file, start + of_plane * row_stride, _bytes_of(one))
 
     def _fill(self, file: FileIO, at: int, part: memoryview) -> None:
         file.seek(at)
@@ -167,6 +175,11 @@ class FileSource(VoxelSource):
     def _state_of(self, status: os.stat_result) -> tuple[int, ...]:
         time = 0 if self._writable else status.st_mtime_ns
         return status.st_size, status.st_ino, status.st_dev, time
+
+
+def _bytes_of(voxels: np.ndarray) -> memoryview:
+    """The memory of a contiguous array."""
+    return voxels.reshape(-1).view(np.uint8).data
 
 
 def raw(

@@ -186,7 +186,7 @@ def plan(
     loads = int(stream.visible.sum())
     nbytes = loads * int(np.prod(stream.stored)) * opened.dtype.itemsize
     found = found._replace(march=march, parts=parts, probed=time.perf_counter() - begun)
-    return BudgetPlan(found, opened, room, stride, stream.grid.counts, loads, nbytes, compositing, cache)
+    return BudgetPlan(found, opened, room, stride, stream.report().counts, loads, nbytes, compositing, cache)
 
 
 def copied(source: VoxelSource, stride: int) -> Volume:

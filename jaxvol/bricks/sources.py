@@ -14,6 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
+from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, is_traced
 from .._util.voxels import check_shape, given_array
 from ..volume import Volume
@@ -24,6 +25,7 @@ Result = TypeVar("Result")
 
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
+
 
 ALIGNED = 64
 """Bytes, of whose multiples the addresses of JAX's arrays are."""
@@ -46,6 +48,8 @@ class VoxelSource(ABC):
     - `chunks`: voxels along x, y, z of the parts in which it is stored. Reading parts of these costs as much
       as reading all. Boxes that are longest along the axes of long chunks are read fastest.
     - `beside`: the path that files derived from the data are named after; None for data in memory.
+    - `order`: axes in the order of storage: along the first one, neighbours lie farthest apart, along the
+      last one, side by side. By default x, y, z.
     """
 
     name: str
@@ -55,6 +59,7 @@ class VoxelSource(ABC):
     origin: tuple[float, float, float] | None
     chunks: tuple[int, int, int]
     beside: Path | None
+    order: Axes = XYZ
 
     @property
     def nbytes(self) -> int:
@@ -62,8 +67,11 @@ class VoxelSource(ABC):
         nx, ny, nz = self.shape
         return nx * ny * nz * self.dtype.itemsize
 
-    def read(self, low: Corner, high: Corner) -> np.ndarray:
+    def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
         """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
+
+        **Arguments:** `low`, `high`: corners of the box. `axes`: of what is returned: data[z, y, x] for
+        (2, 1, 0). In the `order` of storage, voxels keep their order, and are read fastest.
 
         **Returns:** a C-contiguous array of type `dtype` in native byte order. It may be a view of the source
         where that is an array: do not write to it.
@@ -73,7 +81,7 @@ class VoxelSource(ABC):
         time of a single file tell, changed since the source was made.
         """
         box = self._box(low, high)
-        return converted(self._stored(*box), box, self.name)
+        return converted(self._stored(*box, axes), box, axes, self.name)
 
     def read_async(self, low: Corner, high: Corner) -> "Future[np.ndarray]":
         """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
@@ -89,8 +97,9 @@ class VoxelSource(ABC):
         voxels is then valid for this object alone, and while nobody writes to it."""
 
     @abstractmethod
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
-        """The voxels of a box that lies inside, as they are stored: of any byte order and memory layout."""
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
+        """The voxels of a box that lies inside, with its axes in this order, as they are stored: of any byte
+        order, and any layout in memory."""
 
     def _box(self, low: Corner, high: Corner) -> Box:
         try:
@@ -131,20 +140,64 @@ class ArraySource(VoxelSource):
         self.shape = nx, ny, nz = self._data.shape
         self.dtype = voxel_type(self._data.dtype)
         self.spacing, self.origin = spacing, origin
-        slowest = int(np.argmax(np.abs(self._data.strides)))
+        slowest, *_ = self.order = by_stride(self._data.strides)
         self.chunks = (1, ny, nz) if slowest == 0 else (nx, 1, nz) if slowest == 1 else (nx, ny, 1)
 
     def fingerprint(self) -> dict[str, Any] | None:
         return None
 
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
-        return self._data[tuple(map(slice, low, high))]
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
+        return self._data[tuple(map(slice, low, high))].transpose(axes)
 
 
-def empty_box(low: Corner, high: Corner, dtype: np.dtype) -> np.ndarray:
-    """An array for the voxels of a box. It is aligned as JAX aligns its own, so that `jax.device_put` uses it
-    in place where the device is the CPU."""
-    shape = tuple(int(b) - int(a) for a, b in zip(low, high, strict=True))
+class Reordered(VoxelSource):
+    """A source with its axes in another order: along its own first axis runs `axes[0]` of the source, and so
+    on. Errors tell boxes as the source has them.
+
+    **Arguments:** `source`: the voxels. `axes`: the order.
+    """
+
+    def __init__(self, source: VoxelSource, axes: Axes):
+        self.source, self.axes = source, axes
+        self.name, self.dtype, self.beside = source.name, source.dtype, source.beside
+        self.shape, self.chunks = permuted(source.shape, axes), permuted(source.chunks, axes)
+        self.spacing, self.origin = source.spacing and permuted(source.spacing, axes), source.origin
+        self.order = permuted(inverse(axes), source.order)
+
+    def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
+        low, high = self._box(low, high)
+        back = inverse(self.axes)
+        return self.source.read(permuted(low, back), permuted(high, back), permuted(self.axes, axes))
+
+    def fingerprint(self) -> dict[str, Any] | None:
+        found = self.source.fingerprint()
+        return None if found is None else found | {"axes of the source": list(self.axes)}
+
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
+        return self.read(low, high, axes)
+
+
+def in_storage_order(source: VoxelSource) -> VoxelSource:
+    """The source with its axes in the order of storage."""
+    return source if source.order == XYZ else Reordered(source, source.order)
+
+
+def axes_of(source: VoxelSource) -> Axes:
+    """The order in which `in_storage_order` has put the axes of a source."""
+    return source.axes if isinstance(source, Reordered) else XYZ
+
+
+def by_stride(strides: Sequence[int]) -> Axes:
+    """Axes in the order of storage, by the distances of neighbours along them."""
+    a, b, c = sorted(range(3), key=lambda axis: -abs(strides[axis]))
+    return a, b, c
+
+
+def empty_box(low: Corner, high: Corner, axes: Axes, dtype: np.dtype) -> np.ndarray:
+    """An array for the voxels of a box, with its axes in this order. It is aligned as JAX aligns its own, so
+    that `jax.device_put` uses it in place where the device is the CPU."""
+    size = [int(b) - int(a) for a, b in zip(low, high, strict=True)]
+    shape = permuted(size, axes)
     size = math.prod(shape) * dtype.itemsize
     memory = np.empty(size + ALIGNED, np.uint8)
     start = -memory.ctypes.data % ALIGNED

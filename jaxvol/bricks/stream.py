@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
+from .._util.axes import inverse, permuted
 from .._util.memory import give_back
 from .._util.xla import compiled
 from ..camera import Camera
@@ -24,10 +25,10 @@ from ..reference import Progress
 from ..rendering import BrickReport
 from ..space import Ray, Space
 from ..transforms import ToroidalMap
-from ..volume import Volume, part_of
+from ..volume import Volume, part_of, with_voxels
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
-from .sources import VoxelSource, in_background
+from .sources import VoxelSource, axes_of, in_background
 from .split import Margin, bytes_of, check_part, fits, split, stored_of, stored_shape
 from .summary import Summary
 
@@ -107,9 +108,10 @@ class Stream:
         probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
         margin = Margin.of(march, space, source.shape, options.tiling.cells, shown)
         if counts is None:
-            grid = split(source.shape, source.dtype, memory, margin, probe, least)
+            grid = split(source.shape, source.dtype, memory, margin, probe, least, _rows_of(source))
         else:
-            x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
+            along = permuted(counts, axes_of(source))
+            x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, along, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
         alone = stored_of(grid, margin, probe if method == "overlap" else None)
         check_part(alone)
@@ -176,13 +178,14 @@ class Stream:
 
     def report(self) -> BrickReport:
         """What all passes so far took."""
+        back = inverse(axes_of(self.source))
         return BrickReport(
-            self.grid.counts,
+            permuted(self.grid.counts, back),
             int(self.visible.sum()),
             len(self.loads),
             len(self.loads) - len(set(self.loads)),
             self.bytes_read,
-            self.stored,
+            permuted(self.stored, back),
             bytes_of(self.stored, self.source.dtype, self.margin),
         )
 
@@ -190,8 +193,7 @@ class Stream:
         """A part of the volume, once it is read."""
         volume = self.scene.volume
         voxels = jax.device_put(load.voxels.result())  # on a CPU, not copied if a file was read (`empty_box`)
-        part = Volume(voxels, volume.spacing, volume.origin, direction=volume.direction)
-        return part_of(part, jnp.asarray(load.first, jnp.int32), self.grid.shape)
+        return part_of(with_voxels(volume, voxels), jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
     def _turns(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:
         """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the
@@ -310,13 +312,19 @@ class Stream:
         voxels = self.source.read(low, high)
         least, most = self.summary.range_of(low, high)
         if float(voxels.min()) < least or float(voxels.max()) > most:
+            box = [permuted(end.tolist(), inverse(axes_of(self.source))) for end in (low, high)]
             raise ValueError(
                 f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
-                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now "
+                f"{most} in the box {box[0]} to {box[1]}, and now "
                 f"{voxels.min()} to {voxels.max()}. Delete the file of ranges beside it (`cache`), or pass "
                 "cache=None, and open it again."
             )
         return voxels
+
+
+def _rows_of(source: VoxelSource) -> int | None:
+    """The axis of rows in a file, where a piece of one takes as long to read as the whole."""
+    return source.order[-1] if source.chunks[source.order[-1]] == source.shape[source.order[-1]] else None
 
 
 def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._util.axes import Axes, inverse, permuted
 from .._util.checks import integer
 from .._util.memory import give_back
 from ..occupancy import BLOCK, Blocks, over_blocks, widened
 from ..volume import Volume
-from .sources import Corner, VoxelSource
+from .sources import Corner, VoxelSource, axes_of, in_storage_order
 from .streaming import slabs
 
 
@@ -56,6 +57,11 @@ class Summary:
             )
         )
         return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
+
+    def reordered(self, axes: Axes) -> "Summary":
+        """That of the same voxels with their axes in another order (`sources.Reordered`)."""
+        ranges = {name: np.ascontiguousarray(part.transpose(axes)) for name, part in self.ranges.items()}
+        return Summary(permuted(self.shape, axes), self.cell, ranges)
 
     def blocks(self, low: Corner | None = None, high: Corner | None = None) -> Blocks:
         """The `Blocks` of the volume, or of the voxels with `low` <= (x, y, z) < `high` as a volume of their
@@ -120,6 +126,7 @@ def scan(
     cell = integer("cell", cell, BLOCK)
     if cell % BLOCK:
         raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
+    source = in_storage_order(source)
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     ranges: dict[str, np.ndarray] = {}
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
@@ -135,7 +142,8 @@ def scan(
         if progress is not None:
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
     give_back()
-    return Summary(source.shape, cell, ranges)
+    found = Summary(source.shape, cell, ranges)
+    return found.reordered(inverse(axes_of(source)))
 
 
 @jax.jit

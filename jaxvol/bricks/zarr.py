@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from .._util.axes import XYZ, Axes, inverse
 from .._util.checks import described, integer
 from .._util.voxels import check_shape
 from .dtypes import voxel_type
@@ -88,6 +89,8 @@ class ZarrSource(VoxelSource):
             for c, n in zip(self._store.chunk_layout.read_chunk.shape, (nx, ny, nz), strict=True)
         )
         self.chunks = (x, y, z)
+        i, j, k = self._store.chunk_layout.inner_order or XYZ
+        self.order = i, j, k
         self.spacing, self.origin = spacing, origin
 
     def fingerprint(self) -> dict[str, Any] | None:
@@ -107,17 +110,18 @@ class ZarrSource(VoxelSource):
             "complete": self._complete,
         }
 
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
         import tensorstore
 
         # layer by layer: tensorstore holds all chunks of what it is asked for at once
         axis, ends = self._layers(low, high)
-        voxels = empty_box(low, high, np.dtype(self._store.dtype.numpy_dtype))
+        voxels = empty_box(low, high, axes, np.dtype(self._store.dtype.numpy_dtype))
+        ordered = voxels.transpose(inverse(axes))
         try:
             for begin, end in pairwise(ends):
                 layer = [slice(a, b) for a, b in zip(low, high, strict=True)]
                 layer[axis] = slice(begin, end)
-                part = voxels[_along(axis, begin - low[axis], end - low[axis])]
+                part = ordered[_along(axis, begin - low[axis], end - low[axis])]
                 # from the decoded chunks to their place, without another copy
                 there = tensorstore.array(part, copy=False, write=True)
                 there.write(self._store[tuple(layer)].translate_to[0, 0, 0]).result()

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import Arrayable, described, finite_array, flag, require
+from .._util.frame import Frame
 from .._util.vec3 import Scalar, Vec3, apart, dot
 from ..march import Transform
 from ..occupancy import Occupancy
@@ -122,7 +123,7 @@ class HalfSpace(NamedTuple):
         a, b, c = map(jnp.abs, grid.own_direction(self.normal))
         # as far as coordinates go: what rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
-        if grid.frame is not None:
+        if isinstance(grid.frame, Frame):
             ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.origin))
         reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
         middle = x[:, None, None], y[None, :, None], z[None, None]

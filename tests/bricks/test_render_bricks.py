@@ -228,9 +228,9 @@ class Counting(VoxelSource):
     def fingerprint(self):
         return None
 
-    def _stored(self, low, high):
+    def _stored(self, low, high, axes):
         self.reads.append((low, high))
-        return self._of._stored(low, high)
+        return self._of._stored(low, high, axes)
 
 
 def test_only_bricks_that_are_needed_are_read():
