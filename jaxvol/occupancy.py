@@ -26,6 +26,9 @@ from .volume import Volume
 BLOCK = 4
 """Cells of the voxel grid along the side of a block."""
 
+LAYERS = 8
+"""Layers of blocks whose extremes are found at a time."""
+
 FARTHEST = 255
 """Stands for a grid without any occupied cell. Distances in others, in cells, are at most one less."""
 
@@ -203,7 +206,30 @@ def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array,
 
 @jax.jit
 def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-    return widened(over_blocks(data, jnp.minimum), over_blocks(data, jnp.maximum))
+    return widened(*extremes(data))
+
+
+@jax.jit
+def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"], Shaped[Array, "bx by bz"]]:
+    """Least and greatest node of each block; NaN where a node is."""
+
+    def of(nodes: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
+        return over_blocks(nodes, jnp.minimum), over_blocks(nodes, jnp.maximum)
+
+    whole = (data.shape[0] - 1) // BLOCK
+    if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
+        return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
+    # some layers of blocks at a time, which stay in the cache of a CPU: of bytes, this is three times as fast
+    low, high = jax.lax.map(
+        lambda first: of(jax.lax.dynamic_slice_in_dim(data, first, BLOCK + 1)),
+        BLOCK * jnp.arange(whole),
+        batch_size=LAYERS,
+    )
+    low, high = low[:, 0], high[:, 0]
+    if whole * BLOCK < data.shape[0] - 1:
+        last_low, last_high = of(data[whole * BLOCK :])
+        low, high = jnp.concatenate([low, last_low]), jnp.concatenate([high, last_high])
+    return low, high
 
 
 @jax.jit

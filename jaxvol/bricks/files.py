@@ -108,6 +108,12 @@ class FileSource(VoxelSource):
             "voxels": [self._type.str, self._start, *self.shape, *self._strides],
         }
 
+    def touched(self, size: tuple[int, int, int]) -> int:
+        planes, rows, row = (size[axis] for axis in self.order)
+        _, row_stride, voxel = (self._strides[axis] for axis in self.order)
+        with_gap = row_stride if row_stride - row * voxel <= GAP else row * voxel + GAP
+        return planes * rows * with_gap
+
     def holds(self, array: np.ndarray) -> bool:
         """Whether the file has these voxels, as far as samples of them tell."""
         for piece in range(SAMPLES):

@@ -67,6 +67,14 @@ class VoxelSource(ABC):
         nx, ny, nz = self.shape
         return nx * ny * nz * self.dtype.itemsize
 
+    def touched(self, size: tuple[int, int, int]) -> int:
+        """Bytes of storage, uncompressed, that are read for a box of so many voxels, about."""
+        chunks = (
+            min(-(-(s - 1) // c) + 1, -(-n // c)) * c
+            for s, c, n in zip(size, self.chunks, self.shape, strict=True)
+        )
+        return math.prod(chunks) * self.dtype.itemsize
+
     def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
         """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
 
@@ -143,6 +151,9 @@ class ArraySource(VoxelSource):
         slowest, *_ = self.order = by_stride(self._data.strides)
         self.chunks = (1, ny, nz) if slowest == 0 else (nx, 1, nz) if slowest == 1 else (nx, ny, 1)
 
+    def touched(self, size: tuple[int, int, int]) -> int:
+        return math.prod(size) * self.dtype.itemsize
+
     def fingerprint(self) -> dict[str, Any] | None:
         return None
 
@@ -168,6 +179,9 @@ class Reordered(VoxelSource):
         low, high = self._box(low, high)
         back = inverse(self.axes)
         return self.source.read(permuted(low, back), permuted(high, back), permuted(self.axes, axes))
+
+    def touched(self, size: tuple[int, int, int]) -> int:
+        return self.source.touched(permuted(size, inverse(self.axes)))
 
     def fingerprint(self) -> dict[str, Any] | None:
         found = self.source.fingerprint()

@@ -23,12 +23,10 @@ from .ranges import reach
 EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
-SHORT, FLAT = 32, 8
-"""Cells."""
-
-COPIES = 3
-"""Of each voxel of a brick: in the device; of the next brick, as read; and what reading and finding the
-extremes of blocks takes, less than one."""
+COPIES = 2.5
+"""Of each voxel of a brick: in the device; of the next brick, as read; and what finding the
+extremes of blocks takes, less than half. Voxels of a type that is converted take one more while they are
+read."""
 
 
 class TooLittleMemory(ValueError):
@@ -128,29 +126,21 @@ def fits(stored: Node, dtype: Any, margin: Margin, memory: int) -> bool:
 
 
 def split(
-    shape: Node,
-    dtype: Any,
-    memory: int,
-    margin: Margin,
-    probe: ToroidalMap | None,
-    least: int = 1,
-    rows: int | None = None,
+    shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None, least: int = 1
 ) -> BrickGrid:
     """Few bricks that fit into so many bytes, and have fewer than 2**31 voxels: there is one more along the
     axis where they are longest, until they do; first among the axes along which the smallest bricks, with
     what is read around them, are shorter than the volume. There are at least `least`, unless they would be
-    smaller than bricks are. `rows`: the axis of rows that are read as a whole in one piece: it is cut once
-    the others are short (SHORT, and FLAT times what is read on a side).
+    smaller than bricks are.
 
     **Raises:** `TooLittleMemory` if the smallest ones do not fit."""
     memory = integer("memory", memory, 1)
     cells = [n - 1 for n in shape]
     x, y, z = (min(EDGE, c) for c in cells)
     short = np.less(stored_of(BrickGrid(shape, (x, y, z)), margin, probe), shape).tolist()
-    enough = [SHORT + FLAT * m for m in margin.cells]
     parts = [1, 1, 1]
     while True:
-        size = [_rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
+        size = [rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
         grid = BrickGrid(shape, (size[0], size[1], size[2]))
         stored = stored_of(grid, margin, probe)
         left = [axis for axis in range(3) if size[axis] > min(EDGE, cells[axis])]
@@ -164,8 +154,7 @@ def split(
                 f"{' x '.join(map(str, size))} cells and what is read around them, less for a "
                 f"shorter step; got {memory}."
             )
-        others = [axis for axis in left if axis != rows and size[axis] > enough[axis]]
-        parts[max(others or left, key=lambda axis: (short[axis], size[axis]))] += 1
+        parts[max(left, key=lambda axis: (short[axis], size[axis]))] += 1
 
 
 def check_part(stored: Node) -> None:
@@ -184,5 +173,6 @@ def stored_of(grid: BrickGrid, margin: Margin, probe: ToroidalMap | None) -> Nod
     return stored_shape(grid.shape, (wanted[0], wanted[1], wanted[2]))
 
 
-def _rounded(size: int, cells: int) -> int:
+def rounded(size: int, cells: int) -> int:
+    """Cells of a brick along an axis of so many, at least `size`."""
     return min(-(-size // EDGE) * EDGE, cells)

@@ -1,5 +1,6 @@
 """Takes an image's rays through all bricks in turn, while the next brick is read."""
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -20,12 +21,13 @@ from ..engine.batch import CellRange
 from ..engine.image import RenderOptions
 from ..engine.scene import Scene
 from ..march import March
-from ..occupancy import BLOCK, Blocks, widened as with_slack
+from ..occupancy import BLOCK
 from ..reference import Progress
 from ..rendering import BrickReport
 from ..space import Ray, Space
 from ..transforms import ToroidalMap
 from ..volume import Volume, part_of, with_voxels
+from .choice import cheapest, visible
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
 from .sources import VoxelSource, axes_of, in_background
@@ -102,17 +104,24 @@ class Stream:
 
         - `summary_of`: called once it is known that bricks fit, since it may read the whole source.
         - `counts`: along each axis, in place of as few as fit into `memory`, and at least `least`."""
+        assert isinstance(marched.source, Camera)
         march = marched.march
         space = march.locate(marched.volume)
         straight = is_straight(space)
         probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
         margin = Margin.of(march, space, source.shape, options.tiling.cells, shown)
         if counts is None:
-            grid = split(source.shape, source.dtype, memory, margin, probe, least, _rows_of(source))
+            grid = split(source.shape, source.dtype, memory, margin, probe, least)
         else:
             along = permuted(counts, axes_of(source))
             x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, along, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
+        check_part(stored_of(grid, margin, None))
+        summary = summary_of()
+        occupied = _occupied(marched, summary)
+        if counts is None and straight:
+            rays = math.prod(marched.source.size)
+            grid = cheapest(grid, source, summary, occupied, margin, memory, rays, least)
         alone = stored_of(grid, margin, probe if method == "overlap" else None)
         check_part(alone)
         stored = alone
@@ -120,9 +129,7 @@ class Stream:
             middle = (np.asarray(source.shape) - 1) / 2
             typical = replace(margin, cells=margin.of_box(space, source.shape, middle, middle))
             stored = stored_of(grid, typical, probe if method == "overlap" else None)
-        assert isinstance(marched.source, Camera)
-        summary = summary_of()
-        order, visible = grid.order(space, marched.source), _visible(marched, grid, summary)
+        order, seen = grid.order(space, marched.source), visible(grid, summary, occupied)
         return cls(
             *(
                 source,
@@ -133,7 +140,7 @@ class Stream:
                 grid,
                 margin,
                 order,
-                visible,
+                seen,
                 straight,
                 alone,
                 stored,
@@ -322,19 +329,9 @@ class Stream:
         return voxels
 
 
-def _rows_of(source: VoxelSource) -> int | None:
-    """The axis of rows in a file, where a piece of one takes as long to read as the whole."""
-    return source.order[-1] if source.chunks[source.order[-1]] == source.shape[source.order[-1]] else None
-
-
-def _visible(scene: Scene, grid: BrickGrid, summary: Summary) -> np.ndarray:
-    """For each brick, whether anything may be visible in it."""
-    corners = [grid.cells(brick) for brick in range(grid.number)]
-    ranges = np.array([summary.range_of(low, [end + 1 for end in high]) for low, high in corners])
-    low, high = (jnp.asarray(end.reshape(grid.counts), jnp.float32) for end in ranges.T)
-    low, high = with_slack(low, high)
-    blocks = Blocks(low, high, None)
-    return np.asarray(scene.compositing.occupied(scene.transfer, blocks)).reshape(-1)
+def _occupied(scene: Scene, summary: Summary) -> np.ndarray:
+    """For each block of a summary, whether anything may be visible in it."""
+    return np.asarray(scene.compositing.occupied(scene.transfer, summary.of_cells()))
 
 
 def _straight(

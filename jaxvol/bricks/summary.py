@@ -8,15 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._util.axes import Axes, inverse, permuted
 from .._util.checks import integer
 from .._util.memory import give_back
-from ..occupancy import BLOCK, Blocks, over_blocks, widened
+from ..occupancy import BLOCK, Blocks, extremes, widened
 from ..volume import Volume
 from .sources import Corner, VoxelSource, axes_of, in_storage_order
 from .streaming import slabs
@@ -62,6 +60,11 @@ class Summary:
         """That of the same voxels with their axes in another order (`sources.Reordered`)."""
         ranges = {name: np.ascontiguousarray(part.transpose(axes)) for name, part in self.ranges.items()}
         return Summary(permuted(self.shape, axes), self.cell, ranges)
+
+    def of_cells(self) -> Blocks:
+        """The ranges themselves, as blocks of `cell`³ cells."""
+        least, most = widened(jnp.asarray(self.ranges["low"]), jnp.asarray(self.ranges["high"]))
+        return Blocks(least, most, None)
 
     def blocks(self, low: Corner | None = None, high: Corner | None = None) -> Blocks:
         """The `Blocks` of the volume, or of the voxels with `low` <= (x, y, z) < `high` as a volume of their
@@ -132,7 +135,7 @@ def scan(
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
     nx, ny, nz = source.shape
     for slab in slabs(source, memory):
-        found = map(np.asarray, _extremes(Volume(slab.voxels).data))
+        found = map(np.asarray, extremes(Volume(slab.voxels).data))
         for (name, combine), part in zip(COMBINED.items(), found, strict=True):
             merged, place = _merged(part, slab.first, cell // BLOCK, combine)
             if name not in ranges:
@@ -144,11 +147,6 @@ def scan(
     give_back()
     found = Summary(source.shape, cell, ranges)
     return found.reordered(inverse(axes_of(source)))
-
-
-@jax.jit
-def _extremes(data: Array) -> tuple[Array, Array]:
-    return over_blocks(data, jnp.minimum), over_blocks(data, jnp.maximum)
 
 
 def _merged(
