@@ -16,7 +16,7 @@ from .._util.checks import integer
 from .._util.memory import give_back
 from ..occupancy import BLOCK, Blocks, extremes, widened
 from ..volume import Volume
-from .sources import Corner, VoxelSource, axes_of, in_storage_order
+from .sources import Corner, VoxelSource, in_storage_order
 from .streaming import slabs
 
 
@@ -129,7 +129,7 @@ def scan(
     cell = integer("cell", cell, BLOCK)
     if cell % BLOCK:
         raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
-    source = in_storage_order(source)
+    axes, source = source.order, in_storage_order(source)
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     ranges: dict[str, np.ndarray] = {}
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
@@ -146,7 +146,7 @@ def scan(
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
     give_back()
     found = Summary(source.shape, cell, ranges)
-    return found.reordered(inverse(axes_of(source)))
+    return found.reordered(inverse(axes))
 
 
 def _merged(

@@ -48,9 +48,9 @@ IMAGES = """
     peak()
     some = FileSource._stored
 
-    def all_of_it(source, low, high):
-        whole = some(source, (0, 0, 0), source.shape)
-        return whole[tuple(map(slice, low, high))]
+    def all_of_it(source, low, high, axes):
+        whole = some(source, (0, 0, 0), source.shape, (0, 1, 2))
+        return whole[tuple(map(slice, low, high))].transpose(axes)
 
     FileSource._stored = all_of_it
     peak()
@@ -153,9 +153,9 @@ def reads(monkeypatch):
     """The boxes that are read of files."""
     boxes, stored = [], FileSource._stored
 
-    def counted(source, low, high):
+    def counted(source, low, high, axes):
         boxes.append((low, high))
-        return stored(source, low, high)
+        return stored(source, low, high, axes)
 
     monkeypatch.setattr(FileSource, "_stored", counted)
     return boxes

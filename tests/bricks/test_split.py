@@ -13,7 +13,7 @@ from jaxvol.bricks import BrickGrid, Summary, source_of
 from jaxvol.bricks.files import FileSource
 from jaxvol.bricks.ranges import Turn
 from jaxvol.bricks.render import _scene_of, bricks_of
-from jaxvol.bricks.split import Margin, nodes_within, split, stored_of
+from jaxvol.bricks.split import COPIES, Margin, nodes_within, split, stored_of
 from jaxvol.bricks.stream import Stream, _curved
 from jaxvol.engine.image import RenderOptions
 from jaxvol.engine.parts import set_out
@@ -129,10 +129,10 @@ def test_a_brick_has_fewer_voxels_than_a_volume_may_have():
 
 def test_no_axis_is_split_along_which_bricks_would_be_read_whole():
     margin = Margin((1, 20, 2), 1, 1.0, 0.0, 1, False)
-    grid = split((65, 49, 65), np.uint8, 150_000, margin, None)
+    grid = split((65, 49, 65), np.uint8, 125_000, margin, None)
     assert stored_of(grid, margin, None)[1] == 49
     assert grid.counts[1] == 1
-    assert math.prod(stored_of(grid, margin, None)) * 3 <= 150_000
+    assert math.prod(stored_of(grid, margin, None)) * COPIES <= 125_000
 
 
 def test_bricks_that_are_too_large_for_a_volume_are_named():

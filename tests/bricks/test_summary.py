@@ -47,9 +47,9 @@ class Counting:
             monkeypatch.setattr(kind, "_stored", self._counted(kind._stored))
 
     def _counted(self, stored):
-        def counted(source, low, high):
+        def counted(source, low, high, axes):
             self.boxes.append((low, high))
-            return stored(source, low, high)
+            return stored(source, low, high, axes)
 
         return counted
 
