@@ -91,7 +91,7 @@ WAY = """
 """
 DURING_THE_IMAGE = """
     def second(done, of):
-        if done == 3:
+        if done == 2:
             wait()
 
     rendered(sys.argv[1], progress=second)
@@ -119,7 +119,7 @@ WHILE_THE_CACHE_IS_WRITTEN = """
 def rendered(path, **options):
     """An image of the balls in a raw file, at a budget that takes several slabs and bricks."""
     march, camera = jv.March(0.5, (jv.SpaceLeaping(),)), outside(jv.Volume(balls()), 24)
-    return jv.render_bricks(path, TRANSFER, camera, march, memory=100_000, **options)
+    return jv.render_bricks(path, TRANSFER, camera, march, memory=115_000, **options)
 
 
 def killed(way: str, path: Path, sign: signal.Signals) -> None:
