@@ -118,7 +118,7 @@ PAINT = jv.TransferFunction([-0.8, -0.2, 0.2, 0.8], [RED, RED, PALE, PALE], [2.0
 def across(size: int) -> jv.Camera:
     """From one side of the fan to the other, so little from beyond it that rays dip as far as they can below
     the face, and that the brick beyond the face has the first turn."""
-    return jv.Camera((300, 2, 48), (0, 0, 45), (0, 0, 1), size=(size, size), parallel_scale=ACROSS / 2)
+    return jv.Camera((300, 2, 60), (0, 0, 57), (0, 0, 1), size=(size, size), parallel_scale=54)
 
 
 class Samples(NamedTuple):
@@ -198,9 +198,9 @@ OVERLAP = Entry(
     limit=LEVEL,
     outcome="documented",
     does="A ray that dips below the curved face between two bricks by more than they overlap is blended in "
-    "the wrong order: what it meets where it comes back stands before what it meets in the dip. K* is how far "
-    "rays between the sides of a brick can dip, so that it suffices. The images of render_bricks do not rest "
-    "on it: how far each brick is read is found from the rays.",
+    "the wrong order: what it meets where it comes back stands before what it meets in the dip. K* is how "
+    "far rays between the sides of a brick can dip, so that it suffices. The images of render_bricks do not "
+    "rest on it: how far each brick is read is found from the rays.",
     picture=overlapped_picture,
     shows="two bricks of a fan, blended one after the other; a wall in its middle hides red stripes that lie "
     "in the farther one",
