@@ -80,8 +80,8 @@ def _check_coarser(path: Path, level: ZarrSource, following: ZarrSource) -> None
     if any(more) or np.any(finer):
         raise ValueError(
             f"path: {path}: datasets of multiscales must be ordered from the highest resolution to the "
-            f"lowest; got {following.name}, {following.shape} voxels of {following.spacing}, after {level.name}, "
-            f"{level.shape} voxels of {level.spacing}. Correct their order in the file."
+            f"lowest; got {following.name}, {following.shape} voxels of {following.spacing}, after "
+            f"{level.name}, {level.shape} voxels of {level.spacing}. Correct their order in the file."
         )
 
 

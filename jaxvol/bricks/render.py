@@ -181,8 +181,8 @@ def render_bricks(
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
         raise ValueError(
             "render_bricks has gradients in reverse mode (jax.grad, jax.vjp), of first order, and none in "
-            'forward mode (jax.jvp, jax.jacfwd): use jv.render(..., adjoint="forward") on a volume in memory, '
-            'or adjoint="direct" for higher derivatives.'
+            'forward mode (jax.jvp, jax.jacfwd): use jv.render(..., adjoint="forward") on a volume in '
+            'memory, or adjoint="direct" for higher derivatives.'
         )
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
     return Rendering(
