@@ -72,10 +72,12 @@ class Scan(NamedTuple):
         return jv.March(self.step, (self.probe,))
 
 
-def phantom(resolution: int, dtype: str = "float32") -> tuple[jv.Volume, jv.ToroidalMap]:
+def phantom(
+    resolution: int, dtype: str = "float32", *, speckle: bool = True
+) -> tuple[jv.Volume, jv.ToroidalMap]:
     """The fetus as the paper's probe would see it, with so many samples along a beam."""
     x, y, z = (max(8, n * resolution // bricks_paper.SHAPE[2]) for n in bricks_paper.SHAPE)
-    volume, probe = jv.toroidal_phantom("fetus", (x, y, z), probe=bricks_paper.probe(SCALE))
+    volume, probe = jv.toroidal_phantom("fetus", (x, y, z), probe=bricks_paper.probe(SCALE), speckle=speckle)
     return jv.Volume(np.asarray(volume.data).astype(dtype)), probe
 
 

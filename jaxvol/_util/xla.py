@@ -75,6 +75,12 @@ def transformations(leaf: Any) -> list[str]:
     return names
 
 
+def forward_mode(kinds: list[list[str]]) -> bool:
+    """Whether `transformations` of the leaves of a tree are forward mode (`jax.jvp`, `jax.jacfwd`), or of
+    second order. A `custom_vjp` has no rule for these: JAX's own error names neither argument nor remedy."""
+    return any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds)
+
+
 def _is_array(leaf: Any) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.generic)
 

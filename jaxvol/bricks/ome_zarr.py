@@ -31,7 +31,7 @@ def levels_in(
     `index`, `options`: as for `ZarrSource`.
 
     **Raises:** `ValueError` for a group without `multiscales` of version 0.4 or 0.5, for metadata that do not
-    follow them, and for axes of different units.
+    follow them, such as levels in another order, and for axes of different units.
     """
     image = _first_image(path)
     axes = _axes(path, image)
@@ -57,18 +57,32 @@ def levels_in(
             [float(part[axes.index(axis)]) for axis in SPACE] for part in (placement.scale, placement.offset)
         )
         root = path.resolve()
-        found.append(
-            ZarrSource(
-                path / name,
-                axes=axes,
-                index=index,
-                spacing=triple("spacing", scale),
-                origin=triple("origin", offset),
-                beside=root.with_name(f"{root.name}.{name.replace('/', '.')}"),
-                **options,
-            )
+        level = ZarrSource(
+            path / name,
+            axes=axes,
+            index=index,
+            spacing=triple("spacing", scale),
+            origin=triple("origin", offset),
+            beside=root.with_name(f"{root.name}.{name.replace('/', '.')}"),
+            **options,
         )
+        if found:
+            _check_coarser(path, found[-1], level)
+        found.append(level)
     return tuple(found)
+
+
+def _check_coarser(path: Path, level: ZarrSource, following: ZarrSource) -> None:
+    """Raises if a level is finer along any axis than the one before it. Both the number of voxels and their
+    spacing tell; files round the latter."""
+    more = [b > a for a, b in zip(level.shape, following.shape, strict=True)]
+    finer = np.array(following.spacing) < np.array(level.spacing) * (1 - 1e-3)
+    if any(more) or np.any(finer):
+        raise ValueError(
+            f"path: {path}: datasets of multiscales must be ordered from the highest resolution to the "
+            f"lowest; got {following.name}, {following.shape} voxels of {following.spacing}, after "
+            f"{level.name}, {level.shape} voxels of {level.spacing}. Correct their order in the file."
+        )
 
 
 def _first_image(path: Path) -> dict[str, Any]:

@@ -37,6 +37,11 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
 
     At a face at the distance l from the apex, K = l - l cos(θ/2), where θ is the angle of a brick's fan;
     along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger counts.
+    It suffices where the brick beyond a face has its turn before the one within, and rays from side to side
+    of a brick need all of it: with less, they are blended in the wrong order. The images of `render_bricks`
+    do not rest on it: how far each brick is read is found from the rays.
+
+    Where it fails, and where not: `experiments/stability.py`, "overlap under k".
 
     **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
@@ -14,7 +15,7 @@ from .._util.checks import Arrayable, described, integer, is_traced, number, sho
 from .._util.memory import memory_of_device
 from .._util.trees import PyTree, strong
 from .._util.vec3 import apart
-from .._util.xla import compiled
+from .._util.xla import compiled, forward_mode, transformations
 from ..arguments import check_arguments
 from ..camera import Camera
 from ..compositing import Compositing
@@ -108,8 +109,8 @@ def render_bricks(
       (`Lighting.farthest_read`).
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
       are no larger than a pixel; or, with a `tolerance`, whose error by ranges of values stays below that
-      (`bricks.level_for`). Under a `ToroidalMap` it is the finest, 0: its ranges are those of the finest
-      level's nodes, and the nodes of the others lie elsewhere.
+      (`bricks.level_for`). A `tolerance` goes with `"auto"` alone. Under a `ToroidalMap` it is the finest, 0:
+      its ranges are those of the finest level's nodes, and the nodes of the others lie elsewhere.
     - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
       first image: `"beside"` the data, in a folder, or nowhere (None); see `bricks.summary_of`. With
       `tolerance` it is over all levels. What nobody knows to be unchanged, an array or a memory map open for
@@ -134,8 +135,8 @@ def render_bricks(
     Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
     spacing and origin: a second march reads the bricks again. Where the march does not leap, that one reads
     bricks of no extinction, too, whose gradient need not be 0. There is no gradient to the voxels, none of
-    modes that choose a sample or resolve (`"maximum"`, `"average"`, `Isosurface`), and none inside `jax.jit`
-    or `jax.vmap`.
+    modes that choose a sample or resolve (`"maximum"`, `"average"`, `Isosurface`), none in forward mode
+    (`jax.jvp`) or of second order, and none inside `jax.jit` or `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
     unknown; for voxels outside of the ranges of values found before, which tell that it changed; for less
@@ -181,6 +182,12 @@ def render_bricks(
     job = _Job(chosen, room, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
     if owned:
         _check_owned(scene, method)
+    if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
+        raise ValueError(
+            "render_bricks has gradients in reverse mode (jax.grad, jax.vjp), of first order, and none in "
+            'forward mode (jax.jvp, jax.jacfwd): use jv.render(..., adjoint="forward") on a volume in '
+            'memory, or adjoint="direct" for higher derivatives.'
+        )
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
     return Rendering(
         rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=job.streams[0].report())
@@ -393,6 +400,11 @@ def _level(
             raise ValueError(
                 "level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got "
                 f"{level}."
+            )
+        if tolerance is not None:
+            raise ValueError(
+                f"tolerance chooses a level, and level={level} is one: leave one of them out; got "
+                f"tolerance={tolerance}."
             )
         return levels[chosen]
     if len(levels) == 1 or mapped:

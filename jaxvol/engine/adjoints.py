@@ -12,7 +12,7 @@ import jax
 from jaxtyping import Array
 
 from .._util.checks import is_traced
-from .._util.xla import compiled, forward_only, recomputed, transformations
+from .._util.xla import compiled, forward_mode, forward_only, recomputed, transformations
 from ..march import March
 from ..reference import steps_across
 from ..rendering import Rendering
@@ -89,10 +89,9 @@ class DirectAdjoint(AbstractAdjoint):
 
 
 def _checked_for_forward_mode(scene: Scene) -> list[list[str]]:
-    """The transformations of JAX that each leaf of the scene undergoes. Raises where one is forward mode:
-    JAX's own error names neither argument nor remedy."""
+    """The transformations of JAX that each leaf of the scene undergoes. Raises where one is forward mode."""
     kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
-    if any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds):
+    if forward_mode(kinds):
         raise ValueError(WRONG_MODE["replay"])
     return kinds
 

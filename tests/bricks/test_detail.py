@@ -236,6 +236,15 @@ def test_arguments_that_miss_are_named():
         level_for([found[0], ArraySource(ball())], camera(5))
 
 
+def test_a_level_and_a_tolerance_exclude_each_other(tmp_path):
+    ome_written(tmp_path, pyramid(ball(20), 2), "0.5", spacing=(1.0, 1.0, 1.0))
+    for level in (0, 1):
+        with pytest.raises(
+            ValueError, match=rf"tolerance chooses a level, and level={level} is one.*got toler"
+        ):
+            jv.render_bricks(tmp_path, transfer(), camera(101), jv.March(1.0), level=level, tolerance=0.1)
+
+
 def test_under_a_toroidal_map_the_level_is_the_finest(tmp_path):
     """The map's ranges are those of the finest level's nodes."""
     ome_written(tmp_path, pyramid(ball(20), 3), "0.5", spacing=(1.0, 1.0, 1.0))

@@ -438,6 +438,23 @@ def test_under_jit_it_says_what_to_do():
         jax.vmap(image)(TRANSFER.extinction[None])
 
 
+def test_forward_mode_and_second_order_say_what_to_do():
+    data, camera = balls(), outside(jv.Volume(balls()), 16)
+
+    def brightness(extinction):
+        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
+        return jnp.sum(jv.render_bricks(data, transfer, camera, jv.March(1.0)).rgba)
+
+    at = TRANSFER.extinction
+    for given in (
+        lambda: jax.jvp(brightness, (at,), (at,)),
+        lambda: jax.jacfwd(brightness)(at),
+        lambda: jax.hessian(brightness)(at),
+    ):
+        with pytest.raises(ValueError, match=r"gradients in reverse mode.*none in forward mode \(jax\.jvp"):
+            given()
+
+
 def test_a_gradient_to_the_source_says_what_to_do():
     data, camera = balls().astype(np.float32), outside(jv.Volume(balls()), 16)
 

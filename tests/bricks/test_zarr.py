@@ -1,6 +1,7 @@
 """Are Zarr arrays and OME-Zarr images, written by other programs, read as they were meant?"""
 
 import json
+import re
 import shutil
 import sys
 from typing import Any
@@ -325,6 +326,43 @@ def test_metadata_that_do_not_follow_ome_zarr_are_refused(fault, message, versio
     write_image(tmp_path, image | fault, version)
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path)
+
+
+@pytest.mark.parametrize("version", ["0.4", "0.5"])
+def test_levels_in_another_order_than_ome_zarr_prescribes_are_refused(version, tmp_path):
+    image = ome_written(tmp_path, pyramid(voxels("uint8", (16, 16, 16)), 3), version, axes="zyx")
+    first, second, third = image["datasets"]
+    message = "datasets of multiscales must be ordered from the highest resolution to the lowest; got "
+    for order, finer in (
+        ([second, first, third], 0),
+        ([first, third, second], 1),
+        ([third, second, first], 1),
+    ):
+        write_image(tmp_path, image | {"datasets": order}, version)
+        with pytest.raises(ValueError, match=re.escape(f"{tmp_path}: {message}{tmp_path / str(finer)},")):
+            levels_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"scale": [2.0, 0.2, 0.3]}, {"scale": [2.0, 0.4, 0.3]}], ids=["finer voxels", "more voxels"]
+)
+def test_a_level_that_is_finer_along_one_axis_is_refused(change, tmp_path):
+    """By its spacing, and by its number of voxels where the spacing does not tell."""
+    data = voxels("uint8", (16, 16, 16))
+    second = data if change["scale"][1] == 0.2 else np.repeat(data, 2, axis=1)
+    image = ome_written(tmp_path, [data, second], "0.5", axes="zyx")
+    image["datasets"][1]["coordinateTransformations"] = [{"type": "scale", **change}]
+    write_image(tmp_path, image, "0.5")
+    with pytest.raises(ValueError, match="must be ordered from the highest resolution"):
+        levels_of(tmp_path)
+
+
+def test_levels_coarser_along_some_axes_and_of_rounded_spacing_are_in_order(tmp_path):
+    data = voxels("uint8", (16, 16, 16))
+    image = ome_written(tmp_path, [data, data[::2, ::2]], "0.5", axes="zyx")
+    image["datasets"][1]["coordinateTransformations"] = [{"type": "scale", "scale": [1.9999, 0.8, 0.6]}]
+    write_image(tmp_path, image, "0.5")
+    assert [level.shape for level in levels_of(tmp_path)] == [(16, 16, 16), (8, 8, 16)]
 
 
 def test_groups_that_are_no_image_are_refused(tmp_path):
