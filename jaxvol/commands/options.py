@@ -141,9 +141,17 @@ def _camera(view: argparse.ArgumentParser) -> None:
         type=float,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)",
+        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4, or as "
+        "--view-up has it)",
     )
-    group.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
+    group.add_argument(
+        "--view-up",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="what is up in the image (default: 0 0 1; or, for files that do not say how they lie, shown as "
+        "the histogram suggests: away from the one face that cuts the object, if there is such a face)",
+    )
     group.add_argument(
         "--view-angle",
         type=float,

@@ -14,10 +14,10 @@ from ..rendering import Rendering
 from ..unseen import why_unseen
 from .frames import Frames, frames_of
 from .options import scene_options, view_options
-from .orbit import views_of
+from .orbit import axis_of, turned, views_of
 from .progress import working
 from .recorded import settings_of, text_of, transfer_from_file
-from .scene import axis_of, scene_of, turned
+from .scene import scene_of
 
 
 def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "") -> None:
@@ -67,8 +67,8 @@ def _render(options: argparse.Namespace) -> None:
     if options.depth:
         image_file("--depth", options.depth, 0)
     scene = scene_of(options)
-    camera = turned(scene.camera, options.turn, axis_of(options))
-    views = (camera,) if options.orbit is None else views_of(options, scene, options.orbit)
+    camera = turned(scene.camera, options.turn, axis_of(options, scene.camera))
+    views = (camera,) if options.orbit is None else views_of(options, scene.camera, options.orbit)
     frames = frames_of(options, scene, views)
     rendering = rendered(frames, camera, options.output)
     told = {}
