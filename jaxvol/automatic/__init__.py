@@ -2,8 +2,8 @@
 place in the picture and what is up are guessed.
 
 Values: `thresholds.py` parts them, `body.py` says whether those in the middle are worth to be shown,
-`transfer.py` and `labels.py` show them, in colours of `colors.py`. Place: `framing.py`, `upright.py`. All look
-at the voxels that `sampling.py` chooses.
+`transfer.py` and `labels.py` show them, in colours of `colors.py`. Place: `framing.py`, `upright.py`. All
+look at the voxels that `sampling.py` chooses.
 """
 
 from .framing import framed as framed, visible_points as visible_points

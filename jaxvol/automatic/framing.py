@@ -19,6 +19,9 @@ SEEN = 0.1
 SPECK = 0.02
 """Part of the largest connected piece below which another is a speck, which need not be in the picture."""
 
+REACH = 5
+"""Voxels of the cube around each visible one that connects it to others, such as the leaves of a tree."""
+
 MARGIN = 1.06
 """By how much more than what is visible the picture shows, in each direction."""
 
@@ -27,9 +30,9 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     """Corners in the world of the hull of what a transfer function shows, specks left out; those of the whole
     volume where nothing is visible.
 
-    Pieces are connected by faces of voxels, of every n-th one in a large volume. Transfer functions are those
-    made by `automatic_transfer` and `labels_shown`."""
-    from scipy.ndimage import label
+    A piece is what hangs together within REACH voxels, of every n-th in a large volume. Transfer functions
+    are those made by `automatic_transfer` and `labels_shown`."""
+    from scipy.ndimage import label, maximum_filter
 
     data = sampled(volume)
     if isinstance(transfer, LabelTransferFunction):
@@ -38,9 +41,9 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
         assert isinstance(transfer, TransferFunction)
         extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
         seen = -np.expm1(-extinction * unit_of(volume)) > SEEN
-    pieces, count = label(seen)
-    if count == 0:
+    if not seen.any():
         return _in_world(volume, _corners(np.zeros(3), np.array(volume.shape) - 1))
+    pieces = seen * np.asarray(label(maximum_filter(seen, REACH))[0])  # pyright: ignore[reportGeneralTypeIssues]
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
     kept = sizes >= SPECK * sizes.max()
