@@ -1,6 +1,7 @@
 """Where is what a transfer function shows, and from how far does a camera see all of it?"""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,7 +20,7 @@ SEEN = 0.1
 SPECK = 0.02
 """Part of the largest connected piece below which another is a speck, which need not be in the picture."""
 
-REACH = 5
+REACH = 3
 """Voxels of the cube around each visible one that connects it to others, such as the leaves of a tree."""
 
 MARGIN = 1.06
@@ -43,7 +44,8 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
         seen = -np.expm1(-extinction * unit_of(volume)) > SEEN
     if not seen.any():
         return _in_world(volume, _corners(np.zeros(3), np.array(volume.shape) - 1))
-    pieces = seen * np.asarray(label(maximum_filter(seen, REACH))[0])  # pyright: ignore[reportGeneralTypeIssues]
+    found: Any = label(maximum_filter(seen, REACH))  # scipy's types allow a number, too
+    pieces = seen * found[0]
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
     kept = sizes >= SPECK * sizes.max()

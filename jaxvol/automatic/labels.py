@@ -36,11 +36,14 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     kinds = _kinds(data)
     if kinds is None:
         return None
-    labels = np.searchsorted(kinds, data).astype(np.uint8)
-    share = gaussian_filter((labels > 0).astype(np.float32), LABEL_BLUR)
+    if data.dtype in (np.uint8, np.uint16):  # by a table, which is faster than a search for each voxel
+        labels = np.searchsorted(kinds, np.arange(int(kinds[-1]) + 1)).astype(np.uint8)[data]
+    else:
+        labels = np.searchsorted(kinds, data).astype(np.uint8)
+    inside = gaussian_filter(np.where(labels > 0, np.float32(INSIDE), np.float32(0)), LABEL_BLUR)
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
     shown = Volume(
-        *(np.round(INSIDE * share).astype(np.uint8), volume.spacing, volume.origin, beyond),
+        *((inside + 0.5).astype(np.uint8), volume.spacing, volume.origin, beyond),
         direction=volume.direction,
     )
     functions = {}

@@ -85,11 +85,10 @@ def _images(options: argparse.Namespace, scene: Scene, count: int, folder: Path 
     """The frames, one after the other; written into the folder if one is given."""
     frames = frames_of(options, scene, views_of(options, scene.camera, options.degrees))
     digest = checksum(options.file) if folder else ""
+    axis = axis_of(options, scene.camera)
     with working(f"rendering {options.output}, frames") as told:
         for number, angle in enumerate(angles_of(options.degrees, count)):
-            image = frames.render(turned(scene.camera, angle, axis_of(options, scene.camera))).image(
-                options.background
-            )
+            image = frames.render(turned(scene.camera, angle, axis)).image(options.background)
             if folder is not None:
                 turn = {"turn": angle, "orbit": options.degrees}
                 held = transfer_from_file(options, scene.transfer)
