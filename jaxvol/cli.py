@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
+from typing import NoReturn
 
 import jax
 
@@ -102,8 +103,16 @@ def _run_in_thread(options: argparse.Namespace) -> None:
         raise faults[0]
 
 
+class _Parser(argparse.ArgumentParser):
+    """Of the command and of its subcommands. A fault in the arguments is told in one line, as others are: the
+    usage of commands with many options would push it off the screen."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message} ({self.prog} --help lists the options)\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="jaxvol",
         description="Direct volume rendering in JAX.",
         epilog=EXAMPLES,

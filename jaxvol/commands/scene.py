@@ -64,7 +64,7 @@ def scene_of(options: argparse.Namespace) -> Scene:
         if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
             volume, transfer = shown
         else:
-            transfer = _look(options, volume)
+            transfer = look_of(options, volume)
         points = visible_points(volume, transfer) if is_automatic(options) else None
     return Scene(
         volume, transfer, _view(options, volume, points), mode, _lighting(options, mode), clip, source
@@ -75,7 +75,7 @@ def is_automatic(options: argparse.Namespace) -> bool:
     """Whether nothing is said of the transfer function."""
     names = ("preset", "cmap", "transfer", "kept_transfer", "opacity", "clim", "unit_distance")
     said = any(getattr(options, name, None) is not None for name in names)
-    return options.compositing == "over" and not said
+    return getattr(options, "compositing", "over") == "over" and not said
 
 
 def _mode(options: argparse.Namespace) -> Compositing[Any]:
@@ -101,7 +101,7 @@ def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting |
     return Phong() if shade else None
 
 
-def _look(options: argparse.Namespace, volume: Volume) -> Transfer:
+def look_of(options: argparse.Namespace, volume: Volume) -> Transfer:
     """The transfer function that the options specify."""
     kept = getattr(options, "kept_transfer", None)
     if options.transfer or kept is not None:
@@ -119,7 +119,8 @@ def _look(options: argparse.Namespace, volume: Volume) -> Transfer:
     if options.preset:
         return preset(options.preset, options.clim, unit_distance)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
-    cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    surface = getattr(options, "compositing", "over") == "isosurface"
+    cmap = options.cmap or ("white" if surface else "gray")
     return colormap(cmap, clim, options.opacity or "linear", unit_distance)
 
 

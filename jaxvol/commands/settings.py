@@ -102,7 +102,10 @@ def _of_toml(command: argparse.ArgumentParser, path: Path) -> dict[str, Any]:
 
 
 def _of_picture(command: argparse.ArgumentParser, given: dict[str, Any], path: Path) -> dict[str, Any]:
-    found = recorded_in(path)
+    try:
+        found = recorded_in(path)
+    except ValueError as fault:
+        raise ValueError(f"--like: {fault}") from fault
     if found.command != "render":
         said = " ".join(f"--{name} {_written(value)}" for name, value in found.settings.items())
         raise ValueError(
