@@ -20,6 +20,9 @@ SEEN = 0.1
 SPECK = 0.02
 """Part of the largest connected piece below which another is a speck, which need not be in the picture."""
 
+NEAREST = 0.1
+"""Distance of the camera from what is nearest to it, at least, as part of the diagonal of what is visible."""
+
 REACH = 3
 """Voxels of the cube around each visible one that connects it to others, such as the leaves of a tree."""
 
@@ -43,7 +46,7 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
         extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
         seen = -np.expm1(-extinction * unit_of(volume)) > SEEN
     if not seen.any():
-        return _in_world(volume, _corners(np.zeros(3), np.array(volume.shape) - 1))
+        return _in_world(volume, _corners(np.zeros(3), np.array(volume.shape) - 1.0))
     found: Any = label(maximum_filter(seen, REACH))  # scipy's types allow a number, too
     pieces = seen * found[0]
     sizes = np.bincount(pieces.ravel())
@@ -86,8 +89,9 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
     From a perspective camera at distance D from its focal point f, a point that lies x to the right of f, and
     z nearer to the camera than f, is in the picture if |x| <= t (D - z), where t is the tangent of half the
     angle. So D must be at least max(x / t + z) and max(-x / t + z), and a shift of f to the right by t / 2
-    times their difference makes both equal to their mean. In the same way upwards. For parallel rays, z does
-    not count, and D is the half height of the view.
+    times their difference makes both equal to their mean. In the same way upwards; the greater mean is taken,
+    and f shifted so that on both sides as much is left free. For parallel rays, z does not count, and D is
+    the half height of the view.
 
     `views`: the camera turned about its focal point in all ways that are to show the points, by default as it
     is. The focal point of several is the middle of the points, without a shift.
@@ -99,15 +103,18 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
     tangent = np.tan(np.deg2rad(float(camera.view_angle)) / 2) if perspective else 1.0
     t = tangent / MARGIN * np.array([width / height, 1])
     focal, distance = middle, 0.0
+    free = NEAREST * float(np.linalg.norm(np.ptp(points, axis=0))) * perspective
     for view in views:
         right, up, forward = (np.asarray(axis, np.float64) for axis in axes_of(view))
-        across = (points - middle) @ np.stack([right, up], axis=1) / t
-        nearer = -(points - middle) @ forward[:, None] * perspective
-        one, other = (across + nearer).max(axis=0), (nearer - across).max(axis=0)
-        if len(views) == 1:
-            focal = middle + np.stack([right, up], axis=1) @ (t * (one - other) / 2)
-            one = other = (one + other) / 2
-        distance = max(distance, float(one.max()), float(other.max()))
+        axes = np.stack([right, up], axis=1)
+        across, nearer = (points - middle) @ axes / t, -(points - middle) @ forward * perspective
+        one, other = ((nearer[:, None] + side * across).max(axis=0) for side in (1, -1))
+        alone = len(views) == 1
+        distance = max(distance, float(nearer.max()) + free)
+        distance = max(distance, *((one + other) / 2 if alone else np.maximum(one, other)).tolist())
+        if alone:
+            depth = distance - nearer if perspective else np.ones(len(points))
+            focal = middle + axes @ (t * [_centering(each, depth) for each in across.T])
     away = np.asarray(camera.position - camera.focal_point, np.float64)
     return Camera(
         focal + (away * (distance / np.linalg.norm(away)) if perspective else away),
@@ -117,3 +124,14 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
         size=camera.size,
         parallel_scale=None if perspective else distance,
     )
+
+
+def _centering(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) -> float:
+    """The shift that leaves as much free on both sides of what lies so far across at such depths."""
+    from scipy.optimize import brentq
+
+    def excess(shift: float) -> float:
+        seen = (across - shift) / depth
+        return float(seen.max() + seen.min())
+
+    return float(brentq(excess, across.min(), across.max()))  # pyright: ignore[reportArgumentType]
