@@ -87,9 +87,9 @@ def save_image(
     held = CHANNELS.get(Path(path).suffix.lower(), (0, 3, 4))
     shapes = [SHAPES[count] for count in sorted(held, key=(3, 4, 0).index)]
     if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in held):
-        kind = f"a {Path(path).suffix.lower()} of an" if len(held) < len(SHAPES) else "an"
+        where = f" for a {Path(path).suffix.lower()}" if len(held) < len(SHAPES) else ""
         hint = " One channel, such as a depth, is written as .tif or .npy." if channels == 0 else ""
-        raise ValueError(f"{kind} image must have shape {' or '.join(shapes)}; got {image.shape}.{hint}")
+        raise ValueError(f"image{where} must have shape {' or '.join(shapes)}; got {image.shape}.{hint}")
     path = image_file("path", path, channels)
     bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
     if bad.any():

@@ -85,8 +85,8 @@ BAD = {
     "one channel in PNG": (
         "x.png",
         np.zeros((4, 5)),
-        r"a \.png of an image must have shape \(height, width, 3\) or \(height, width, 4\); got \(4, 5\)\. One "
-        r"channel, such as a depth, is written as \.tif or \.npy",
+        r"image for a \.png must have shape \(height, width, 3\) or \(height, width, 4\); got \(4, 5\)\. "
+        r"One channel, such as a depth, is written as \.tif or \.npy",
     ),
     "NaN depth": ("x.npy", np.full((4, 4), np.nan), "image must not be NaN"),
     "a folder": (
@@ -116,9 +116,7 @@ def test_save_png_writes_nothing_else(tmp_path):
 @pytest.mark.parametrize("save", [jv.save_png, jv.save_image])
 def test_swapped_arguments_are_named(save, tmp_path):
     image = np.zeros((4, 5, 3))
-    with pytest.raises(
-        ValueError, match=r"path .* got a NumPy array of shape \(4, 5, 3\) .* path comes first"
-    ):
+    with pytest.raises(ValueError, match=r"path .* got a NumPy array of shape .* the path comes first"):
         save(image, tmp_path / "x.png")
     with pytest.raises(ValueError, match="path must be a str or a path; got 5"):
         save(5, image)

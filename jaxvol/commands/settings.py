@@ -48,7 +48,12 @@ def parsed(
     settings: dict[str, Any] = {}
     parser = make()
     command = _chosen(parser, given)
-    sources = [_of_picture(command, given, given["like"])] if given.get("like") else []
+    sources = []
+    if given.get("like"):
+        try:
+            sources = [_of_picture(command, given, given["like"])]
+        except ValueError as fault:
+            raise ValueError(f"--like: {fault}") from fault
     sources += [_of_toml(command, given["config"])] if given.get("config") else []
     for source in sources:
         settings = _without_rivals(settings, source) | source
@@ -102,10 +107,7 @@ def _of_toml(command: argparse.ArgumentParser, path: Path) -> dict[str, Any]:
 
 
 def _of_picture(command: argparse.ArgumentParser, given: dict[str, Any], path: Path) -> dict[str, Any]:
-    try:
-        found = recorded_in(path)
-    except ValueError as fault:
-        raise ValueError(f"--like: {fault}") from fault
+    found = recorded_in(path)
     if found.command != "render":
         said = " ".join(f"--{name} {_written(value)}" for name, value in found.settings.items())
         raise ValueError(

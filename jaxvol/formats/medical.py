@@ -69,8 +69,8 @@ def _check_header(path: Path) -> None:
         begin = stream.read(4)
     if not {int.from_bytes(begin, order) for order in ("little", "big")} & SIZES:
         raise ValueError(
-            f"path: {path} is no NIfTI file: it must begin with the size of its header, 348 or 540; got the "
-            f"bytes {begin.hex(' ')}. Fetch or write it again."
+            f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; this "
+            f"one with the bytes {begin.hex(' ')}. Fetch or write it again."
         )
 
 
