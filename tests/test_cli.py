@@ -41,7 +41,7 @@ def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
         assert image.shape == (30, 40, 3)
         assert image.std() > 5
         assert str(tmp_path / "demo" / name) in printed
-    assert "compilation" in printed
+    assert "compiling and rendering" in printed
     assert "cpu" in printed.lower() or "gpu" in printed.lower()
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
     assert sorted(re.findall(r'src="([^"]+)"', page)) == ["after.png", "before.png", "head.png"]

@@ -65,8 +65,8 @@ def test_jpeg_is_jpeg(tmp_path):
 
 
 BAD = {
-    "no image": ("x.png", np.zeros(4), r"image must have shape .*got \(4,\)"),
-    "two channels": ("x.png", np.zeros((4, 4, 2)), r"image must have shape .*got \(4, 4, 2\)"),
+    "no image": ("x.png", np.zeros(4), r"image for a \.png must have shape .*got \(4,\)"),
+    "two channels": ("x.png", np.zeros((4, 4, 2)), r"image for a \.png must have shape .*got \(4, 4, 2\)"),
     "a rendering": ("x.png", object(), r"linear must be an array of numbers; .*rendering\.image\(\)"),
     "empty": ("x.npy", np.zeros((0, 4, 3)), "image must have shape"),
     "NaN": (
