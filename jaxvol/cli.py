@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
+from typing import NoReturn
 
 import jax
 
@@ -29,22 +30,22 @@ EXAMPLES = """\
 examples:
   jaxvol demo
   jaxvol datasets list
-  jaxvol datasets fetch engine
-  jaxvol info engine_256x256x128_uint8.raw.gz
-  jaxvol render engine_256x256x128_uint8.raw.gz
-  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine -o engine.png
+  FILE=$(jaxvol datasets fetch engine)
+  jaxvol info "$FILE"
+  jaxvol render "$FILE"
+  jaxvol render "$FILE" --preset engine -o engine.png
   jaxvol render --like engine.png --size 1024 1024 -o large.png
-  jaxvol animate engine_256x256x128_uint8.raw.gz --preset engine --frames 48 -o engine.gif
+  jaxvol animate "$FILE" --preset engine --frames 48 -o engine.gif
   jaxvol render head_256x256x113_uint16le.raw.gz --spacing 1 1 2 --preset ct_skin_bone --clim 0 4000 \\
       --direction -0.7 -1 0.25 --view-up 0 0 -1 -o head.png
-  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --clip-plane 128 128 64 1 -1 0 -o half.png
-  jaxvol render engine_256x256x128_uint8.raw.gz --cmap gray --compositing maximum -o mip.png
-  jaxvol render engine_256x256x128_uint8.raw.gz --preset engine --compositing isosurface --isovalue 170
+  jaxvol render "$FILE" --preset engine --clip-plane 128 128 64 1 -1 0 -o half.png
+  jaxvol render "$FILE" --cmap gray --compositing maximum -o mip.png
+  jaxvol render "$FILE" --preset engine --compositing isosurface --isovalue 170
   jaxvol render large.npy --memory 512M --config settings.toml
-  jaxvol plan engine_256x256x128_uint8.raw.gz --preset engine --tolerance 0.001
+  jaxvol plan "$FILE" --preset engine --tolerance 0.001
   jaxvol render chest.npy --preset ct_airway --camera 99 64 165 96 78 140 --view-angle 90 -o inside.png
-  jaxvol fit engine_256x256x128_uint8.raw.gz --images a.png b.png --cameras cameras.json -o transfer.json
-  jaxvol render engine_256x256x128_uint8.raw.gz --transfer transfer.json --transparent --depth depth.npy
+  jaxvol fit "$FILE" --images a.png b.png --cameras cameras.json -o transfer.json
+  jaxvol render "$FILE" --transfer transfer.json --transparent --depth depth.npy
 """
 
 
@@ -102,8 +103,16 @@ def _run_in_thread(options: argparse.Namespace) -> None:
         raise faults[0]
 
 
+class _Parser(argparse.ArgumentParser):
+    """Of the command and of its subcommands. A fault in the arguments is told in one line, as others are: the
+    usage of commands with many options would push it off the screen."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message} ({self.prog} --help lists the options)\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="jaxvol",
         description="Direct volume rendering in JAX.",
         epilog=EXAMPLES,

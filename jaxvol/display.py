@@ -42,7 +42,7 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
 
 def save_image(
-    path: str | os.PathLike[str], linear: Arrayable, *, text: Mapping[str, str] | None = None
+    path: str | os.PathLike[str] | Any, linear: Arrayable, *, text: Mapping[str, str] | None = None
 ) -> Path:
     """Write an image, in the format given by the file extension:
 
@@ -55,7 +55,7 @@ def save_image(
 
     **Arguments:**
 
-    - `path`: of the file.
+    - `path`: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
     - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
       (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
       may be infinite. 8-bit formats clip to [0, 1].
@@ -70,6 +70,12 @@ def save_image(
     A viewer blends a transparent PNG over its background in sRGB, `Rendering.image` blends in linear light;
     the two look different where the opacity lies between 0 and 1.
     """
+    if not isinstance(path, str | os.PathLike):
+        swapped = isinstance(linear, str | os.PathLike)
+        raise ValueError(
+            f"path must be a str or a path; got {described(path)}."
+            + (" That is the image: the path comes first, as in save_png(path, image)." if swapped else "")
+        )
     try:
         image = np.asarray(linear, np.float32)
     except (TypeError, ValueError) as fault:
@@ -78,11 +84,12 @@ def save_image(
             "rendering.image() or rendering.rgba."
         ) from fault
     channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else None
-    if channels not in (0, 3, 4) or 0 in image.shape:
-        raise ValueError(
-            "image must have shape (height, width, 3), (height, width, 4) or (height, width); "
-            f"got {image.shape}."
-        )
+    held = CHANNELS.get(Path(path).suffix.lower(), (0, 3, 4))
+    shapes = [SHAPES[count] for count in sorted(held, key=(3, 4, 0).index)]
+    if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in held):
+        where = f" for a {Path(path).suffix.lower()}" if len(held) < len(SHAPES) else ""
+        hint = " One channel, such as a depth, is written as .tif or .npy." if channels == 0 else ""
+        raise ValueError(f"image{where} must have shape {' or '.join(shapes)}; got {image.shape}.{hint}")
     path = image_file("path", path, channels)
     bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
     if bad.any():
@@ -98,17 +105,18 @@ def save_image(
     return path
 
 
-def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
+def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
     """`save_image` for a path that must end in `.png`.
 
-    **Arguments:** `path`: of the file. `linear`: RGB (height, width, 3), which is written as 8-bit sRGB, or
-    premultiplied RGBA (height, width, 4), which is written with alpha.
+    **Arguments:** `path`: of the file; it comes first, unlike in `save`, of volumes. `linear`: RGB (height,
+    width, 3), which is written as 8-bit sRGB, or premultiplied RGBA (height, width, 4), which is written with
+    alpha.
 
     **Returns:** the path.
 
     **Raises:** `ValueError` as `save_image` does, and for another ending.
     """
-    if Path(path).suffix.lower() != ".png":
+    if isinstance(path, str | os.PathLike) and Path(path).suffix.lower() != ".png":
         raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")
     return save_image(path, linear)
 
@@ -170,6 +178,9 @@ def _displayed(name: Any, image: Any) -> Float[np.ndarray, "height width *channe
         raise ValueError(f"images[{name!r}] must not be NaN; {np.isnan(linear).sum()} of its values are.")
     return np.asarray(to_srgb(linear))
 
+
+SHAPES = {0: "(height, width)", 3: "(height, width, 3)", 4: "(height, width, 4)"}
+"""Of images, by their number of channels."""
 
 CHANNELS: dict[str, tuple[int, ...]] = {
     ".png": (3, 4),

@@ -69,6 +69,12 @@ def limit_programs_in_memory():
         jax.clear_caches()
 
 
+@pytest.fixture(autouse=True)
+def no_progress(monkeypatch):
+    """No lines on stderr of what takes long, which depends on how busy the machine is."""
+    monkeypatch.setattr("jaxvol.commands.progress.PATIENCE", 1e6)
+
+
 @pytest.fixture
 def volume_file(tmp_path):
     """A raw file of a small volume, whose name tells its shape and type."""

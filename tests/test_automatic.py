@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.automatic import INSIDE, labels_shown, thresholds, visible_box
+from jaxvol.automatic import FRONT, framed, front_of, labels_shown, upright, visible_points
+from jaxvol.automatic.body import is_body
+from jaxvol.automatic.framing import MARGIN
+from jaxvol.automatic.labels import INSIDE
+from jaxvol.automatic.thresholds import thresholds
+from jaxvol.commands.orbit import turned
 from jaxvol.lighting import Phong
 
 
@@ -83,18 +88,114 @@ def test_what_is_no_volume_is_named():
         jv.automatic_transfer(np.zeros((3, 3, 3)))
 
 
-def test_the_box_holds_what_is_visible():
+def extent(points):
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2, high - low
+
+
+def test_the_points_are_around_what_is_visible():
     volume = ball(0.3, 0.15, at=0.5)
-    box = visible_box(volume, jv.automatic_transfer(volume))
-    low, high = (np.asarray(corner) for corner in box.corners)
-    middle = (low + high) / 2 / 31 * 2 - 1
-    np.testing.assert_allclose(middle, (0.5, 0, 0), atol=0.06)
-    assert ((high - low) / 31 * 2 > 0.55).all()
-    assert ((high - low) / 31 * 2 < 0.85).all()
+    points = visible_points(volume, jv.automatic_transfer(volume))
+    middle, size = extent(points)
+    np.testing.assert_allclose(middle / 31 * 2 - 1, (0.5, 0, 0), atol=0.06)
+    assert (size / 31 * 2 > 0.55).all()
+    assert (size / 31 * 2 < 0.85).all()
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     turned = jv.Volume(volume.data, volume.spacing, (5, 6, 7), direction=turn)
-    there = visible_box(turned, jv.automatic_transfer(volume))
-    np.testing.assert_allclose(there.center, turn @ np.asarray(box.center) + (5, 6, 7), atol=1e-4)
+    there, _ = extent(visible_points(turned, jv.automatic_transfer(volume)))
+    np.testing.assert_allclose(there, turn @ middle + (5, 6, 7), atol=1e-4)
+
+
+def test_specks_far_away_do_not_count_and_parts_that_are_near_do():
+    data = np.array(ball(0.3, 0.15, at=0.5).data)
+    volume = jv.Volume(data)
+    transfer = jv.automatic_transfer(volume)
+    middle, size = extent(visible_points(volume, transfer))
+    data[1, 1, 1] = data[1, 30, 30] = 200
+    specks = extent(visible_points(jv.Volume(data), transfer))
+    np.testing.assert_array_equal(specks, (middle, size))
+    data[12:19:2, 16, 16] = 200  # with one voxel between them, like leaves
+    _, longer = extent(visible_points(jv.Volume(data), transfer))
+    assert longer[0] >= size[0] + 5
+    hidden = jv.TransferFunction([0, 1], np.zeros((2, 3)), np.zeros(2))
+    np.testing.assert_array_equal(extent(visible_points(volume, hidden))[1], (31, 31, 31))
+
+
+def in_picture(camera, points):
+    """Image coordinates of points, in units of half the picture's height and width."""
+    away = np.asarray(camera.position - camera.focal_point)
+    back = away / np.linalg.norm(away)
+    right = np.cross(camera.view_up, back)
+    right /= np.linalg.norm(right)
+    offset = points - np.asarray(camera.position)
+    plane = np.stack([offset @ right, offset @ np.cross(back, right)], axis=1)
+    if camera.parallel_scale is None:
+        plane /= -(offset @ back)[:, None] * np.tan(np.deg2rad(float(camera.view_angle)) / 2)
+    else:
+        plane /= float(camera.parallel_scale)
+    return plane / (camera.size[0] / camera.size[1], 1)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("size", [(32, 32), (48, 32), (16, 32)])
+def test_a_framed_camera_just_sees_all_points(parallel, size):
+    points = np.random.default_rng(1).normal(size=(40, 3)) * (3, 1, 0.5) + (10, -20, 5)
+    volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
+    camera = jv.Camera.looking_at(volume, (1, -1, 0.3), view_angle=40, parallel=parallel, size=size)
+    seen = in_picture(framed(camera, points), points)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    # both sides of the tighter axis are at the margin, and the other is as far inside on both sides
+    assert max(high) == pytest.approx(1 / MARGIN, abs=1e-4)
+    np.testing.assert_allclose(low[np.argmax(high)], -1 / MARGIN, atol=1e-4)
+    assert np.abs(seen).max() < 1 / MARGIN + 1e-4
+    np.testing.assert_allclose(low + high, 0, atol=1e-4)
+
+
+def test_a_camera_that_turns_sees_all_points_all_the_time():
+    points = np.random.default_rng(1).normal(size=(40, 3)) * (3, 1, 0.5)
+    volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
+    camera = jv.Camera.looking_at(volume, (1, -1, 0.3), size=(32, 32))
+    angles = range(0, 360, 15)
+    found = framed(camera, points, [turned(camera, angle, (0, 0, 1)) for angle in angles])
+    reach = [np.abs(in_picture(turned(found, angle, (0, 0, 1)), points)).max() for angle in angles]
+    assert max(reach) == pytest.approx(1 / MARGIN, abs=1e-4)
+
+
+def standing(axis, end):
+    """A ball that one face of the grid cuts, at an end (0 or -1) of an axis."""
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 24)] * 3, indexing="ij"))
+    x[axis] -= 0.7 if end else -0.7
+    return jv.Volume((200 * ((x**2).sum(axis=0) < 0.5)).astype(np.uint8))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("end", [0, -1])
+def test_what_one_face_cuts_stands_on_it(axis, end):
+    up = upright(standing(axis, end))
+    assert up is not None
+    np.testing.assert_array_equal(up, np.eye(3)[axis] * (-1 if end else 1))
+    side = front_of(up)
+    assert side @ up == FRONT[2]  # from as far above
+    np.testing.assert_allclose(np.linalg.norm(side), np.linalg.norm(FRONT))
+    if axis == 2 and end == 0:
+        np.testing.assert_array_equal(side, FRONT)
+
+
+def test_nothing_is_up_where_no_face_or_two_cut():
+    assert upright(ball(0.6, 0.3)) is None
+    both = np.maximum(np.asarray(standing(1, 0).data), np.asarray(standing(1, -1).data))
+    assert upright(jv.Volume(both)) is None
+
+
+def test_borders_and_grain_between_thresholds_are_no_body():
+    solid = np.asarray(ball(0.8, 0.35).data)
+    assert is_body(solid, 55, 150)
+    border = np.where(solid > 55, 200, solid).astype(np.uint8)
+    border[1:] = np.maximum(border[1:], border[:-1] // 2)  # of 100, on one side
+    assert not is_body(border, 55, 150)
+    grain = solid + 45 * np.random.default_rng(0).uniform(-1, 1, solid.shape) * (solid > 55) * (solid < 150)
+    assert not is_body(grain.astype(np.float32), 55, 150)
+    assert is_body(solid[:2], 55, 150)  # too thin to tell
 
 
 def labels(n=24):

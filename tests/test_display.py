@@ -65,8 +65,8 @@ def test_jpeg_is_jpeg(tmp_path):
 
 
 BAD = {
-    "no image": ("x.png", np.zeros(4), r"image must have shape .*got \(4,\)"),
-    "two channels": ("x.png", np.zeros((4, 4, 2)), r"image must have shape .*got \(4, 4, 2\)"),
+    "no image": ("x.png", np.zeros(4), r"image for a \.png must have shape .*got \(4,\)"),
+    "two channels": ("x.png", np.zeros((4, 4, 2)), r"image for a \.png must have shape .*got \(4, 4, 2\)"),
     "a rendering": ("x.png", object(), r"linear must be an array of numbers; .*rendering\.image\(\)"),
     "empty": ("x.npy", np.zeros((0, 4, 3)), "image must have shape"),
     "NaN": (
@@ -82,7 +82,12 @@ BAD = {
         RGBA,
         r"colours and opacity must end in one of \.png, \.tif, \.tiff, \.npy;",
     ),
-    "depth in PNG": ("x.png", np.zeros((4, 4)), r"depth must end in one of \.tif, \.tiff, \.npy;"),
+    "one channel in PNG": (
+        "x.png",
+        np.zeros((4, 5)),
+        r"image for a \.png must have shape \(height, width, 3\) or \(height, width, 4\); got \(4, 5\)\. "
+        r"One channel, such as a depth, is written as \.tif or \.npy",
+    ),
     "NaN depth": ("x.npy", np.full((4, 4), np.nan), "image must not be NaN"),
     "a folder": (
         "folder.png",
@@ -106,6 +111,16 @@ def test_bad_images_and_files_are_named(case, tmp_path):
 def test_save_png_writes_nothing_else(tmp_path):
     with pytest.raises(ValueError, match=r"path must end in \.png; got .*x\.jpg"):
         jv.save_png(tmp_path / "x.jpg", np.zeros((4, 4, 3)))
+
+
+@pytest.mark.parametrize("save", [jv.save_png, jv.save_image])
+def test_swapped_arguments_are_named(save, tmp_path):
+    image = np.zeros((4, 5, 3))
+    with pytest.raises(ValueError, match=r"path .* got a NumPy array of shape .* the path comes first"):
+        save(image, tmp_path / "x.png")
+    with pytest.raises(ValueError, match="path must be a str or a path; got 5"):
+        save(5, image)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_image_over_a_background():

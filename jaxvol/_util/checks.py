@@ -201,17 +201,18 @@ def power_of_two(name: str, value: Any, most: int) -> int:
 
 
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
-    """Check that the file `path` can be written, and create its folder, before a long computation.
+    """Check that the file `path` can be written, before a long computation. Its folder is made when it is
+    written (`whole_file`).
 
     **Raises:** `ValueError` if it cannot be written."""
     path = Path(path)
     try:
         if path.is_dir():
             raise IsADirectoryError("it is a folder")
-        if path.parent.exists() and not path.parent.is_dir():
-            raise NotADirectoryError(f"{path.parent} is not a folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
+        there = next(folder for folder in path.absolute().parents if folder.exists())
+        if not there.is_dir():
+            raise NotADirectoryError(f"{there} is not a folder")
+        with tempfile.TemporaryFile(dir=there):
             pass
         if path.exists():
             path.open("ab").close()

@@ -4,6 +4,7 @@ Sizes are checked before memory is allocated or, if only decompressing tells, wh
 further than one byte past the expected size.
 """
 
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 
 
 CHUNK = 2**20
+LONGEST_REASON = 200  # letters
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
 # RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
@@ -96,8 +98,17 @@ def decoding(path: Path) -> Iterator[None]:
         yield
     except CORRUPT as fault:
         raise ValueError(
-            f"path: {path} cannot be read: corrupt, cut short or incomplete ({fault})."
+            f"path: {path} cannot be read: corrupt, cut short or incomplete ({reason(fault)})."
         ) from fault
+
+
+def reason(fault: BaseException) -> str:
+    """What an error says at its end, in one line. ITK's begin with where in its own source they were raised,
+    and its libraries tell each of their functions on the way."""
+    lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
+    told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", lines[-1]) if lines else ""
+    shown = "".join(letter if letter.isprintable() else "?" for letter in told[:LONGEST_REASON])
+    return shown.rstrip(".") or type(fault).__name__
 
 
 def as_array(

@@ -10,15 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
-_UNDERWAY: set[Path] = set()
+_UNDERWAY: dict[Path, list[Path]] = {}
+"""Files and folders that are not whole, and the folders made for each, the innermost first."""
 _MOVING = threading.Lock()
 _NUMBERS = itertools.count()
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path beside `path`, of the same ending, to write a file to. At the end of the context the file takes
-    the place of `path`; after an error it is removed, and `path` is as it was."""
+    """A path beside `path`, of the same ending, to write a file to; its folder is made. At the end of the
+    context the file takes the place of `path`; after an error it is removed, with the folders that were made
+    for it, and `path` is as it was."""
     with _beside(path) as part:
         yield part
         with _MOVING:
@@ -30,7 +32,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """An empty folder beside `path` to write files to. At the end of the context they take their places in
     `path`, which may hold others; after an error all are removed."""
     with _beside(path) as part:
-        part.mkdir(parents=True)
+        part.mkdir()
         yield part
         with _MOVING:
             for file in sorted(part.rglob("*")):
@@ -38,7 +40,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
                 if file.is_dir():
                     there.mkdir(parents=True, exist_ok=True)
                 else:
-                    there.parent.mkdir(parents=True, exist_ok=True)
+                    there.parent.mkdir(parents=True, exist_ok=True)  # path itself, at least
                     os.replace(file, there)
 
 
@@ -46,24 +48,31 @@ def whole_folder(path: Path) -> Iterator[Path]:
 def _beside(path: Path) -> Iterator[Path]:
     # not by tempfile, whose files nobody else may read; several processes may write the same file
     part = path.with_name(f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{path.suffix}")
-    _UNDERWAY.add(part)
+    missing = list(itertools.takewhile(lambda folder: not folder.exists(), path.absolute().parents))
+    _UNDERWAY[part] = missing
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield part
     finally:
-        _remove(part)
-        _UNDERWAY.discard(part)
+        _remove(part, missing)
+        del _UNDERWAY[part]
 
 
 def remove_unfinished() -> None:
     """Remove all that is not whole yet. For a process that ends at once: nothing takes its place
     afterwards."""
     _MOVING.acquire()  # and never released
-    for part in list(_UNDERWAY):
-        _remove(part)
+    for part, made in list(_UNDERWAY.items()):
+        _remove(part, made)
 
 
-def _remove(part: Path) -> None:
+def _remove(part: Path, made: list[Path]) -> None:
     if part.is_dir():
         shutil.rmtree(part, ignore_errors=True)
     else:
         part.unlink(missing_ok=True)
+    for folder in made:
+        try:
+            folder.rmdir()
+        except OSError:  # it holds what was written, or was not made
+            break

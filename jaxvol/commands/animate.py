@@ -16,10 +16,10 @@ from .._util.whole_files import whole_file, whole_folder
 from ..display import displayed, save_image
 from .frames import frames_of
 from .options import scene_options, view_options
-from .orbit import angles_of, views_of
+from .orbit import angles_of, axis_of, turned, views_of
 from .progress import working
 from .recorded import checksum, settings_of, text_of, transfer_from_file
-from .scene import Scene, axis_of, scene_of, turned
+from .scene import Scene, scene_of
 
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -83,11 +83,12 @@ def _animate(options: argparse.Namespace) -> None:
 
 def _images(options: argparse.Namespace, scene: Scene, count: int, folder: Path | None) -> Iterator[Picture]:
     """The frames, one after the other; written into the folder if one is given."""
-    frames = frames_of(options, scene, views_of(options, scene, options.degrees))
+    frames = frames_of(options, scene, views_of(options, scene.camera, options.degrees))
     digest = checksum(options.file) if folder else ""
+    axis = axis_of(options, scene.camera)
     with working(f"rendering {options.output}, frames") as told:
         for number, angle in enumerate(angles_of(options.degrees, count)):
-            image = frames.render(turned(scene.camera, angle, axis_of(options))).image(options.background)
+            image = frames.render(turned(scene.camera, angle, axis)).image(options.background)
             if folder is not None:
                 turn = {"turn": angle, "orbit": options.degrees}
                 held = transfer_from_file(options, scene.transfer)

@@ -18,7 +18,7 @@ def add_datasets(commands: Any, shared: argparse.ArgumentParser) -> None:
     listing = actions.add_parser("list", parents=[shared], help="print name, shape, type and size of each")
     listing.set_defaults(run=_list)
     fetching = actions.add_parser(
-        "fetch", parents=[shared], help="download one, check its SHA-512, and print its path"
+        "fetch", parents=[shared], help="print the path of one; download it first, and check it, if need be"
     )
     fetching.add_argument("name", metavar="NAME", help="as listed")
     fetching.add_argument("--folder", help="where to keep it (default: a cache of the user's)")
@@ -37,14 +37,14 @@ def _list(options: argparse.Namespace) -> None:
 def _fetch(options: argparse.Namespace) -> None:
     where = {"folder": options.folder, "mirror": options.mirror}
     path = datasets.fetch(options.name, **where, progress=sys.stderr.isatty())
-    print(path)
+    print(path)  # alone on stdout, for "$(jaxvol datasets fetch engine)"
     dataset = datasets.info(options.name)
-    print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}")
+    print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}", file=sys.stderr)
     if not path.name.startswith(dataset.file):
         return
     spacing = " ".join(f"{step:g}" for step in dataset.spacing)
     if dataset.spacing != (1, 1, 1):
-        print(f"jaxvol render {path} --spacing {spacing}")
+        print(f"jaxvol render {path} --spacing {spacing}", file=sys.stderr)
 
 
 def _bytes(number: float) -> str:

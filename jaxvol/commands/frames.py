@@ -57,7 +57,7 @@ def planned(options: argparse.Namespace, scene: Scene, camera: Camera | None = N
         "lighting": scene.lighting,
     }
     seen = scene.transfer, scene.camera if camera is None else camera
-    with working("planning"):
+    with working(f"planning how to render {options.file}"):
         if scene.source is None:
             return plan(scene.volume, *seen, tolerance_of(options), **how)
         return plan(scene.source, *seen, tolerance_of(options), memory=options.memory, **how)

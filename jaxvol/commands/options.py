@@ -45,7 +45,7 @@ def scene_options() -> argparse.ArgumentParser:
 
 def view_options() -> argparse.ArgumentParser:
     """Options of all commands that look at a volume through a camera."""
-    view = argparse.ArgumentParser(add_help=False)
+    view = argparse.ArgumentParser(add_help=False, parents=[transfer_options()])
     view.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
     view.add_argument(
         "--like",
@@ -81,14 +81,18 @@ def memory_size(text: str) -> int:
     try:
         count = int(float(number) * factor)
     except (ValueError, OverflowError) as fault:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of bytes, such as 256M or 2G") from fault
+        raise argparse.ArgumentTypeError(
+            f"must be a number of bytes, such as 256M or 2G; got {text!r}"
+        ) from fault
     if count < 1:
-        raise argparse.ArgumentTypeError(f"at least 1 byte; got {text}")
+        raise argparse.ArgumentTypeError(f"must be at least 1 byte; got {text!r}")
     return count
 
 
-def _appearance(view: argparse.ArgumentParser) -> None:
-    group = view.add_argument_group("appearance")
+def transfer_options() -> argparse.ArgumentParser:
+    """Options of all commands that show a volume: its transfer function."""
+    look = argparse.ArgumentParser(add_help=False)
+    group = look.add_argument_group("transfer function")
     kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
     transfer = group.add_mutually_exclusive_group()
     transfer.add_argument(
@@ -108,6 +112,11 @@ def _appearance(view: argparse.ArgumentParser) -> None:
         "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values that it covers"
     )
     group.add_argument("--unit-distance", type=float, help="length to which opacities refer (default: 1)")
+    return look
+
+
+def _appearance(view: argparse.ArgumentParser) -> None:
+    group = view.add_argument_group("appearance")
     group.add_argument(
         "--compositing",
         choices=(*MODES, "isosurface"),
@@ -141,9 +150,17 @@ def _camera(view: argparse.ArgumentParser) -> None:
         type=float,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)",
+        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4, or as "
+        "--view-up has it)",
     )
-    group.add_argument("--view-up", type=float, nargs=3, default=(0, 0, 1), metavar=("X", "Y", "Z"))
+    group.add_argument(
+        "--view-up",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="what is up in the image (default: 0 0 1; or, for files that do not say how they lie, shown as "
+        "the histogram suggests: away from the one face that cuts the object, if there is such a face)",
+    )
     group.add_argument(
         "--view-angle",
         type=float,

@@ -1,4 +1,4 @@
-"""How does a command show what it is doing? By one line on a terminal, once that has taken two seconds."""
+"""How does a command show what it is doing? By a line on stderr, once that has taken two seconds."""
 
 import sys
 import threading
@@ -17,21 +17,22 @@ Told = Callable[[int, int], None]
 @contextmanager
 def working(what: str) -> Iterator[Told]:
     """Show `what` with the seconds that it has taken, on the terminal of stderr, until the context ends;
-    yields a function that adds how many are done of how many. Nothing is shown where stderr is no
-    terminal."""
+    yields a function that adds how many are done of how many. Where stderr is no terminal, such as a log, the
+    line is `what` alone, once, and stays."""
     begun, count = time.monotonic(), ""
 
     def told(done: int, of: int) -> None:
         nonlocal count
         count = f"{done} of {of}, "
 
-    if not sys.stderr.isatty():
-        yield told
-        return
-    ended = threading.Event()
+    ended, terminal = threading.Event(), sys.stderr.isatty()
 
     def show() -> None:
         wait = PATIENCE
+        if not terminal:
+            if not ended.wait(wait):
+                print(f"{what} ...", file=sys.stderr, flush=True)
+            return
         while not ended.wait(wait):
             wait = INTERVAL
             line = f"{what}: {count}{time.monotonic() - begun:.0f} s"

@@ -2,6 +2,7 @@
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from ..rendering import Rendering
 from ..unseen import why_unseen
 from .frames import Frames, frames_of
 from .options import scene_options, view_options
-from .orbit import views_of
+from .orbit import axis_of, turned, views_of
 from .progress import working
 from .recorded import settings_of, text_of, transfer_from_file
-from .scene import axis_of, scene_of, turned
+from .scene import scene_of
 
 
 def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "") -> None:
@@ -63,14 +64,16 @@ def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "
 
 
 def _render(options: argparse.Namespace) -> None:
+    begun = time.perf_counter()
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
     scene = scene_of(options)
-    camera = turned(scene.camera, options.turn, axis_of(options))
-    views = (camera,) if options.orbit is None else views_of(options, scene, options.orbit)
+    camera = turned(scene.camera, options.turn, axis_of(options, scene.camera))
+    views = (camera,) if options.orbit is None else views_of(options, scene.camera, options.orbit)
     frames = frames_of(options, scene, views)
-    rendering = rendered(frames, camera, options.output)
+    before = "reading and planning" if options.step is None else "reading"
+    rendering = rendered(frames, camera, options.output, {before: time.perf_counter() - begun})
     told = {}
     if options.output.suffix.lower() == ".png":
         held = transfer_from_file(options, scene.transfer)
@@ -85,18 +88,22 @@ def _render(options: argparse.Namespace) -> None:
             print(f"{options.output}: nothing is seen: {why}")
 
 
-def rendered(frames: Frames, camera: Camera, path: Path) -> Rendering:
-    """One image; prints what it took, under the name of the file that it is for."""
+def rendered(
+    frames: Frames, camera: Camera, path: Path, before: Mapping[str, float] | None = None
+) -> Rendering:
+    """One image; prints what it took, under the name of the file that it is for. `before`: the seconds that
+    were needed for it until now, by what was done in them."""
     begun = time.perf_counter()
-    with working(f"rendering {path}") as told:
+    with working(f"compiling and rendering {path}") as told:
         rendering = frames.render(camera, told)
-    took = time.perf_counter() - begun
+    spent = {**(before or {}), "compiling and rendering": time.perf_counter() - begun}
+    parts = ", ".join(f"{what} {seconds:.2f} s" for what, seconds in spent.items())
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     shape = frames.volume.shape if frames.source is None else frames.source.shape
     print(
         f"{path}: {' x '.join(map(str, camera.size))} pixels of {' x '.join(map(str, shape))} voxels, "
-        f"{millions:.1f} million samples in {took:.2f} s including compilation, "
+        f"{millions:.1f} million samples in {sum(spent.values()):.2f} s ({parts}), "
         f"on {device.device_kind} ({device.platform})"
     )
     if frames.source is not None:

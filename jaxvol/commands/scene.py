@@ -4,13 +4,22 @@ import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float
 
-from ..automatic import automatic_transfer, labels_shown, visible_box
+from ..automatic import (
+    FRONT,
+    automatic_transfer,
+    framed,
+    front_of,
+    labels_shown,
+    upright,
+    visible_points,
+)
 from ..bricks import VoxelSource
 from ..camera import Camera
 from ..compositing import Compositing, Over
 from ..fitting import read_transfer
+from ..formats import says_where_it_lies
 from ..isosurface import Isosurface
 from ..lighting import Lighting, Phong
 from ..march import Transform
@@ -21,7 +30,11 @@ from ..transfer import Transfer
 from ..transforms.clip import Clip
 from ..volume import Volume
 from .data import copy_of, source_of, volume_of
+from .orbit import views_shown
 from .progress import working
+
+
+Z = 0.0, 0.0, 1.0
 
 
 class Scene(NamedTuple):
@@ -51,38 +64,18 @@ def scene_of(options: argparse.Namespace) -> Scene:
         if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
             volume, transfer = shown
         else:
-            transfer = _look(options, volume)
-        seen = visible_box(volume, transfer) if is_automatic(options) else volume
-    return Scene(volume, transfer, _view(options, seen), mode, _lighting(options, mode), clip, source)
+            transfer = look_of(options, volume)
+        points = visible_points(volume, transfer) if is_automatic(options) else None
+    return Scene(
+        volume, transfer, _view(options, volume, points), mode, _lighting(options, mode), clip, source
+    )
 
 
 def is_automatic(options: argparse.Namespace) -> bool:
     """Whether nothing is said of the transfer function."""
     names = ("preset", "cmap", "transfer", "kept_transfer", "opacity", "clim", "unit_distance")
     said = any(getattr(options, name, None) is not None for name in names)
-    return options.compositing == "over" and not said
-
-
-def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
-    """The camera, turned about an axis through its focal point."""
-    if not degrees:
-        return camera
-    axis = np.asarray(axis, float)
-    if not np.isfinite(axis).all() or not axis.any():
-        raise ValueError(f"--axis must not be 0; got {' '.join(map(str, axis))}.")
-    rotation = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
-    position, focal, up = (
-        np.asarray(v, float) for v in (camera.position, camera.focal_point, camera.view_up)
-    )
-    return Camera(
-        focal + rotation.apply(position - focal),
-        focal,
-        rotation.apply(up),
-        camera.view_angle,
-        size=camera.size,
-        parallel_scale=camera.parallel_scale,
-        window=camera.window,
-    )
+    return getattr(options, "compositing", "over") == "over" and not said
 
 
 def _mode(options: argparse.Namespace) -> Compositing[Any]:
@@ -108,7 +101,7 @@ def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting |
     return Phong() if shade else None
 
 
-def _look(options: argparse.Namespace, volume: Volume) -> Transfer:
+def look_of(options: argparse.Namespace, volume: Volume) -> Transfer:
     """The transfer function that the options specify."""
     kept = getattr(options, "kept_transfer", None)
     if options.transfer or kept is not None:
@@ -126,30 +119,36 @@ def _look(options: argparse.Namespace, volume: Volume) -> Transfer:
     if options.preset:
         return preset(options.preset, options.clim, unit_distance)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
-    cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    surface = getattr(options, "compositing", "over") == "isosurface"
+    cmap = options.cmap or ("white" if surface else "gray")
     return colormap(cmap, clim, options.opacity or "linear", unit_distance)
 
 
-def _view(options: argparse.Namespace, volume: Volume) -> Camera:
-    """Where it is looked at from. `volume`: what the camera is to show, unless its position is given."""
-    view = {"view_up": options.view_up, "view_angle": options.view_angle, "size": tuple(options.size)}
+def _view(options: argparse.Namespace, volume: Volume, points: Float[np.ndarray, "n 3"] | None) -> Camera:
+    """Where it is looked at from. `points`: what the camera is to show, by default the volume, unless its
+    position is given."""
     if options.camera and options.parallel:
         raise ValueError(
             "--parallel goes with --direction, which shows the whole volume; leave out --camera."
         )
     if options.camera and options.direction:
         raise ValueError("--camera sets the position; leave out --direction.")
+    up, side = options.view_up, options.direction
+    free = points is not None and up is side is options.camera is None
+    if free and not says_where_it_lies(options.file) and (found := upright(volume)) is not None:
+        up, side = found, front_of(found)
+    view: dict[str, Any] = {
+        "view_up": Z if up is None else up,
+        "view_angle": options.view_angle,
+        "size": tuple(options.size),
+    }
     if options.camera:
         camera = Camera(options.camera[:3], options.camera[3:], **view)
     else:
-        side = options.direction or (0.5, -1, 0.4)
-        camera = Camera.looking_at(volume, side, parallel=options.parallel, **view)
+        camera = Camera.looking_at(volume, FRONT if side is None else side, parallel=options.parallel, **view)
+        if points is not None:
+            camera = framed(camera, points, views_shown(options, camera))
     return camera.zoom(options.zoom)
-
-
-def axis_of(options: argparse.Namespace) -> Any:
-    """The axis that the camera turns about."""
-    return options.view_up if options.axis is None else options.axis
 
 
 def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:

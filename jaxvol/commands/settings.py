@@ -48,7 +48,12 @@ def parsed(
     settings: dict[str, Any] = {}
     parser = make()
     command = _chosen(parser, given)
-    sources = [_of_picture(command, given, given["like"])] if given.get("like") else []
+    sources = []
+    if given.get("like"):
+        try:
+            sources = [_of_picture(command, given, given["like"])]
+        except ValueError as fault:
+            raise ValueError(f"--like: {fault}") from fault
     sources += [_of_toml(command, given["config"])] if given.get("config") else []
     for source in sources:
         settings = _without_rivals(settings, source) | source

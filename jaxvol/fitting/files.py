@@ -89,7 +89,6 @@ def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
     if not isinstance(transfer, TransferFunction):
         raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as part:
         part.write_text(json.dumps(transfer_fields(transfer), indent=1) + "\n", encoding="utf-8")
     return path

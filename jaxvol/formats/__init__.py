@@ -154,6 +154,15 @@ def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
     )
 
 
+PLACELESS: tuple[str, ...] = (".raw", ".raw.gz", ".npy", *TIFF)
+"""Endings of files that do not say where in the world their axes point."""
+
+
+def says_where_it_lies(path: Path) -> bool:
+    """Whether a file says where in the world the axes of its volume point."""
+    return not path.name.lower().endswith(PLACELESS)
+
+
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
     """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world.
 

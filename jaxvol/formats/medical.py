@@ -15,6 +15,9 @@ from .._util.files import MOST_VOXELS, Header, check_size, chunks, decoding, fil
 from .orientation import toward_axes
 
 
+SIZES = {348, 540}
+"""Bytes of a header, of NIfTI-1 and NIfTI-2."""
+
 LONGEST_LINE, MOST_FIELDS = 2**16, 2**10
 """Of a header in text. It is at most one of corrupt files that has more."""
 
@@ -39,6 +42,8 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
     kind = "Nrrd" if name.endswith(".nrrd") else "Nifti"
     reader.SetImageIO(f"{kind}ImageIO")
     with decoding(path):
+        if kind == "Nifti":
+            _check_header(path)
         reader.ReadImageInformation()
         size, parts = reader.GetSize(), reader.GetNumberOfComponents()
         if len(size) != 3 or parts != 1 or not 0 < math.prod(size) <= MOST_VOXELS:
@@ -56,6 +61,17 @@ def read_medical(path: Path, header: Header) -> dict[str, Any]:
     if data.dtype == np.float64:
         data = data.astype(np.float32)
     return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
+
+
+def _check_header(path: Path) -> None:
+    """**Raises** `ValueError` for what has no NIfTI header. Of that, ITK's library prints text of its own."""
+    with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as stream:
+        begin = stream.read(4)
+    if not {int.from_bytes(begin, order) for order in ("little", "big")} & SIZES:
+        raise ValueError(
+            f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; this "
+            f"one with the bytes {begin.hex(' ')}. Fetch or write it again."
+        )
 
 
 def _check_nifti(path: Path, reader: Any, n_bytes: int) -> None:

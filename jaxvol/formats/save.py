@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from .._util.checks import described, is_traced, output_file
+from .._util.files import reason
+from .._util.whole_files import whole_file
 from ..volume import Volume
 
 
-def save(volume: Volume | Any, path: str | os.PathLike[str]) -> Path:
+def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     """Write a volume to a file, in the format of its ending; `jv.load` reads the same volume.
 
     | ending | written |
@@ -29,7 +31,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str]) -> Path:
 
     **Arguments:**
 
-    - `volume`: with voxels; of one that has a `field`, they are not what is shown, and it is refused.
+    - `volume`: with voxels. It comes first; `save_png`, of images, has the path first. Of one that has a
+        `field`, voxels are not what is shown, and it is refused.
     - `path`: the file to write. Folders are made where they are missing.
 
     **Returns:** the path.
@@ -39,7 +42,13 @@ def save(volume: Volume | Any, path: str | os.PathLike[str]) -> Path:
     needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
-        raise ValueError(f"volume must be a Volume; got {described(volume)}.")
+        swapped = isinstance(path, Volume)
+        raise ValueError(
+            f"volume must be a Volume; got {described(volume)}."
+            + (" The volume comes first, as in save(volume, path)." if swapped else "")
+        )
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path must be a str or a path; got {described(path)}.")
     if is_traced(volume):
         raise ValueError("volume must not be traced: save it outside of jit and grad.")
     if volume.field is not None:
@@ -52,11 +61,10 @@ def save(volume: Volume | Any, path: str | os.PathLike[str]) -> Path:
         raise ValueError(f"path must end in {', '.join(sorted(WRITERS))}; got {path}.")
     write = WRITERS[ending]
     output_file("path", path)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with whole_file(path) as part, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         write(volume, Path(folder) / path.name)
-        # the header last: it names the other file of two
-        for file in sorted(Path(folder).iterdir(), key=lambda file: file.name == path.name):
-            os.replace(file, path.parent / file.name)
+        for file in Path(folder).iterdir():  # the header takes its place last: it names the other file of two
+            os.replace(file, part if file.name == path.name else path.parent / file.name)
     return path
 
 
@@ -96,7 +104,7 @@ def _write_medical(volume: Volume, path: Path) -> None:
     try:
         sitk.WriteImage(image, str(path), compress)
     except RuntimeError as fault:
-        raise ValueError(f"path: {path.name} cannot be written ({fault}).") from fault
+        raise ValueError(f"path: {path.name} cannot be written ({reason(fault)}).") from fault
 
 
 WRITERS: dict[str, Callable[[Volume, Path], None]] = {

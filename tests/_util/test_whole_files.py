@@ -5,6 +5,9 @@ import os
 import subprocess
 import sys
 
+import pytest
+
+from jaxvol._util.checks import output_file
 from jaxvol._util.whole_files import whole_file, whole_folder
 
 
@@ -32,6 +35,22 @@ def test_after_an_error_all_is_as_it_was(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["a.png", "folder"]
 
 
+def test_folders_are_made_for_what_becomes_whole_and_not_left_behind_otherwise(tmp_path):
+    for context, inside in ((whole_file, "."), (whole_folder, "b")):
+        with contextlib.suppress(ZeroDivisionError), context(tmp_path / "deep" / "down" / "a") as part:
+            (part / inside).write_text("half")
+            raise ZeroDivisionError
+        assert os.listdir(tmp_path) == []
+    output_file("path", tmp_path / "deep" / "down" / "a")
+    assert os.listdir(tmp_path) == []
+    with whole_file(tmp_path / "deep" / "down" / "a") as part:
+        part.write_text("whole")
+    assert (tmp_path / "deep" / "down" / "a").read_text() == "whole"
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"file is not a folder"):
+        output_file("path", tmp_path / "file" / "deep" / "a")
+
+
 def test_files_of_a_folder_take_their_places_beside_others(tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -55,7 +74,7 @@ from pathlib import Path
 from jaxvol._util.whole_files import remove_unfinished, whole_file, whole_folder
 
 def write():
-    with whole_folder(Path("folder")) as folder, whole_file(Path("a.png")) as part:
+    with whole_folder(Path("deep/folder")) as folder, whole_file(Path("a.png")) as part:
         (folder / "b").write_text("half")
         part.write_text("half")
         begun.set()

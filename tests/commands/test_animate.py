@@ -12,8 +12,7 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.cli import main
-from jaxvol.commands.orbit import angles_of
-from jaxvol.commands.scene import turned
+from jaxvol.commands.orbit import angles_of, turned
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]

@@ -41,8 +41,9 @@ def test_what_is_soon_done_is_not_shown(shown):
     assert shown(Terminal(), patience=30, seconds=0) == ""
 
 
-def test_nothing_is_shown_in_a_file(shown):
-    assert shown(io.StringIO(), patience=0.01, seconds=0.1) == ""
+def test_a_log_has_one_line_of_what_takes_long(shown):
+    assert shown(io.StringIO(), patience=0.01, seconds=0.3) == "rendering a.png, frames ...\n"
+    assert shown(io.StringIO(), patience=30, seconds=0) == ""
 
 
 def test_it_ends_with_an_error(monkeypatch):

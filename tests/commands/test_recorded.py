@@ -181,7 +181,7 @@ def test_settings_that_others_may_have_made_are_checked(case, tmp_path, capsys, 
     make(tmp_path / "a.png")
     assert main(["render", "--like", "a.png", "-o", "b.png"]) == 2
     printed = capsys.readouterr().err
-    assert printed.startswith("jaxvol render: error: ")
+    assert printed.startswith("jaxvol render: error: --like: ")
     assert printed.count("\n") == 1
     assert len(printed) < 700
     assert message in printed

@@ -69,6 +69,29 @@ def test_what_a_command_needs_may_stand_in_the_file(config):
         options("fit", "a.raw", "--config", config('images = ["a.png"]'))
 
 
+def test_the_viewer_takes_its_options_from_a_file(config):
+    path = config(
+        'file = "a.raw"\nclim = [0, 9]\ncmap = "bone"\nopacity = "sigmoid"\nshade = false\nport = 9000'
+    )
+    flags = [
+        "a.raw",
+        "--clim",
+        "0",
+        "9",
+        "--cmap",
+        "bone",
+        "--opacity",
+        "sigmoid",
+        "--no-shade",
+        "--port",
+        "9001",
+    ]
+    found, expected = options("view", "--config", path, "--port", 9001), options("view", *flags)
+    assert vars(found) | {"config": None} == vars(expected)
+    with pytest.raises(ValueError, match="jaxvol view has no option 'size'"):
+        options("view", "--config", config("size = [1, 2]"))
+
+
 BAD = {
     "unknown": ("sise = [1, 2]", "settings.toml: jaxvol render has no option 'sise'. Did you mean size?"),
     "of another command": ('solver = "adam"', "jaxvol render has no option 'solver'"),

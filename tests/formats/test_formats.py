@@ -15,7 +15,8 @@ import pytest
 
 from jaxvol import formats
 from jaxvol._util import files
-from jaxvol.formats import load, register
+from jaxvol.formats import load, register, save
+from jaxvol.volume import Volume
 
 
 SHAPE = (5, 4, 3)
@@ -466,10 +467,22 @@ def test_a_metaimage_is_inflated_to_its_end_whatever_its_header_says_of_it(sitk,
     assert same(load(tmp_path / "a.mhd"), ramp("int16"), (1, 2, 3))
 
 
-def test_what_is_no_image_is_refused(sitk, tmp_path):
+def test_what_is_no_image_is_refused_without_text_of_itk(sitk, tmp_path, capfd):
     for ending in ITK_ENDINGS:
-        with pytest.raises(ValueError, match=f"a{ending} cannot be read"):
+        with pytest.raises(ValueError, match=f"a{ending} cannot be read") as fault:
             load(write(tmp_path / f"a{ending}", b"not an image\n" * 99))
+        assert "\n" not in str(fault.value)
+        assert not any(word in str(fault.value) for word in ("ITK", ".cxx", "(0x", "ERROR"))
+    assert capfd.readouterr().err == ""
+
+
+def test_a_fault_that_only_itk_sees_is_told_in_one_line(sitk, tmp_path):
+    path = save(Volume(ramp()), tmp_path / "a.nii")
+    whole = bytearray(path.read_bytes())
+    whole[70:72] = (9999).to_bytes(2, "little")  # the type of the voxels
+    path.write_bytes(whole)
+    with pytest.raises(ValueError, match=r"incomplete \(\S*a\.nii is not recognized as a NIFTI file\)\.$"):
+        load(path)
 
 
 def test_a_missing_simpleitk_says_how_to_install_it(tmp_path, monkeypatch):

@@ -81,6 +81,7 @@ def test_what_cannot_be_saved_is_refused(tmp_path, monkeypatch):
     volume = jv.Volume(ramp(), labels=ramp())
     cases = [
         (ramp(), "a.npz", "volume must be a Volume"),
+        (volume, 5, "path must be a str or a path; got 5"),
         (volume, "a.vti", r"path must end in \.mha"),
         (volume, "a.nii", "has labels, for which a.nii has no place"),
         (jv.Volume(ramp("float16")), "a.nrrd", "voxels of float16, which a.nrrd cannot hold"),
@@ -88,11 +89,14 @@ def test_what_cannot_be_saved_is_refused(tmp_path, monkeypatch):
     ]
     for what, name, message in cases:
         with pytest.raises(ValueError, match=message):
-            jv.save(what, tmp_path / name)
+            jv.save(what, tmp_path / "deep" / name if isinstance(name, str) else name)
+    with pytest.raises(ValueError, match=r"volume must be a Volume; .* The volume comes first, as in save"):
+        jv.save("a.npz", volume)
     assert not list(tmp_path.iterdir())
     monkeypatch.setitem(__import__("sys").modules, "SimpleITK", None)
     with pytest.raises(ImportError, match=r"pip install jaxvol\[io\]"):
-        jv.save(jv.Volume(ramp()), tmp_path / "a.nii")
+        jv.save(jv.Volume(ramp()), tmp_path / "deep" / "a.nii")
+    assert not list(tmp_path.iterdir())
 
 
 # Labels of another file
