@@ -54,7 +54,8 @@ def test_bricks_follow_what_is_visible():
         assert read_of(best, summary, occupied) < 0.7 * read_of(first, summary, occupied)
         # nothing that fits into as many bricks reads less
         for parts in itertools.product(range(1, 9), repeat=3):
-            other = BrickGrid(shape, tuple(-(-256 // p // 16) * 16 for p in parts))
+            x, y, z = (-(-256 // p // 16) * 16 for p in parts)
+            other = BrickGrid(shape, (x, y, z))
             fitting = fits(stored_of(other, MARGIN, None), np.dtype(np.uint8), MARGIN, memory)
             if fitting and other.number <= 2 * first.number:
                 assert read_of(best, summary, occupied) <= read_of(other, summary, occupied)
