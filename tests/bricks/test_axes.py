@@ -14,7 +14,7 @@ from jaxvol.bricks.sources import Reordered
 from jaxvol.bricks.summary import scan
 
 
-ORDERS = list(itertools.permutations(range(3)))
+ORDERS: Any = list(itertools.permutations(range(3)))
 SHAPE = 20, 25, 18
 TRANSFER = jv.TransferFunction.from_points(
     [(60, (1, 1, 1), 0.0), (90, (1, 0, 1), 0.02), (250, (0, 1, 1), 0.1)]
