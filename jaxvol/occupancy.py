@@ -8,10 +8,12 @@ are conservative: what is called empty is proven to be. They carry no gradient.
 
 from collections.abc import Callable
 from functools import reduce
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from ._util.frame import Frame, Order
@@ -34,6 +36,8 @@ FARTHEST = 255
 
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 """By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
+
+Nodes = TypeVar("Nodes", Array, np.ndarray)
 
 Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 
@@ -292,27 +296,29 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
     return over_blocks(bits, jnp.bitwise_or)
 
 
-def over_blocks(
-    data: Shaped[Array, "*nodes"], combine: Callable[[Array, Array], Array], margin: int = 0
-) -> Shaped[Array, "*blocks"]:
-    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
-    for axis in range(data.ndim):
-        cells = data.shape[axis] - 1
+def over_blocks(data: Nodes, combine: Callable[[Nodes, Nodes], Nodes], margin: int = 0) -> Nodes:
+    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis; of an array
+    of JAX or NumPy."""
+    xp: Any = jnp if isinstance(data, jax.Array) else np
+    values: Any = data
+
+    def along(axis: int, begin: int, end: int, step: int = 1) -> Any:
+        return values[(slice(None),) * axis + (slice(begin, end, step),)]
+
+    for axis in range(values.ndim):
+        cells = values.shape[axis] - 1
         if margin:
             missing = -cells % BLOCK
-            around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(data.ndim)]
-            data, cells = jnp.pad(data, around, mode="edge"), cells + missing
+            around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
+            values, cells = xp.pad(values, around, mode="edge"), cells + missing
         # The last block may be shorter. To pad the nodes takes seven times as long, and a copy of them.
         whole, rest = divmod(cells, BLOCK)
         found = []
         if whole:
-            last, step = (whole - 1) * BLOCK, BLOCK
-            parts = range(BLOCK + 1 + 2 * margin)
-            found.append(
-                reduce(combine, [jax.lax.slice_in_dim(data, i, i + last + 1, step, axis) for i in parts])
-            )
+            last, parts = (whole - 1) * BLOCK, range(BLOCK + 1 + 2 * margin)
+            found.append(reduce(combine, [along(axis, i, i + last + 1, BLOCK) for i in parts]))
         if rest:
             nodes = range(whole * BLOCK, cells + 1)
-            found.append(reduce(combine, [jax.lax.slice_in_dim(data, i, i + 1, 1, axis) for i in nodes]))
-        data = jnp.concatenate(found, axis) if len(found) > 1 else found[0]
-    return data
+            found.append(reduce(combine, [along(axis, i, i + 1) for i in nodes]))
+        values = xp.concatenate(found, axis) if len(found) > 1 else found[0]
+    return values

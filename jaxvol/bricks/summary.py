@@ -14,8 +14,7 @@ import numpy as np
 from .._util.axes import Axes, inverse, permuted
 from .._util.checks import integer
 from .._util.memory import give_back
-from ..occupancy import BLOCK, Blocks, extremes, widened
-from ..volume import Volume
+from ..occupancy import BLOCK, Blocks, over_blocks, widened
 from .sources import Corner, VoxelSource, in_storage_order
 from .streaming import slabs
 
@@ -135,8 +134,9 @@ def scan(
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
     nx, ny, nz = source.shape
     for slab in slabs(source, memory):
-        found = map(np.asarray, extremes(Volume(slab.voxels).data))
-        for (name, combine), part in zip(COMBINED.items(), found, strict=True):
+        for name, combine in COMBINED.items():
+            # by NumPy: to compile for each shape of a slab takes longer, and memory
+            part = over_blocks(slab.voxels, combine)
             merged, place = _merged(part, slab.first, cell // BLOCK, combine)
             if name not in ranges:
                 ranges[name] = np.full(blocks, _neutral(part.dtype, combine), part.dtype)
