@@ -255,7 +255,7 @@ MUTATIONS = [
         "bricks/render.py",
         "cache=self.cache).reordered(axes)",
         "cache=self.cache)",
-        ("bricks/test_axes.py::test_images_do_not_depend_on_the_order_of_storage",),
+        ("bricks/test_choice.py::test_an_image_reads_what_the_choice_says[F]",),
     ),
     Mutation(
         "bricks: a block at the far end of a brick is not looked at",

@@ -87,9 +87,10 @@ def test_many_rays_want_few_bricks():
     assert visible(many, summary, occupied).sum() < visible(few, summary, occupied).sum()
 
 
-def test_an_image_reads_what_the_choice_says():
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_an_image_reads_what_the_choice_says(order):
     """A rod of 3 x 3 blocks in a corner: what lies beside it is not read."""
-    data = np.zeros((129, 129, 129), np.uint8)
+    data = np.zeros((129, 129, 129), np.uint8, order)
     data[3:40, 3:40, :] = 200
     transfer = jv.TransferFunction.from_points([(60, (1, 1, 1), 0.0), (250, (1, 0, 1), 0.2)])
     camera = jv.Camera((64, 64, -300), (64, 64, 64), (0, 1, 0), 30.0, size=(16, 16))
