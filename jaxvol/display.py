@@ -154,7 +154,8 @@ def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -
     for place, (name, image) in enumerate(shown.items()):
         row, column = divmod(place, columns)
         left, top = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE
-        box = left, down - top - image.shape[0], image.shape[1], image.shape[0]
+        # a thousandth of a pixel off the edge between two, on which older versions of matplotlib miss a row
+        box = left, down - top - image.shape[0] + 1e-3, image.shape[1], image.shape[0]
         axes = figure.add_axes(np.divide(box, (across, down, across, down)).tolist())
         axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="none")
         axes.set_axis_off()
