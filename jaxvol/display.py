@@ -121,10 +121,10 @@ def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
     return save_image(path, linear)
 
 
-GAP, INSET = 1e-3
-"""Pixels."""
-TITLE = 6, 20
-"""Pixels between images that are shown side by side, and of the line above each that names it."""
+GAP, TITLE, INSET = 6, 20, 1e-3
+"""Pixels between images that are shown side by side, and of the line above each that names it; and
+by how much an image is drawn smaller on each side: versions of matplotlib before 3.11 may draw one row more or
+less where an edge lies exactly between two pixels."""
 
 
 def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -> None:
@@ -156,8 +156,6 @@ def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -
     for place, (name, image) in enumerate(shown.items()):
         row, column = divmod(place, columns)
         left, top = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE
-        # a thousandth of a pixel smaller on each side: at edges between two pixels, versions of matplotlib
-        # before 3.11 may draw one row more or less
         box = left + INSET, down - top - image.shape[0] + INSET, *(n - 2 * INSET for n in image.shape[1::-1])
         axes = figure.add_axes(np.divide(box, (across, down, across, down)).tolist())
         axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="none")
