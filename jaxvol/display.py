@@ -123,8 +123,8 @@ def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
 
 GAP, TITLE, INSET = 6, 20, 1e-3
 """Pixels between images that are shown side by side, and of the line above each that names it; and
-by how much an image is drawn smaller on each side: versions of matplotlib before 3.11 may draw one row more or
-less where an edge lies exactly between two pixels."""
+by how much an image is drawn smaller on each side, since versions of matplotlib before 3.11 may draw one row
+more or less where an edge lies exactly between two pixels."""
 
 
 def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -> None:
