@@ -114,6 +114,7 @@ def test_what_is_leapt_over_does_not_show():
     np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_volume_along_the_axes():
     straight, turned = pair()
     march, _ = march_pair("hierarchy", straight)

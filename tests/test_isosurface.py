@@ -272,6 +272,7 @@ def test_gradients_are_central_differences(adjoint):
         check_gradients(volume, jv.Isosurface(0.45), value, adjoint, constant=constant, normals=True)
 
 
+@pytest.mark.slow
 def test_an_image_of_nothing_has_the_gradient_0():
     """Of a value that the volume does not have, and of rays that miss among others that do not."""
 

@@ -130,6 +130,7 @@ def test_strides_are_those_of_the_reference(name):
     np.testing.assert_allclose(rendering.rgba, unleapt.rgba, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["hierarchy", *slow("distance", "beam")])
 @pytest.mark.parametrize("name", ["aligned", *slow("moving")])
 def test_leaping_does_not_change_gradients_under_strides(name, method):

@@ -232,7 +232,7 @@ def test_the_length_of_the_gradient_does_not_matter():
         np.testing.assert_allclose(found, lit(Phong(SUN), VIEWS[1], -VIEWS[0]), atol=2e-5)
 
 
-@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("light", ["head", *slow("sun", "all")])
 def test_without_a_gradient_there_is_ambient_light_and_no_derivative(light):
     np.testing.assert_allclose(lit(Phong(LIGHTS[light]), (0, 0, 0), (0, 0, 1)), 0.1 * COLOR, rtol=1e-6)
 
@@ -348,6 +348,7 @@ def test_quadratures_shade_where_they_sample(quadrature):
     np.testing.assert_allclose(found.rgba, of_reference(scene, Phong()), atol=2e-5)
 
 
+@pytest.mark.slow
 def test_leaping_and_tiles_show_neither_in_the_image_nor_in_its_gradient():
     """By many tiles, as a larger image has; with 8-bit voxels."""
     volume, transfer, camera, _ = scene_of((), size=(40, 36))
@@ -379,6 +380,7 @@ def test_leaping_and_tiles_show_neither_in_the_image_nor_in_its_gradient():
         assert np.linalg.norm(a - b) <= 1e-5 * max(np.linalg.norm(a), 1e-3)
 
 
+@pytest.mark.slow
 def test_outputs_programs_and_batches_give_the_same_image():
     scene, lighting = scene_of((jv.SpaceLeaping(), jv.AlphaCorrection())), Phong(SUN)
     whole = jv.render(*scene, lighting=lighting)

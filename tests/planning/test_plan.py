@@ -60,6 +60,7 @@ def test_it_is_within_its_tolerance(sphere, planned):
     assert TOLERANCE / 10 < error_of(planned, *sphere) <= planned.error <= TOLERANCE
 
 
+@pytest.mark.slow
 def test_a_smaller_tolerance_takes_shorter_steps(sphere, planned):
     finer = plan_of(sphere, TOLERANCE / 8)
     assert float(finer.march.step) < float(planned.march.step) / 1.5

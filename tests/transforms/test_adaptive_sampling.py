@@ -453,6 +453,7 @@ def test_leaping_does_not_change_its_gradients():
     assert_same(found, expected, 1e-4)
 
 
+@pytest.mark.slow
 def test_it_follows_tolerance_and_transfer_function_in_one_program():
     volume, transfer, camera, march = scene_of()
     kind, samples = counting(), []
