@@ -260,15 +260,15 @@ MUTATIONS = [
     Mutation(
         "bricks: a block at the far end of a brick is not looked at",
         "bricks/choice.py",
-        "found.take(range(a, b + 1), axis)",
-        "found.take(range(a, max(a + 1, b)), axis)",
+        "ends.append(((first, -1), (last + 1, 1)))",
+        "ends.append(((first, -1), (np.maximum(last, first + 1), 1)))",
         ("bricks/test_choice.py::test_a_brick_is_visible_if_any_of_its_blocks_is",),
     ),
     Mutation(
         "bricks: what is visible does not count in the choice of a split",
         "bricks/choice.py",
-        "return each * int(visible(grid, summary, occupied).sum())",
-        "return each * grid.number",
+        "return each * -(-int(visible(other, summary, table).sum()) // least)",
+        "return each * other.number",
         ("bricks/test_choice.py::test_bricks_follow_what_is_visible",),
     ),
     Mutation(

@@ -7,6 +7,8 @@ all rays.
 
 import math
 from collections.abc import Iterator
+from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -28,51 +30,68 @@ def cheapest(
     grid: BrickGrid,
     source: VoxelSource,
     summary: Summary,
-    occupied: np.ndarray,
+    table: np.ndarray,
     margin: Margin,
     memory: int,
     rays: int,
     least: int = 1,
 ) -> BrickGrid:
-    """The split of the volume of which least is read, among those into no more than MORE times as many bricks
-    as `grid` has, and at least `least`, that fit into `memory`. `occupied`: blocks of the summary in which
-    anything may be visible."""
+    """The split of the volume that takes the least time to read and to march, as far as that is known, among
+    those into no more than MORE times as many bricks as `grid` has that fit into `memory`. `table`: of what
+    may be visible (`counts`). `least`: devices that take a brick each at a time, and the least number of
+    bricks."""
 
-    def cost(grid: BrickGrid) -> int:
-        stored = stored_of(grid, margin, None)
+    def cost(other: BrickGrid) -> int:
+        stored = stored_of(other, margin, None)
         each = source.touched(stored) + math.prod(stored) * source.dtype.itemsize + PER_RAY * rays
-        return each * int(visible(grid, summary, occupied).sum())
+        return each * -(-int(visible(other, summary, table).sum()) // least)
 
     tried = [other for other in _others(grid, source, margin, memory) if other.number >= least]
     return min([grid, *tried], key=cost)
 
 
-def visible(grid: BrickGrid, summary: Summary, occupied: np.ndarray) -> np.ndarray:
-    """For each brick, whether anything may be visible in it."""
-    found = occupied
-    for axis, (size, n) in enumerate(zip(grid.size, grid.shape, strict=True)):
-        ends = [(low, min(low + size, n - 1)) for low in range(0, n - 1, size)]
-        touched = [summary.touched(low, high, n) for low, high in ends]
-        parts = [found.take(range(a, b + 1), axis).any(axis, keepdims=True) for a, b in touched]
-        found = np.concatenate(parts, axis)
-    return found.reshape(-1)
+def counts(occupied: np.ndarray) -> np.ndarray:
+    """How many blocks before each one along all axes may hold anything visible: a summed-volume table, of one
+    entry more along each axis."""
+    table = occupied.astype(np.int32)
+    for axis in range(3):
+        np.cumsum(table, axis, out=table)
+    return np.pad(table, ((1, 0),) * 3)
+
+
+def visible(grid: BrickGrid, summary: Summary, table: np.ndarray) -> np.ndarray:
+    """For each brick, whether anything may be visible in it. `table`: `counts` of the summary's blocks."""
+    ends = []
+    for size, n in zip(grid.size, grid.shape, strict=True):
+        touched = [summary.touched(low, min(low + size, n - 1), n) for low in range(0, n - 1, size)]
+        first, last = np.array(touched).T
+        ends.append(((first, -1), (last + 1, 1)))
+    number: Any = 0
+    for corner in product(*ends):
+        x, y, z = (index for index, _ in corner)
+        number = number + math.prod(sign for _, sign in corner) * table[np.ix_(x, y, z)]
+    return number.reshape(-1) > 0
 
 
 def _others(grid: BrickGrid, source: VoxelSource, margin: Margin, memory: int) -> Iterator[BrickGrid]:
-    """Splits that fit: with any numbers of parts along two axes, and along the third as few as may be."""
-    cells = [n - 1 for n in grid.shape]
-    most = [max(1, -(-c // EDGE)) for c in cells]
-    seen = set[Node]()
+    """Splits that fit: of any sizes along two axes, and of the largest that fits along the third."""
+    sizes = [_sizes(n - 1) for n in grid.shape]
+    most, seen = MORE * grid.number, set[Node]()
     for third in range(3):
         a, b = (axis for axis in range(3) if axis != third)
-        for i in range(1, most[a] + 1):
-            for j in range(1, min(most[b], MORE * grid.number // i) + 1):
-                for k in range(1, min(most[third], MORE * grid.number // (i * j)) + 1):
-                    parts = {a: i, b: j, third: k}
-                    x, y, z = (rounded(-(-c // parts[axis]), c) for axis, c in enumerate(cells))
-                    other = BrickGrid(grid.shape, (x, y, z))
-                    if fits(stored_of(other, margin, None), source.dtype, margin, memory):
-                        if other.size not in seen:
-                            seen.add(other.size)
-                            yield other
-                        break
+        for along_a, along_b in product(sizes[a], sizes[b]):
+            for along_third in sizes[third]:
+                by_axis = {a: along_a, b: along_b, third: along_third}
+                other = BrickGrid(grid.shape, (by_axis[0], by_axis[1], by_axis[2]))
+                if other.number > most or other.size in seen:
+                    break
+                if fits(stored_of(other, margin, None), source.dtype, margin, memory):
+                    seen.add(other.size)
+                    yield other
+                    break
+
+
+def _sizes(cells: int) -> list[int]:
+    """Sizes of bricks along an axis of so many cells, one for each number of parts, the largest first."""
+    parts = range(1, max(1, -(-cells // EDGE)) + 1)
+    return sorted({rounded(-(-cells // part), cells) for part in parts}, reverse=True)

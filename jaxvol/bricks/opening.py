@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described
+from .._util.named_axes import along_xyz, is_named
 from ..volume import Volume
 from .files import mapped, npy, raw, triple
 from .ome_zarr import levels_in
@@ -53,6 +54,7 @@ def levels_of(
       | | read |
       |---|---|
       | an array, data[x, y, z] | in place |
+      | an xarray `DataArray` | in place, its axes and coordinates as in `Volume` |
       | a memory map (`np.memmap`) or a view of one | from its file; in place if that was replaced |
       | path of a `.raw` file, x fastest | from the file, box by box; header as for `jv.load` |
       | path of a `.npy` file, data[x, y, z] | from the file, box by box |
@@ -83,6 +85,9 @@ def levels_of(
                 f"spacing and origin are those of {described(thing)}; got {place} as well. Leave them out."
             )
         return (source,)
+    if is_named(thing):
+        thing, told = along_xyz(thing)
+        place = {name: triple(name, told.get(name)) if at is None else at for name, at in place.items()}
     found = mapped(thing, **place) if isinstance(thing, np.ndarray) else None
     return (ArraySource(thing, **place) if found is None else found,)
 

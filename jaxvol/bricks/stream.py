@@ -27,7 +27,7 @@ from ..rendering import BrickReport
 from ..space import Ray, Space
 from ..transforms import ToroidalMap
 from ..volume import Volume, part_of, with_voxels
-from .choice import cheapest, visible
+from .choice import cheapest, counts as counted, visible
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
 from .sources import VoxelSource, axes_of, in_background
@@ -118,10 +118,10 @@ class Stream:
             grid = BrickGrid(source.shape, (x, y, z))
         check_part(stored_of(grid, margin, None))
         summary = summary_of()
-        occupied = _occupied(marched, summary)
+        table = counted(_occupied(marched, summary))
         if counts is None and straight:
             rays = math.prod(marched.source.size)
-            grid = cheapest(grid, source, summary, occupied, margin, memory, rays, least)
+            grid = cheapest(grid, source, summary, table, margin, memory, rays, least)
         alone = stored_of(grid, margin, probe if method == "overlap" else None)
         check_part(alone)
         stored = alone
@@ -129,7 +129,7 @@ class Stream:
             middle = (np.asarray(source.shape) - 1) / 2
             typical = replace(margin, cells=margin.of_box(space, source.shape, middle, middle))
             stored = stored_of(grid, typical, probe if method == "overlap" else None)
-        order, seen = grid.order(space, marched.source), visible(grid, summary, occupied)
+        order, seen = grid.order(space, marched.source), visible(grid, summary, table)
         return cls(
             *(
                 source,

@@ -126,6 +126,20 @@ def test_images_do_not_depend_on_the_order_of_storage(tmp_path, bricks):
         assert found.bricks.stored == SHAPE, name  # with what is read around bricks
 
 
+def test_an_array_of_xarray_is_taken_by_its_names():
+    xarray = pytest.importorskip("xarray")
+    data = noise()
+    at = {
+        name: PLACE["origin"][i] + PLACE["spacing"][i] * np.arange(SHAPE[i]) for i, name in enumerate("xyz")
+    }
+    named = xarray.DataArray(data, dims=("x", "y", "z"), coords=at).transpose("z", "x", "y")
+    whole = jv.render(jv.Volume(data, **PLACE), TRANSFER, CAMERA, MARCH)
+    found = jv.render_bricks(named, TRANSFER, CAMERA, MARCH)
+    np.testing.assert_allclose(found.rgba, whole.rgba, atol=1e-5)
+    moved = jv.render_bricks(named, TRANSFER, CAMERA, MARCH, spacing=(2, 2, 2))
+    assert np.max(np.abs(moved.rgba - whole.rgba)) > 0.01
+
+
 def test_gradients_do_not_depend_on_the_order_of_storage():
     data = noise()
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, Summary, raw, source_of
-from jaxvol.bricks.choice import cheapest, visible
+from jaxvol.bricks.choice import _others, cheapest, counts, visible
 from jaxvol.bricks.sources import in_storage_order
 from jaxvol.bricks.split import Margin, fits, split, stored_of
 
@@ -30,7 +30,7 @@ def test_a_brick_is_visible_if_any_of_its_blocks_is(size):
     shape = (97, 128, 100)
     summary, occupied = summary_with(shape, np.s_[2:4, 5:6, :3])
     grid = BrickGrid(shape, size)
-    found = visible(grid, summary, occupied)
+    found = visible(grid, summary, counts(occupied))
     for brick in range(grid.number):
         low, high = grid.cells(brick)
         part = tuple(slice(a // CELL, -(-b // CELL)) for a, b in zip(low, high, strict=True))
@@ -38,7 +38,7 @@ def test_a_brick_is_visible_if_any_of_its_blocks_is(size):
 
 
 def read_of(grid, summary, occupied):
-    return visible(grid, summary, occupied).sum() * math.prod(stored_of(grid, MARGIN, None))
+    return visible(grid, summary, counts(occupied)).sum() * math.prod(stored_of(grid, MARGIN, None))
 
 
 def test_bricks_follow_what_is_visible():
@@ -49,7 +49,7 @@ def test_bricks_follow_what_is_visible():
         summary, occupied = summary_with(shape, box)
         source = source_of(np.broadcast_to(np.uint8(0), shape))
         first = split(shape, np.uint8, memory, MARGIN, None)
-        best = cheapest(first, source, summary, occupied, MARGIN, memory, 0)
+        best = cheapest(first, source, summary, counts(occupied), MARGIN, memory, 0)
         assert fits(stored_of(best, MARGIN, None), np.dtype(np.uint8), MARGIN, memory)
         assert read_of(best, summary, occupied) < 0.7 * read_of(first, summary, occupied)
         # nothing that fits into as many bricks reads less
@@ -70,7 +70,7 @@ def test_rows_of_a_file_are_not_cut_for_nothing(tmp_path):
     source = in_storage_order(raw(path, shape, "uint8"))
     summary, occupied = summary_with(shape, np.s_[:])
     first = split(shape, np.uint8, memory, MARGIN, None)
-    best = cheapest(first, source, summary, occupied, MARGIN, memory, 0)
+    best = cheapest(first, source, summary, counts(occupied), MARGIN, memory, 0)
     assert first.counts[2] > 1  # planes, rows, voxels of a row
     assert best.counts[2] == 1
     assert best.counts[0] > 1
@@ -83,8 +83,31 @@ def test_many_rays_want_few_bricks():
     occupied = np.random.default_rng(0).random(occupied.shape) < 0.01
     source = source_of(np.broadcast_to(np.uint8(0), shape))
     first = split(shape, np.uint8, memory, MARGIN, None)
-    few, many = (cheapest(first, source, summary, occupied, MARGIN, memory, rays) for rays in (0, 2**24))
-    assert visible(many, summary, occupied).sum() < visible(few, summary, occupied).sum()
+    given = first, source, summary, counts(occupied), MARGIN, memory
+    few, many = (cheapest(*given, rays) for rays in (0, 2**24))
+    assert visible(many, summary, counts(occupied)).sum() < visible(few, summary, counts(occupied)).sum()
+
+
+def test_the_choice_takes_little_time_for_large_volumes():
+    """As many splits are tried as an axis has sizes, and not as it has numbers of parts."""
+    shape, memory = (4097, 4097, 4097), 2**28
+    source = source_of(np.broadcast_to(np.uint8(0), shape))
+    first, tried = split(shape, np.uint8, memory, MARGIN, None), []
+    for other in _others(first, source, MARGIN, memory):
+        tried.append(other.size)
+        assert other.number <= 2 * first.number
+    assert 50 < len(tried) == len({*tried}) < 2000
+
+
+def test_devices_that_own_bricks_take_one_each_at_a_time():
+    """A rod, of which a single long brick would do, and leave seven devices idle."""
+    shape, memory = (257, 257, 257), 2**26
+    summary, occupied = summary_with(shape, np.s_[4:6, 4:6, :])
+    source = source_of(np.broadcast_to(np.uint8(0), shape))
+    given = source, summary, counts(occupied), MARGIN, memory, 0
+    one = cheapest(split(shape, np.uint8, memory, MARGIN, None), *given)
+    eight = cheapest(split(shape, np.uint8, memory, MARGIN, None, 8), *given, 8)
+    assert visible(eight, summary, counts(occupied)).sum() > visible(one, summary, counts(occupied)).sum()
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

@@ -184,7 +184,11 @@ def gradient(scene: Scene) -> Any:
 
 def moving(scene: Scene, f: Any) -> tuple[Any, ...]:
     """A function of what changes from frame to frame, and this: voxels are known, as where one renders."""
-    return lambda *leaves: f(Scene(scene.volume, *leaves)), scene.transfer, scene.source, scene.march
+
+    def moved(transfer: Any, source: Any, march: Any) -> Any:
+        return f(scene._replace(transfer=transfer, source=source, march=march))
+
+    return moved, scene.transfer, scene.source, scene.march
 
 
 def test_a_program_for_cuda_has_no_branch(on_a_gpu):
