@@ -17,13 +17,13 @@ T = TypeVar("T")
 class BrickReport(NamedTuple):
     """What an image by `render_bricks` took.
 
-    - `counts`: bricks along each axis. `needed`: how many of them may hold anything visible, as the ranges of
-      values tell before any ray is marched.
+    - `counts`: bricks along x, y and z. `needed`: how many of them may hold anything visible, as the ranges
+      of values tell before any ray is marched.
     - `loads`: how often a brick was read. `reloads`: how many of these were not the first of their brick. It
       is less than `needed` where bricks lie outside of the view, or behind what is opaque, and more where
       bricks are read again (`method="reload"`).
     - `bytes_read`: of voxels, with what is read around each brick.
-    - `stored`: voxels along each axis that are held at a time. `bytes_held`: memory that these take, with
+    - `stored`: voxels along x, y and z that are held at a time. `bytes_held`: memory that these take, with
       what is made of them and with the next ones. Programs are compiled for `stored`: the first image of a
       budget or split that leads to another shape takes seconds longer.
     """

@@ -103,7 +103,7 @@ class Stream:
         """The bricks of a scene: as its rays are marched, and as it is `shown`.
 
         - `summary_of`: called once it is known that bricks fit, since it may read the whole source.
-        - `counts`: along each axis, in place of as few as fit into `memory`, and at least `least`."""
+        - `counts`: along x, y and z, in place of those chosen to fit into `memory`, at least `least`."""
         assert isinstance(marched.source, Camera)
         march = marched.march
         space = march.locate(marched.volume)

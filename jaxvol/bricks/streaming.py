@@ -20,8 +20,8 @@ from .sources import VoxelSource
 T = TypeVar("T")
 
 COPIES = 8
-"""Slabs in memory at once: this one, as read and as an array of JAX; the next; and what JAX needs to find the
-extremes of blocks."""
+"""Slabs in memory at once, at most: this one, as read and with what was kept of the one before; the next; and
+what finding the extremes of blocks takes."""
 
 
 class Slab(NamedTuple):
