@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
-from . import typechecker  # noqa: F401  (the hook imports it by name)
+from . import typechecker
 
 
+typechecker.leave_inner_functions()
 with install_import_hook("jaxvol", "tests.typechecker.check"):
     import jaxvol
 
@@ -32,6 +33,7 @@ def pytest_configure(config):
     """Compile each program once per session, for all workers, kernels and subprocesses.
 
     The cache folder is new in each session and removed at its end, so that no stale program is tested."""
+    typechecker.InnerFunctions.checked = config.option.markexpr != "not slow"
     if hasattr(config, "workerinput"):
         return  # a worker of pytest-xdist inherits the environment variables
     if config.option.markexpr == "not slow":
