@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from .._util.axes import XYZ, Axes, inverse, permuted
+from .._util.axes import XYZ, Axes, permuted
 from .._util.checks import Arrayable, is_traced
 from .._util.voxels import check_shape, given_array
 from ..volume import Volume
@@ -91,9 +91,9 @@ class VoxelSource(ABC):
         box = self._box(low, high)
         return converted(self._stored(*box, axes), box, axes, self.name)
 
-    def read_async(self, low: Corner, high: Corner) -> "Future[np.ndarray]":
+    def read_async(self, low: Corner, high: Corner, axes: Axes = XYZ) -> "Future[np.ndarray]":
         """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
-        return in_background(self.read, low, high)
+        return in_background(self.read, low, high, axes)
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any] | None:
@@ -159,46 +159,6 @@ class ArraySource(VoxelSource):
 
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
         return self._data[tuple(map(slice, low, high))].transpose(axes)
-
-
-class Reordered(VoxelSource):
-    """A source with its axes in another order: along its own first axis runs `axes[0]` of the source, and so
-    on. Errors tell boxes as the source has them.
-
-    **Arguments:** `source`: the voxels. `axes`: the order.
-    """
-
-    def __init__(self, source: VoxelSource, axes: Axes):
-        self.source, self.axes = source, axes
-        self.name, self.dtype, self.beside = source.name, source.dtype, source.beside
-        self.shape, self.chunks = permuted(source.shape, axes), permuted(source.chunks, axes)
-        self.spacing, self.origin = source.spacing and permuted(source.spacing, axes), source.origin
-        self.order = permuted(inverse(axes), source.order)
-
-    def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
-        low, high = self._box(low, high)
-        back = inverse(self.axes)
-        return self.source.read(permuted(low, back), permuted(high, back), permuted(self.axes, axes))
-
-    def touched(self, size: tuple[int, int, int]) -> int:
-        return self.source.touched(permuted(size, inverse(self.axes)))
-
-    def fingerprint(self) -> dict[str, Any] | None:
-        found = self.source.fingerprint()
-        return None if found is None else found | {"axes of the source": list(self.axes)}
-
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
-        return self.read(low, high, axes)
-
-
-def in_storage_order(source: VoxelSource) -> VoxelSource:
-    """The source with its axes in the order of storage."""
-    return source if source.order == XYZ else Reordered(source, source.order)
-
-
-def axes_of(source: VoxelSource) -> Axes:
-    """The order in which `in_storage_order` has put the axes of a source."""
-    return source.axes if isinstance(source, Reordered) else XYZ
 
 
 def by_stride(strides: Sequence[int]) -> Axes:

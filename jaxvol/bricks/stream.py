@@ -12,7 +12,6 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
-from .._util.axes import inverse, permuted
 from .._util.memory import give_back
 from .._util.xla import compiled
 from ..camera import Camera
@@ -30,7 +29,7 @@ from ..volume import Volume, part_of, with_voxels
 from .choice import cheapest, counts as counted, visible
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
-from .sources import VoxelSource, axes_of, in_background
+from .sources import VoxelSource, in_background
 from .split import Margin, bytes_of, check_part, fits, split, stored_of, stored_shape
 from .summary import Summary
 
@@ -113,8 +112,7 @@ class Stream:
         if counts is None:
             grid = split(source.shape, source.dtype, memory, margin, probe, least)
         else:
-            along = permuted(counts, axes_of(source))
-            x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, along, strict=True))
+            x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, counts, strict=True))
             grid = BrickGrid(source.shape, (x, y, z))
         check_part(stored_of(grid, margin, None))
         summary = summary_of()
@@ -185,14 +183,13 @@ class Stream:
 
     def report(self) -> BrickReport:
         """What all passes so far took."""
-        back = inverse(axes_of(self.source))
         return BrickReport(
-            permuted(self.grid.counts, back),
+            self.grid.counts,
             int(self.visible.sum()),
             len(self.loads),
             len(self.loads) - len(set(self.loads)),
             self.bytes_read,
-            permuted(self.stored, back),
+            self.stored,
             bytes_of(self.stored, self.source.dtype, self.margin),
         )
 
@@ -316,10 +313,10 @@ class Stream:
 
     def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """The voxels of a box, whose range tells whether they are those of the summary."""
-        voxels = self.source.read(low, high)
+        voxels = self.source.read(low, high, self.source.order)
         least, most = self.summary.range_of(low, high)
         if float(voxels.min()) < least or float(voxels.max()) > most:
-            box = [permuted(end.tolist(), inverse(axes_of(self.source))) for end in (low, high)]
+            box = [tuple(end.tolist()) for end in (low, high)]
             raise ValueError(
                 f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
                 f"{most} in the box {box[0]} to {box[1]}, and now "

@@ -11,11 +11,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.axes import Axes, inverse, permuted
+from .._util.axes import inverse
 from .._util.checks import integer
 from .._util.memory import give_back
 from ..occupancy import BLOCK, Blocks, over_blocks, widened
-from .sources import Corner, VoxelSource, in_storage_order
+from .sources import Corner, VoxelSource
 from .streaming import slabs
 
 
@@ -54,11 +54,6 @@ class Summary:
             )
         )
         return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
-
-    def reordered(self, axes: Axes) -> "Summary":
-        """That of the same voxels with their axes in another order (`sources.Reordered`)."""
-        ranges = {name: np.ascontiguousarray(part.transpose(axes)) for name, part in self.ranges.items()}
-        return Summary(permuted(self.shape, axes), self.cell, ranges)
 
     def of_cells(self) -> Blocks:
         """The ranges themselves, as blocks of `cell`³ cells."""
@@ -128,7 +123,6 @@ def scan(
     cell = integer("cell", cell, BLOCK)
     if cell % BLOCK:
         raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
-    axes, source = source.order, in_storage_order(source)
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     ranges: dict[str, np.ndarray] = {}
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
@@ -136,7 +130,7 @@ def scan(
     for slab in slabs(source, memory):
         for name, combine in COMBINED.items():
             # by NumPy: to compile for each shape of a slab takes longer, and memory
-            part = over_blocks(slab.voxels, combine)
+            part = over_blocks(slab.voxels, combine).transpose(inverse(source.order))
             merged, place = _merged(part, slab.first, cell // BLOCK, combine)
             if name not in ranges:
                 ranges[name] = np.full(blocks, _neutral(part.dtype, combine), part.dtype)
@@ -145,8 +139,7 @@ def scan(
         if progress is not None:
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
     give_back()
-    found = Summary(source.shape, cell, ranges)
-    return found.reordered(inverse(axes))
+    return Summary(source.shape, cell, ranges)
 
 
 def _merged(
