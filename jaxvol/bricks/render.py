@@ -98,7 +98,7 @@ def render_bricks(
     - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory`. By default those
       of which least is read (`bricks/choice.py`); where rays are curved in the grid, one more along their
       longest axis until they fit, first where less is read by that. There are fewer along an axis of too few
-      voxels. What these bricks take may exceed `memory`.
+      voxels, and no more than 65 536 in all. What these bricks take may exceed `memory`.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
       fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
