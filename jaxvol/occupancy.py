@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
-from ._util.frame import Frame, Order
+from ._util.axes import XYZ, inverse
+from ._util.frame import Frame
 from ._util.memo import memoized
 from ._util.platform import while_loop
 from ._util.sharding import varying
@@ -57,7 +58,7 @@ class Blocks(eqx.Module):
         """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: with the
         ranges of slopes, for those who read the gradient."""
         labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
-        low, high = memoized(volume.data, _ranges)
+        low, high = map(volume.in_grid_order, memoized(volume.data, _ranges))
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
@@ -103,7 +104,9 @@ class SlopeRanges(eqx.Module):
     @classmethod
     def of(cls, volume: Volume) -> "SlopeRanges":
         """Those of a volume's voxels, computed once for each array of them."""
-        low, high, steepest = memoized(volume.data, _slope_ranges)
+        low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
+        if (axes := volume.fetch.axes) != XYZ:  # or ranges would be copied in each image
+            low, high = (jnp.stack([part[axis] for axis in inverse(axes)]) for part in (low, high))
         return cls(low, high, steepest, jax.lax.stop_gradient(volume.spacing))
 
     @property
@@ -158,7 +161,7 @@ class Occupancy(eqx.Module):
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
     size: Vec3
-    frame: Frame | Order | None = None
+    frame: Frame | None = None
 
     def sums(self) -> Sums:
         """For queries about boxes."""

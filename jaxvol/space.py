@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.axes import XYZ
-from ._util.frame import Frame, Order
+from ._util.frame import Frame
 from ._util.vec3 import Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
 from .volume import Volume
@@ -178,15 +177,13 @@ class Affine(Space):
     low: Vec3
     high: Vec3
     spacing: Vec3
-    frame: Frame | Order | None
+    frame: Frame | None
 
     def __init__(self, volume: Volume):
         self.spacing = apart(volume.spacing)
         if volume.direction is None:
-            low, high = (apart(end) for end in volume.corners)
-            order = Order(volume.axes)
-            self.low, self.high = order.coordinates(low), order.coordinates(high)
-            self.frame = None if volume.axes == XYZ else order
+            self.low, self.high = (apart(end) for end in volume.corners)
+            self.frame = None
         else:
             # from the first node, where the numbers are small: many origins are far away
             self.frame = Frame.of(volume.origin, volume.direction)

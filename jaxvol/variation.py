@@ -41,7 +41,7 @@ class Windows(eqx.Module):
     @classmethod
     def of(cls, volume: Volume) -> "Windows":
         """The windows of a volume, computed once for each array of voxels."""
-        low, high, bend = memoized(volume.data, _windows)
+        low, high, bend = map(volume.in_grid_order, memoized(volume.data, _windows))
         if volume.field is not None:  # nothing is known about it
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
             bend = jnp.full_like(bend, jnp.inf)

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
-from ._util.axes import XYZ, Axes, inverse, permuted
+from ._util.axes import Axes
 from ._util.checks import Arrayable, described, finite_array, is_traced, require
 from ._util.named_axes import along_xyz, is_named
-from ._util.vec3 import Scalar, Vec3, apart
+from ._util.vec3 import Scalar, Vec3
 from ._util.voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by
 from ._util.voxels import label_array, voxel_array
 
@@ -118,11 +118,10 @@ class Volume(eqx.Module):
         x, y, z = self.fetch.window.first.astype(self.spacing.dtype)
         return x, y, z
 
-    @property
-    def axes(self) -> Axes:
-        """Without a direction: along which axis of the world each axis of the data runs. Other than x, y, z
-        only where the data are a part of a grid, which may be kept as it is stored (`part_of`)."""
-        return XYZ if self.fetch.window is None else self.fetch.window.axes
+    def in_grid_order(self, of_data: Array) -> Array:
+        """What was computed of parts of `data`, with its last three axes along x, y, z: `data` may be a part
+        of a grid that is kept in the order of storage (`part_of`)."""
+        return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
 
     @property
     def bounds(self) -> Float[Array, "6"]:
@@ -143,10 +142,7 @@ class Volume(eqx.Module):
             # not by a matrix product, which some GPUs round to 10 bits
             along = self.direction * (self._steps * self.spacing)[None, :]
             return self.origin, self.origin + jnp.sum(along, axis=1)
-        extent = self._steps * self.spacing
-        if self.axes != XYZ:
-            extent = jnp.stack(permuted(apart(extent), inverse(self.axes)))
-        return self.origin, self.origin + extent
+        return self.origin, self.origin + self._steps * self.spacing
 
     @property
     def _steps(self) -> Float[Array, "3"]:
@@ -277,9 +273,9 @@ def part_of(
     """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing,
     origin and direction are those of the whole. Beyond the part nothing is known: its faces are read.
 
-    `axes`: along which axes of the world those of the data, and of `first`, `whole` and the spacing, run: for
-    (2, 1, 0) it is data[z, y, x]. By default as before; only x, y, z if there is a direction."""
-    window = Window(first, whole, volume.axes if axes is None else axes)
+    `axes`: of the array, which is data[z, y, x] for (2, 1, 0); by default as before. All else is along x, y,
+    z."""
+    window = Window(first, whole, volume.fetch.axes if axes is None else axes)
     fetch = eqx.tree_at(lambda f: f.window, volume.fetch, window, is_leaf=lambda leaf: leaf is None)
     return with_fetch(volume, fetch)
 

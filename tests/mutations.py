@@ -82,6 +82,7 @@ RANGES = "test_transfer2d.py::test_ranges_of_magnitude_and_majorants_hold_all_th
 
 SHARED = "engine/test_devices.py::test_work_is_balanced_and_images_and_gradients_are_those_of_one_device"
 OWNED = "engine/test_devices.py::test_devices_that_own_bricks_render_the_whole"
+SURFACE = "bricks/test_axes.py::test_a_surface_does_not_move_with_the_order_of_storage"
 
 MUTATIONS = [
     # devices
@@ -239,22 +240,29 @@ MUTATIONS = [
     Mutation(
         "bricks: kept in the order of storage, they lie as if it were x, y, z",
         "bricks/render.py",
-        "jnp.zeros(3, jnp.int32), source.shape, axes)",
+        "jnp.zeros(3, jnp.int32), source.shape, source.order)",
         "jnp.zeros(3, jnp.int32), source.shape)",
         ("bricks/test_axes.py::test_images_do_not_depend_on_the_order_of_storage",),
     ),
     Mutation(
-        "bricks: kept in the order of storage, they have the spacing of x, y, z",
-        "bricks/render.py",
-        "jnp.stack(permuted(apart(volume.spacing), axes))",
-        "volume.spacing",
-        ("bricks/test_axes.py::test_images_do_not_depend_on_the_order_of_storage",),
+        "bricks: kept in the order of storage, values are interpolated in that order",
+        "_util/voxel_fetch.py",
+        "return transposed(self.cube_at(data, node, coordinate[0].dtype), self.axes), fraction",
+        "return self.cube_at(data, node, coordinate[0].dtype), permuted(fraction, self.axes)",
+        (f"{SURFACE}[yzx]",),
+    ),
+    Mutation(
+        "bricks: kept in the order of storage, the slope along x is that along the array's first axis",
+        "_util/voxel_fetch.py",
+        "return permuted(found, inverse(self.axes))",
+        "return found[0], found[1], found[2]",
+        (f"{SURFACE}[yzx]",),
     ),
     Mutation(
         "bricks: ranges of values are along other axes than the bricks",
-        "bricks/render.py",
-        "cache=self.cache).reordered(axes)",
-        "cache=self.cache)",
+        "bricks/summary.py",
+        "over_blocks(slab.voxels, combine).transpose(inverse(source.order))",
+        "over_blocks(slab.voxels, combine)",
         ("bricks/test_choice.py::test_an_image_reads_what_the_choice_says[F]",),
     ),
     Mutation(
@@ -394,8 +402,8 @@ MUTATIONS = [
     Mutation(
         "slopes: a bit of y is read as one of z",
         "_util/voxel_fetch.py",
-        "slope(lambda word: word << 10)",
-        "slope(lambda word: word << 9)",
+        "for bits in (0, 10, shift)",
+        "for bits in (0, 9, shift)",
         (f"{SLOPES}[uint8]",),
     ),
     Mutation(
@@ -1426,8 +1434,8 @@ MUTATIONS = [
     Mutation(
         "direction: left out of bricks",
         "bricks/render.py",
-        ", direction=direction), axes_of",
-        "), axes_of",
+        "*place, direction=direction)\n    # its",
+        "*place)\n    # its",
         ("test_direction.py::test_bricks_keep_the_direction",),
     ),
     Mutation(

@@ -3,7 +3,6 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .axes import Axes, inverse, permuted
 from .vec3 import Vec3, apart, dot
 
 
@@ -38,21 +37,3 @@ class Frame(eqx.Module):
         a, b, c = coordinates
         x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(self.origin, *self.axes, strict=True))
         return x, y, z
-
-
-class Order(eqx.Module):
-    """The axes of the world in another order, as a frame. Nothing is computed, so that nothing is rounded."""
-
-    axes: Axes = eqx.field(static=True)
-
-    def coordinates(self, point: Vec3) -> Vec3:
-        """Coordinates of a world point."""
-        return permuted(point, self.axes)
-
-    def components(self, direction: Vec3) -> Vec3:
-        """Components of a world direction along the axes."""
-        return permuted(direction, self.axes)
-
-    def point(self, coordinates: Vec3) -> Vec3:
-        """World point of coordinates."""
-        return permuted(coordinates, inverse(self.axes))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
-from .axes import Axes
+from .axes import XYZ, Axes, inverse, permuted
 from .vec3 import Scalar, Vec3
 from .xla import gather
 
@@ -30,8 +30,9 @@ SLOPE_BITS = 10
 class Window(eqx.Module):
     """The box of a grid that is in memory. Beyond it nothing is known: there its faces are read.
 
-    - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both are along the axes of
-      the data. `axes`: along which axes of the world these run.
+    - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both along x, y, z.
+    - `axes`: of the array in memory, which is data[z, y, x] for (2, 1, 0). All else is along x, y, z, so that
+      what is computed, and how it rounds, does not depend on them.
     """
 
     first: Int[Array, "3"]
@@ -46,12 +47,17 @@ class Fetch(eqx.Module):
 
     @abstractmethod
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        """The eight voxels that begin with this one of those in memory."""
+        """The eight voxels that begin with this one of those in memory, along the array's axes."""
+
+    @property
+    def axes(self) -> Axes:
+        """Of the array in memory (`Window.axes`)."""
+        return XYZ if self.window is None else self.window.axes
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
         node, fraction = self.split(data, coordinate)
-        return self.cube_at(data, node, coordinate[0].dtype), fraction
+        return transposed(self.cube_at(data, node, coordinate[0].dtype), self.axes), fraction
 
     def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
         """Number of nodes of the grid."""
@@ -61,14 +67,15 @@ class Fetch(eqx.Module):
         return nx, ny, nz
 
     def split(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Node, Vec3]:
-        """The node below a grid coordinate, among those in memory, and the fractions past it."""
+        """The node below a grid coordinate, among those in memory and along the array's axes; and the
+        fractions past it, along x, y, z."""
         node, fraction = split(coordinate, self.shape(data))
         if self.window is None:
             return node, fraction
         # of integers, so that the fractions are those of the whole grid
         i, j, k = (
-            jnp.clip(index - self.window.first[axis], 0, data.shape[axis] - 2)
-            for axis, index in enumerate(node)
+            jnp.clip(node[axis] - self.window.first[axis], 0, n - 2)
+            for axis, n in zip(self.axes, data.shape, strict=True)
         )
         return (i, j, k), fraction
 
@@ -87,14 +94,16 @@ class Fetch(eqx.Module):
         the nodes. That of a node is half the difference of the two voxels beside it, or at the border the
         difference between itself and the one beside it. From six cubes, unless they are stored."""
         node, fraction = self.split(data, coordinate)
-        x, y, z = (
-            interpolated(self._slopes_of_nodes(data, node, axis, coordinate[0].dtype), fraction)
-            for axis in range(3)
-        )
-        return x, y, z
+        slopes = [self._slopes_of_nodes(data, node, axis, coordinate[0].dtype) for axis in range(3)]
+        return self._interpolated_slopes(slopes, fraction)
+
+    def _interpolated_slopes(self, slopes: list[Cube], fraction: Vec3) -> Vec3:
+        """Slopes along x, y and z, from those of eight nodes along the array's axes."""
+        found = [interpolated(transposed(cube, self.axes), fraction) for cube in slopes]
+        return permuted(found, inverse(self.axes))
 
     def _slopes_of_nodes(self, data: Shaped[Array, "nx ny nz"], node: Node, axis: int, dtype: Any) -> Cube:
-        """Slopes along an axis of the eight nodes that begin with this one."""
+        """Slopes along an axis of the array of the eight nodes that begin with this one."""
 
         def beside(offset: int) -> Cube:
             i, j, k = (
@@ -121,15 +130,19 @@ def read_by(fetch: Fetch, how: Fetch) -> Fetch:
     return eqx.tree_at(lambda fetch: fetch.window, how, fetch.window, is_leaf=lambda leaf: leaf is None)
 
 
-def _with_first(axis: int, cube: Cube) -> Cube:
-    """A cube with this axis and x exchanged."""
+def transposed(cube: Cube, axes: Axes) -> Cube:
+    """A cube along x, y, z, from one whose own axes run along these."""
 
     def corner(*index: int) -> Scalar:
-        order = [axis if i == 0 else 0 if i == axis else i for i in range(3)]
-        x, y, z = (index[i] for i in order)
-        return cube[x][y][z]
+        i, j, k = permuted(index, axes)
+        return cube[i][j][k]
 
     return [[[corner(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+
+
+def _with_first(axis: int, cube: Cube) -> Cube:
+    """A cube with this axis and the first one exchanged."""
+    return transposed(cube, ((0, 1, 2), (1, 0, 2), (2, 1, 0))[axis])
 
 
 def interpolated(cube: Cube, fraction: Vec3) -> Scalar:
@@ -206,15 +219,17 @@ class Packed(Fetch):
 
         words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
 
-        def slope(of_word: Callable[[Int[Array, ""]], Int[Array, ""]]) -> Scalar:
-            """The slope that is put into the highest bits, which alone are read."""
+        def slopes(bits: int) -> Cube:
+            """The slopes that begin so many bits below the highest one, times a power of two."""
 
             def top(word: Int[Array, ""]) -> Scalar:
-                return (of_word(word) & -(1 << shift)).astype(dtype)
+                return ((word << bits) & -(1 << shift)).astype(dtype)
 
-            return interpolated(jax.tree.map(top, words), fraction) * 2.0 ** -(shift + 1)
+            return jax.tree.map(top, words)
 
-        return slope(lambda word: word), slope(lambda word: word << 10), slope(lambda word: word << shift)
+        x, y, z = self._interpolated_slopes([slopes(bits) for bits in (0, 10, shift)], fraction)
+        factor = 2.0 ** -(shift + 1)
+        return x * factor, y * factor, z * factor
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
         word = gather(self.words, flat)

@@ -63,7 +63,7 @@ def visible(grid: BrickGrid, summary: Summary, table: np.ndarray) -> np.ndarray:
     """For each brick, whether anything may be visible in it. `table`: `counts` of the summary's blocks."""
     ends = []
     for size, n in zip(grid.size, grid.shape, strict=True):
-        touched = [summary.touched(low, min(low + size, n - 1), n) for low in range(0, n - 1, size)]
+        touched = [summary.blocks_of(low, min(low + size, n - 1), n) for low in range(0, n - 1, size)]
         first, last = np.array(touched).T
         ends.append(((first, -1), (last + 1, 1)))
     number: Any = 0

@@ -91,7 +91,7 @@ def nearest_pixel(
         visible = np.ones((1, 1, 1), bool)
     else:
         edges = [_nodes(summary, axis) for axis in range(3)]
-        visible = np.asarray(transfer.visible(summary.blocks()))
+        visible = summary.where(transfer.visible)
     edges = _in_world(source, edges)
     for normal, offset in shown.sides:
         visible = visible & (_greatest(normal, edges) + offset >= 0)
@@ -148,7 +148,7 @@ def _unmatched(
         index = (edge - _known(other.origin)[axis]) / _known(other.spacing)[axis]
         first, last = np.floor(index[0] + 1e-5), np.ceil(index[1] - 1e-5)
         ends = np.clip([first, last], 0, other.shape[axis] - 1).astype(int)
-        touched = [others.touched(a, b, other.shape[axis]) for a, b in ends.T.tolist()]
+        touched = [others.blocks_of(a, b, other.shape[axis]) for a, b in ends.T.tolist()]
         low, high = (
             over_intervals(low, axis, touched, np.minimum),
             over_intervals(high, axis, touched, np.maximum),

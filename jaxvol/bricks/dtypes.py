@@ -28,6 +28,20 @@ def voxel_type(stored: np.dtype) -> np.dtype:
     return np.dtype(np.float32) if stored.kind in "iu" else np.dtype(jnp.result_type(float))
 
 
+def range_of(voxels: np.ndarray) -> tuple[float, float]:
+    """Least and greatest voxel; NaN if any is, and infinite if any is: unlike a mask, they take no memory."""
+    # NumPy compares 16-bit floats one by one: as float32, layer by layer, in a fraction of the time
+    layers = (layer.astype(np.float32) for layer in voxels) if is_half(voxels.dtype) else (voxels,)
+    with np.errstate(invalid="ignore"):
+        low, high = zip(*((layer.min(), layer.max()) for layer in layers), strict=True)
+        return float(np.min(low)), float(np.max(high))
+
+
+def is_half(dtype: np.dtype) -> bool:
+    """Whether it is float16 or bfloat16."""
+    return dtype.itemsize == 2 and dtype.kind not in "iu"
+
+
 def converted(voxels: np.ndarray, box: Box, axes: tuple[int, int, int], what: str) -> np.ndarray:
     """Voxels as `voxel_type` says, and C-contiguous. `box`: what they were read from. `axes`: of the box, in
     their order.
@@ -49,10 +63,7 @@ def converted(voxels: np.ndarray, box: Box, axes: tuple[int, int, int], what: st
         voxels = np.ascontiguousarray(voxels, dtype)
     if dtype.kind in "iu":
         return voxels
-    with np.errstate(invalid="ignore"):
-        # the extremes are NaN or infinite if any voxel is; unlike a mask, they take no memory
-        fine = np.isfinite(np.float64(voxels.min())) and np.isfinite(np.float64(voxels.max()))
-    if not fine:
+    if not np.all(np.isfinite(range_of(voxels))):
         wrong = ~(abs(voxels) < np.inf)
         first = np.unravel_index(np.argmax(wrong), voxels.shape)
         place = tuple(start + int(first[axes.index(axis)]) for axis, start in enumerate(box[0]))

@@ -22,15 +22,12 @@ from .._util.npy import npy_header
 from .._util.voxels import check_shape
 from ..formats.raw import raw_header
 from .dtypes import voxel_type
-from .sources import VoxelSource, by_stride, empty_box
+from .sources import AT_ONCE, VoxelSource, by_stride, empty_box
 
 
 GAP = 2**14
 """Bytes: what is not wanted between two rows is read with them if it is no more, since a system call, and on
 a disk the pages at its ends, cost as much."""
-
-AT_ONCE = 2**23
-"""Bytes of a box that are read before they are brought into the order of axes that is asked for."""
 
 AGAIN = "Open it again."
 
@@ -73,6 +70,7 @@ class FileSource(VoxelSource):
         self.name, self.shape, self.dtype = str(path), (nx, ny, nz), voxel_type(stored)
         self.spacing, self.origin = spacing, origin
         self._type, self._start, self._strides = stored, start, tuple(strides)
+        self.stored_type = stored.newbyteorder("=")
         self._writable = writable
         size = file_size(self.path)
         end = start + stored.itemsize + sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
@@ -246,14 +244,15 @@ def mapped(
     origin: tuple[float, float, float] | None = None,
 ) -> FileSource | None:
     """The file under a memory map (`np.memmap`), or under a part or a transposed view of one; None for other
-    arrays, those whose voxels lie in the file at odd distances or not at all, and maps of which the file has
-    other voxels, since another one has taken its name: SAMPLES boxes along the diagonal are compared."""
+    arrays, those whose voxels lie in the file at odd distances or not at all, and maps of which the file is
+    deleted, or has other voxels, since another one has taken its name: SAMPLES boxes along the diagonal are
+    compared. The voxels of such a map are there as long as it is."""
     root: Any = array
     while isinstance(root, np.ndarray) and not isinstance(root.base, mmap.mmap):
         root = root.base
     if not isinstance(root, np.memmap) or root.filename is None or root.mode == "c":
         return None
-    if array.ndim != 3 or min(array.strides) != array.itemsize:
+    if array.ndim != 3 or min(array.strides) != array.itemsize or not Path(root.filename).exists():
         return None
     # a map has no name but the one under which its file was opened
     start = root.offset + array.__array_interface__["data"][0] - root.__array_interface__["data"][0]

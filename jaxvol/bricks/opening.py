@@ -55,10 +55,11 @@ def levels_of(
       |---|---|
       | an array, data[x, y, z] | in place |
       | an xarray `DataArray` | in place, its axes and coordinates as in `Volume` |
-      | a memory map (`np.memmap`) or a view of one | from its file; in place if that was replaced |
+      | a memory map (`np.memmap`) or a view of one | from its file; in place if that is gone or replaced |
       | path of a `.raw` file, x fastest | from the file, box by box; header as for `jv.load` |
       | path of a `.npy` file, data[x, y, z] | from the file, box by box |
       | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
+      | an array or a group of the `zarr` package, in a folder | as its path |
       | a `Volume` without labels and field | in place |
       | a `VoxelSource` | as it says |
 
@@ -75,8 +76,9 @@ def levels_of(
     options = {"shape": shape, "dtype": dtype, "axes": axes, "index": index, "missing": missing}
     options = {name: value for name, value in options.items() if value is not None}
     place = {"spacing": triple("spacing", spacing), "origin": triple("origin", origin)}
-    if isinstance(thing, str | os.PathLike):
-        return _of_path(Path(thing), options, place)
+    path = _folder_of(thing) if type(thing).__module__.partition(".")[0] == "zarr" else thing
+    if isinstance(path, str | os.PathLike):
+        return _of_path(Path(path), options, place)
     _refuse(described(thing), options, ())
     if isinstance(thing, VoxelSource | Volume):
         source = array_of(thing) if isinstance(thing, Volume) else thing
@@ -112,6 +114,20 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
         "an OME-Zarr image. If it fits into memory, pass jv.load(path), or for ultrasound the volume and "
         "the map that jv.load_ultrasound(path) returns."
     )
+
+
+def _folder_of(thing: Any) -> Path:
+    """The folder of an array or a group of the zarr package, which is not imported here."""
+    store = getattr(thing, "store", None)
+    root = getattr(store, "root", getattr(store, "path", None))
+    folder = Path(root, thing.path) if isinstance(root, str | os.PathLike) else None
+    if folder is None or not folder.is_dir():
+        raise ValueError(
+            f"source: {described(thing)} does not lie in a folder of this machine, from which alone Zarr is "
+            f"read; its store is {described(store)}. Copy it to a folder and pass the path of that; or, if "
+            "they fit into memory, its voxels: array[:], as data[x, y, z]."
+        )
+    return folder
 
 
 def _of_zarr(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tuple[VoxelSource, ...]:

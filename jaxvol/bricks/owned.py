@@ -19,6 +19,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Int, Shaped
 
+from .._util.axes import permuted
 from .._util.trees import PyTree
 from .._util.xla import compiled
 from ..engine.acceleration import VolumeAcceleration
@@ -102,11 +103,9 @@ def _turns(stream: Stream, mesh: Mesh, lists: list[list[int]], newest: list[Shar
 
 def _placed(stream: Stream, mesh: Mesh, turn: Turn) -> tuple[Array, Array, Array]:
     """The bricks, their first nodes and their voxels, each on its device."""
-    nothing, voxels, first = (
-        np.zeros(stream.stored, stream.source.dtype),
-        [],
-        np.zeros((mesh.size, 3), np.int32),
-    )
+    shape = permuted(stream.stored, stream.source.order)
+    nothing, first = np.zeros(shape, stream.source.dtype), np.zeros((mesh.size, 3), np.int32)
+    voxels = []
     for d, device in enumerate(mesh.devices):
         if device.process_index != jax.process_index():
             continue
@@ -116,11 +115,10 @@ def _placed(stream: Stream, mesh: Mesh, turn: Turn) -> tuple[Array, Array, Array
             part = coming.result()
         voxels.append(jax.device_put(part[None], device))
     sharding = NamedSharding(mesh, DEALT)
-    whole = (mesh.size, *stream.stored)
     return (
         jnp.asarray(turn.bricks),
         jax.make_array_from_callback(first.shape, sharding, lambda index: first[index]),
-        jax.make_array_from_single_device_arrays(whole, sharding, voxels),
+        jax.make_array_from_single_device_arrays((mesh.size, *shape), sharding, voxels),
     )
 
 

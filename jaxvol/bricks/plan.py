@@ -42,7 +42,9 @@ class BudgetPlan(NamedTuple):
     - `source`: the volume. `memory`: the budget, bytes.
     - `stride`: 1 where the volume fits.
     - `counts`: bricks along each axis; None where the volume fits. `loads`: how many of them are read at
-      most: those that may hold anything visible. `bytes_read`: of these, at most.
+      most: those that may hold anything visible. `bytes_read`: of these, at most. All three hold for the
+      camera of the plan, and for others of as many pixels: into which bricks a volume is split depends on
+      the number of rays (`bricks/choice.py`).
     - `compositing`, `cache`: as given.
     """
 

@@ -10,11 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._util.axes import permuted
 from .._util.checks import Arrayable, described, integer, is_traced, number, shortened
 from .._util.memory import memory_of_device
 from .._util.trees import PyTree, strong
-from .._util.vec3 import apart
 from .._util.xla import compiled, forward_mode, transformations
 from ..arguments import check_arguments
 from ..camera import Camera
@@ -34,6 +32,7 @@ from ..labels import LabelTransferFunction
 from ..lighting.shading import Lighting
 from ..march import March
 from ..modes import Mode, compositing_of
+from ..occupancy import BLOCK
 from ..rendering import Details, Rendering
 from ..selection import Selection
 from ..transfer import Transfer
@@ -43,7 +42,7 @@ from .detail import level_for
 from .grid import is_straight
 from .opening import OF_RAW, OF_ZARR, levels_of
 from .owned import render_owned
-from .sources import Reordered, VoxelSource, axes_of, in_storage_order
+from .sources import VoxelSource
 from .stream import CELL, Method, Stream
 from .summary import Summary
 from .summary_files import summary_of
@@ -99,7 +98,7 @@ def render_bricks(
     - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory`. By default those
       of which least is read (`bricks/choice.py`); where rays are curved in the grid, one more along their
       longest axis until they fit, first where less is read by that. There are fewer along an axis of too few
-      voxels. What these bricks take may exceed `memory`.
+      voxels, and no more than 65 536 in all. What these bricks take may exceed `memory`.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
       fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
@@ -175,7 +174,6 @@ def render_bricks(
             for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
         )
     direction = source.direction if isinstance(source, Volume) else None
-    chosen = _as_marched(chosen, march, direction)
     scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting, direction)
     check_not_sharded(mesh, scene)
     scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
@@ -213,18 +211,10 @@ def bricks_of(
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
     _check(march, transfer, lighting, "overlap", "all", "rays")
     place = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
-    source = _as_marched(source, march)
     scene = _scene_of(source, place, transfer, camera, march, compositing, lighting)
     marched = _marched(scene)
     job = _Job(source, memory, None, "overlap", "all", cache, None, None, False, [])
     return job.stream(marched, scene, job.options("all"))
-
-
-def _as_marched(source: VoxelSource, march: March, direction: Any = None) -> VoxelSource:
-    """The source as its bricks are kept: with its axes as they are stored, so that no voxel is moved. A map
-    has axes of its own, and so has a `direction`."""
-    mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
-    return source if mapped or direction is not None else in_storage_order(source)
 
 
 def _scene_of(
@@ -238,9 +228,9 @@ def _scene_of(
     direction: Any = None,
 ) -> Scene:
     """The scene of a source, without its voxels. `place`: spacing and origin, along x, y and z."""
-    volume, axes = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=direction), axes_of(source)
-    volume = eqx.tree_at(lambda v: v.spacing, volume, jnp.stack(permuted(apart(volume.spacing), axes)))
-    volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, axes)
+    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=direction)
+    # its voxels are kept as they are stored, so that none is moved
+    volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
     return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
 
 
@@ -281,10 +271,8 @@ class _Job:
         def summary() -> Summary:
             if self.streams:  # the second march of a gradient
                 return self.streams[0].summary
-            axes, source = axes_of(self.source), self.source
-            source = source.source if isinstance(source, Reordered) else source
-            cell = CELL if min(source.shape) > CELL else 4
-            return summary_of(source, cell, memory=self.memory, cache=self.cache).reordered(axes)
+            cell = CELL if min(self.source.shape) > CELL else BLOCK
+            return summary_of(self.source, cell, memory=self.memory, cache=self.cache)
 
         where = self.memory, self.counts, self.method, self.progress
         least = number_of(self.devices) if self.owned else 1

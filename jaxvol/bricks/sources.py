@@ -9,12 +9,13 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from .._util.axes import XYZ, Axes, inverse, permuted
+from .._util.axes import XYZ, Axes, permuted
 from .._util.checks import Arrayable, is_traced
 from .._util.voxels import check_shape, given_array
 from ..volume import Volume
@@ -26,6 +27,9 @@ Result = TypeVar("Result")
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
 
+
+AT_ONCE = 2**23
+"""Bytes of a box that are read before they are converted, or brought into another order of axes."""
 
 ALIGNED = 64
 """Bytes, of whose multiples the addresses of JAX's arrays are."""
@@ -43,7 +47,10 @@ class VoxelSource(ABC):
 
     - `name`: what it is called in errors: its path, or "array".
     - `shape`: number of voxels along x, y, z.
-    - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`); the stored type may be another.
+    - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`).
+    - `stored_type`: of the voxels that `_stored` returns. Where it is not `dtype`, boxes are read and
+      converted some layers at a time, so that they take little more memory than what they become. By default
+      it is not known, and boxes are read at once.
     - `spacing`, `origin`: as in `Volume`, where the source knows them, or else None.
     - `chunks`: voxels along x, y, z of the parts in which it is stored. Reading parts of these costs as much
       as reading all. Boxes that are longest along the axes of long chunks are read fastest.
@@ -55,6 +62,7 @@ class VoxelSource(ABC):
     name: str
     shape: tuple[int, int, int]
     dtype: np.dtype
+    stored_type: np.dtype | None = None
     spacing: tuple[float, float, float] | None
     origin: tuple[float, float, float] | None
     chunks: tuple[int, int, int]
@@ -89,11 +97,26 @@ class VoxelSource(ABC):
         time of a single file tell, changed since the source was made.
         """
         box = self._box(low, high)
-        return converted(self._stored(*box, axes), box, axes, self.name)
+        if self.stored_type in (None, self.dtype):
+            return converted(self._stored(*box, axes), box, axes, self.name)
+        voxels = empty_box(*box, axes, self.dtype)
+        slowest, (first, last) = self.order[0], box
+        plane = math.prod(b - a for a, b in zip(*box, strict=True)) // (last[slowest] - first[slowest])
+        of_chunk = plane * self.chunks[slowest] * self.stored_type.itemsize
+        for begin, end in pairwise(
+            cuts(first[slowest], last[slowest], self.chunks[slowest], of_chunk, AT_ONCE)
+        ):
+            low_, high_ = list(first), list(last)
+            low_[slowest], high_[slowest] = begin, end
+            layer = (low_[0], low_[1], low_[2]), (high_[0], high_[1], high_[2])
+            along = axes.index(slowest)
+            there = voxels[(slice(None),) * along + (slice(begin - first[slowest], end - first[slowest]),)]
+            there[:] = converted(self._stored(*layer, axes), layer, axes, self.name)
+        return voxels
 
-    def read_async(self, low: Corner, high: Corner) -> "Future[np.ndarray]":
+    def read_async(self, low: Corner, high: Corner, axes: Axes = XYZ) -> "Future[np.ndarray]":
         """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
-        return in_background(self.read, low, high)
+        return in_background(self.read, low, high, axes)
 
     @abstractmethod
     def fingerprint(self) -> dict[str, Any] | None:
@@ -106,8 +129,13 @@ class VoxelSource(ABC):
 
     @abstractmethod
     def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
-        """The voxels of a box that lies inside, with its axes in this order, as they are stored: of any byte
-        order, and any layout in memory."""
+        """The voxels of a box that lies inside, as they are stored: of any byte order, and any layout in
+        memory. A source of your own has this method.
+
+        `low`, `high`: as for `read`. `axes`: of what is returned, of which the first one is the axis axes[0]
+        of the volume, and so on: data[z, y, x] for (2, 1, 0). What has data[x, y, z] returns
+        `data[x0:x1, y0:y1, z0:z1].transpose(axes)`; it is asked for its own `order`, so that this moves
+        nothing, and for others by those who call `read` alone."""
 
     def _box(self, low: Corner, high: Corner) -> Box:
         try:
@@ -146,7 +174,7 @@ class ArraySource(VoxelSource):
         self._data = np.asarray(array)
         self.name, self.beside = "array", None
         self.shape = nx, ny, nz = self._data.shape
-        self.dtype = voxel_type(self._data.dtype)
+        self.dtype, self.stored_type = voxel_type(self._data.dtype), self._data.dtype
         self.spacing, self.origin = spacing, origin
         slowest, *_ = self.order = by_stride(self._data.strides)
         self.chunks = (1, ny, nz) if slowest == 0 else (nx, 1, nz) if slowest == 1 else (nx, ny, 1)
@@ -161,44 +189,11 @@ class ArraySource(VoxelSource):
         return self._data[tuple(map(slice, low, high))].transpose(axes)
 
 
-class Reordered(VoxelSource):
-    """A source with its axes in another order: along its own first axis runs `axes[0]` of the source, and so
-    on. Errors tell boxes as the source has them.
-
-    **Arguments:** `source`: the voxels. `axes`: the order.
-    """
-
-    def __init__(self, source: VoxelSource, axes: Axes):
-        self.source, self.axes = source, axes
-        self.name, self.dtype, self.beside = source.name, source.dtype, source.beside
-        self.shape, self.chunks = permuted(source.shape, axes), permuted(source.chunks, axes)
-        self.spacing, self.origin = source.spacing and permuted(source.spacing, axes), source.origin
-        self.order = permuted(inverse(axes), source.order)
-
-    def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
-        low, high = self._box(low, high)
-        back = inverse(self.axes)
-        return self.source.read(permuted(low, back), permuted(high, back), permuted(self.axes, axes))
-
-    def touched(self, size: tuple[int, int, int]) -> int:
-        return self.source.touched(permuted(size, inverse(self.axes)))
-
-    def fingerprint(self) -> dict[str, Any] | None:
-        found = self.source.fingerprint()
-        return None if found is None else found | {"axes of the source": list(self.axes)}
-
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
-        return self.read(low, high, axes)
-
-
-def in_storage_order(source: VoxelSource) -> VoxelSource:
-    """The source with its axes in the order of storage."""
-    return source if source.order == XYZ else Reordered(source, source.order)
-
-
-def axes_of(source: VoxelSource) -> Axes:
-    """The order in which `in_storage_order` has put the axes of a source."""
-    return source.axes if isinstance(source, Reordered) else XYZ
+def cuts(begin: int, end: int, chunk: int, of_chunk: int, at_once: int) -> list[int]:
+    """Where an interval of voxels along an axis is cut: between chunks, so that each is read once; into parts
+    of no more than `at_once` bytes, if these are thicker than a chunk, of `of_chunk` bytes."""
+    thick = chunk * max(1, at_once // of_chunk)
+    return [begin, *range(begin // chunk * chunk + thick, end, thick), end]
 
 
 def by_stride(strides: Sequence[int]) -> Axes:

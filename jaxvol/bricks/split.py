@@ -23,10 +23,14 @@ from .ranges import reach
 EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
+MOST_BRICKS = 2**16
+"""How many a user may ask for. Each has its turn, in which it is looked for along all rays: milliseconds,
+also where it is not read. So these take minutes before anything is rendered."""
+
 COPIES = 2.5
-"""Of each voxel of a brick: in the device; of the next brick, as read; and what finding the
-extremes of blocks takes, less than half. Voxels of a type that is converted take one more while they are
-read."""
+"""Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of
+blocks takes, less than half. Voxels that are stored in another type take `sources.AT_ONCE` bytes more while
+they are read, or a layer of chunks, if that is more."""
 
 
 class TooLittleMemory(ValueError):
@@ -157,12 +161,27 @@ def split(
         parts[max(left, key=lambda axis: (short[axis], size[axis]))] += 1
 
 
+def divided(shape: Node, counts: Node) -> BrickGrid:
+    """So many bricks along each axis, or fewer along one of too few voxels.
+
+    **Raises:** `ValueError` for more than MOST_BRICKS in all."""
+    x, y, z = (-(-(n - 1) // c) for n, c in zip(shape, counts, strict=True))
+    grid = BrickGrid(shape, (x, y, z))
+    if grid.number > MOST_BRICKS:
+        raise ValueError(
+            f"bricks must be no more than {MOST_BRICKS} in all, each of which has its turn; got {counts}, "
+            f"which divide {' x '.join(map(str, shape))} voxels into {grid.number}. Ask for bricks of "
+            f"{EDGE} cells or more along each side."
+        )
+    return grid
+
+
 def check_part(stored: Node) -> None:
     """**Raises** `ValueError` if a part of this shape has more voxels than a volume may have."""
     if math.prod(stored) > MOST_VOXELS:
         raise ValueError(
             "bricks must be so many, and steps so short, that a brick and what is read around it have fewer "
-            f"than 2**31 voxels; got {' x '.join(map(str, stored))}."
+            f"than 2**31 voxels; got {' x '.join(map(str, stored))} along x, y and z."
         )
 
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
@@ -12,7 +13,6 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
-from .._util.axes import inverse, permuted
 from .._util.memory import give_back
 from .._util.xla import compiled
 from ..camera import Camera
@@ -28,10 +28,11 @@ from ..space import Ray, Space
 from ..transforms import ToroidalMap
 from ..volume import Volume, part_of, with_voxels
 from .choice import cheapest, counts as counted, visible
+from .dtypes import range_of
 from .grid import BrickGrid, Node, is_straight
 from .ranges import Found, Turn, of_curved, of_straight, widened
-from .sources import VoxelSource, axes_of, in_background
-from .split import Margin, bytes_of, check_part, fits, split, stored_of, stored_shape
+from .sources import VoxelSource, in_background
+from .split import Margin, bytes_of, check_part, divided, fits, split, stored_of, stored_shape
 from .summary import Summary
 
 
@@ -113,22 +114,20 @@ class Stream:
         if counts is None:
             grid = split(source.shape, source.dtype, memory, margin, probe, least)
         else:
-            along = permuted(counts, axes_of(source))
-            x, y, z = (-(-(n - 1) // c) for n, c in zip(source.shape, along, strict=True))
-            grid = BrickGrid(source.shape, (x, y, z))
-        check_part(stored_of(grid, margin, None))
+            grid = divided(source.shape, counts)
+        overlapping = probe if method == "overlap" else None
+        check_part(stored_of(grid, margin, overlapping))
         summary = summary_of()
-        table = counted(_occupied(marched, summary))
+        occupied = partial(marched.compositing.occupied, marched.transfer)
+        table = counted(summary.where(occupied))
         if counts is None and straight:
             rays = math.prod(marched.source.size)
             grid = cheapest(grid, source, summary, table, margin, memory, rays, least)
-        alone = stored_of(grid, margin, probe if method == "overlap" else None)
-        check_part(alone)
-        stored = alone
+        stored = alone = stored_of(grid, margin, overlapping)
         if not straight and method != "naive":  # what is read is found from the rays: begin with less
             middle = (np.asarray(source.shape) - 1) / 2
             typical = replace(margin, cells=margin.of_box(space, source.shape, middle, middle))
-            stored = stored_of(grid, typical, probe if method == "overlap" else None)
+            stored = stored_of(grid, typical, overlapping)
         order, seen = grid.order(space, marched.source), visible(grid, summary, table)
         return cls(
             *(
@@ -185,14 +184,13 @@ class Stream:
 
     def report(self) -> BrickReport:
         """What all passes so far took."""
-        back = inverse(axes_of(self.source))
         return BrickReport(
-            permuted(self.grid.counts, back),
+            self.grid.counts,
             int(self.visible.sum()),
             len(self.loads),
             len(self.loads) - len(set(self.loads)),
             self.bytes_read,
-            permuted(self.stored, back),
+            self.stored,
             bytes_of(self.stored, self.source.dtype, self.margin),
         )
 
@@ -316,22 +314,16 @@ class Stream:
 
     def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """The voxels of a box, whose range tells whether they are those of the summary."""
-        voxels = self.source.read(low, high)
-        least, most = self.summary.range_of(low, high)
-        if float(voxels.min()) < least or float(voxels.max()) > most:
-            box = [permuted(end.tolist(), inverse(axes_of(self.source))) for end in (low, high)]
+        voxels = self.source.read(low, high, self.source.order)
+        (least, most), (lowest, highest) = self.summary.range_of(low, high), range_of(voxels)
+        if lowest < least or highest > most:
             raise ValueError(
                 f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
-                f"{most} in the box {box[0]} to {box[1]}, and now "
-                f"{voxels.min()} to {voxels.max()}. Delete the file of ranges beside it (`cache`), or pass "
-                "cache=None, and open it again."
+                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now {lowest} to "
+                f"{highest}. Delete the file of ranges beside it (`cache`), or pass cache=None, and open it "
+                "again."
             )
         return voxels
-
-
-def _occupied(scene: Scene, summary: Summary) -> np.ndarray:
-    """For each block of a summary, whether anything may be visible in it."""
-    return np.asarray(scene.compositing.occupied(scene.transfer, summary.of_cells()))
 
 
 def _straight(

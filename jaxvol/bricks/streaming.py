@@ -27,7 +27,7 @@ what finding the extremes of blocks takes."""
 class Slab(NamedTuple):
     """A part of a volume that is read at once.
 
-    - `voxels`: those of its blocks, with the nodes on all their faces.
+    - `voxels`: those of its blocks, with the nodes on all their faces; with its axes in the source's `order`.
     - `first`: index of its first block along each axis, and `blocks`: number of blocks.
     """
 
@@ -51,12 +51,12 @@ def slabs(source: VoxelSource, memory: int) -> Iterator[Slab]:
 
 def _column(source: VoxelSource, axis: int, step: int, nodes: tuple[tuple[int, int], ...]) -> Iterator[Slab]:
     """The slabs of the blocks between these first and last nodes across `axis`, along which they are read."""
-    length = source.shape[axis]
+    length, stored = source.shape[axis], source.order.index(axis)
     ends = [*range(step, length - 1, step), length]
     low, high = [first for first, _ in nodes], [last + 1 for _, last in nodes]
 
     def reading(begin: int, end: int) -> "Future[np.ndarray]":
-        return source.read_async(_with(low, axis, begin), _with(high, axis, end))
+        return source.read_async(_with(low, axis, begin), _with(high, axis, end), source.order)
 
     coming, kept = reading(0, ends[0]), None
     begin = done = 0  # the first voxel kept, and the blocks done
@@ -64,7 +64,7 @@ def _column(source: VoxelSource, axis: int, step: int, nodes: tuple[tuple[int, i
         new = coming.result()
         if following is not None:
             coming = reading(end, following)
-        voxels = new if kept is None else np.concatenate([kept, new], axis)
+        voxels = new if kept is None else np.concatenate([kept, new], stored)
         # blocks that are complete
         blocks = -(-(length - 1) // BLOCK) if following is None else (end - 1) // BLOCK
         if blocks > done:
@@ -72,13 +72,13 @@ def _column(source: VoxelSource, axis: int, step: int, nodes: tuple[tuple[int, i
             spans = [(first // BLOCK, -(-final // BLOCK)) for first, final in nodes]
             (x0, x1), (y0, y1), (z0, z1) = _with(spans, axis, (done, blocks))
             yield Slab(
-                _along(voxels, axis, 0, last - begin),
+                _along(voxels, stored, 0, last - begin),
                 (x0, y0, z0),
                 (x1 - x0, y1 - y0, z1 - z0),
             )
             done = blocks
         needed = BLOCK * done
-        kept, begin = _along(voxels, axis, needed - begin, end - begin), needed
+        kept, begin = _along(voxels, stored, needed - begin, end - begin), needed
 
 
 def _with(of_axes: list[T], axis: int, one: T) -> list[T]:

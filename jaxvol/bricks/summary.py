@@ -11,16 +11,23 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.axes import Axes, inverse, permuted
+from .._util.axes import inverse
 from .._util.checks import integer
 from .._util.memory import give_back
 from ..occupancy import BLOCK, Blocks, over_blocks, widened
-from .sources import Corner, VoxelSource, in_storage_order
+from .dtypes import is_half
+from .sources import Corner, VoxelSource
 from .streaming import slabs
 
 
 COMBINED = {"low": np.minimum, "high": np.maximum}
 """Each kind of range, and how those of two blocks are combined."""
+
+AT_ONCE = 2**18
+"""Blocks that are looked through at a time, if a layer of them has no more."""
+
+LAYERS = 8
+"""Layers of blocks of 16-bit floats that are converted at a time."""
 
 Progress = Callable[[int, int], Any]
 """Called with the number of voxels done and the number of all."""
@@ -50,20 +57,22 @@ class Summary:
         touched = tuple(
             slice(first, last + 1)
             for first, last in (
-                self.touched(int(a), int(b) - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
+                self.blocks_of(int(a), int(b) - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
             )
         )
         return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
 
-    def reordered(self, axes: Axes) -> "Summary":
-        """That of the same voxels with their axes in another order (`sources.Reordered`)."""
-        ranges = {name: np.ascontiguousarray(part.transpose(axes)) for name, part in self.ranges.items()}
-        return Summary(permuted(self.shape, axes), self.cell, ranges)
-
-    def of_cells(self) -> Blocks:
-        """The ranges themselves, as blocks of `cell`³ cells."""
-        least, most = widened(jnp.asarray(self.ranges["low"]), jnp.asarray(self.ranges["high"]))
-        return Blocks(least, most, None)
+    def where(self, holds: Callable[[Blocks], Any]) -> np.ndarray:
+        """For each block, whether something holds of it, such as `transfer.visible`: some layers of them at a
+        time, since a transfer function may take a hundred times their memory."""
+        low, high = self.ranges["low"], self.ranges["high"]
+        layers = max(1, AT_ONCE // low[0].size)
+        found = []
+        for begin in range(0, len(low), layers):
+            some = slice(begin, begin + layers)
+            least, most = widened(jnp.asarray(low[some]), jnp.asarray(high[some]))
+            found.append(np.asarray(holds(Blocks(least, most, None))))
+        return np.concatenate(found)
 
     def blocks(self, low: Corner | None = None, high: Corner | None = None) -> Blocks:
         """The `Blocks` of the volume, or of the voxels with `low` <= (x, y, z) < `high` as a volume of their
@@ -82,13 +91,13 @@ class Summary:
         for axis in range(3):
             begin, end, n = int(first[axis]), int(last[axis]), self.shape[axis]
             nodes = range(begin, end - 1, BLOCK)
-            touched = [self.touched(node, min(node + BLOCK, end - 1), n) for node in nodes]
+            touched = [self.blocks_of(node, min(node + BLOCK, end - 1), n) for node in nodes]
             found = {
                 name: over_intervals(part, axis, touched, COMBINED[name]) for name, part in found.items()
             }
         return found
 
-    def touched(self, first: int, last: int, count: int) -> tuple[int, int]:
+    def blocks_of(self, first: int, last: int, count: int) -> tuple[int, int]:
         """First and last block along an axis of `count` nodes, that together hold the nodes `first` to
         `last`."""
         final = -(-(count - 1) // self.cell) - 1
@@ -128,7 +137,6 @@ def scan(
     cell = integer("cell", cell, BLOCK)
     if cell % BLOCK:
         raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
-    axes, source = source.order, in_storage_order(source)
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     ranges: dict[str, np.ndarray] = {}
     done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
@@ -136,7 +144,7 @@ def scan(
     for slab in slabs(source, memory):
         for name, combine in COMBINED.items():
             # by NumPy: to compile for each shape of a slab takes longer, and memory
-            part = over_blocks(slab.voxels, combine)
+            part = _over_blocks(slab.voxels, combine).transpose(inverse(source.order))
             merged, place = _merged(part, slab.first, cell // BLOCK, combine)
             if name not in ranges:
                 ranges[name] = np.full(blocks, _neutral(part.dtype, combine), part.dtype)
@@ -145,8 +153,18 @@ def scan(
         if progress is not None:
             progress(done * (nx * ny * nz) // whole, nx * ny * nz)
     give_back()
-    found = Summary(source.shape, cell, ranges)
-    return found.reordered(inverse(axes))
+    return Summary(source.shape, cell, ranges)
+
+
+def _over_blocks(voxels: np.ndarray, combine: np.ufunc) -> np.ndarray:
+    """Combines the nodes of each block. NumPy compares 16-bit floats one by one, and float32 in a fraction of
+    the time, which they become layer by layer."""
+    if not is_half(voxels.dtype):
+        return over_blocks(voxels, combine)
+    thick = LAYERS * BLOCK
+    starts = range(0, len(voxels) - 1, thick)
+    parts = [over_blocks(voxels[i : i + thick + 1].astype(np.float32), combine) for i in starts]
+    return np.concatenate(parts).astype(voxels.dtype)
 
 
 def _merged(

@@ -18,7 +18,7 @@ from .._util.axes import XYZ, Axes, inverse
 from .._util.checks import described, integer
 from .._util.voxels import check_shape
 from .dtypes import voxel_type
-from .sources import VoxelSource, empty_box
+from .sources import VoxelSource, cuts, empty_box
 
 
 Triple: TypeAlias = tuple[float, float, float]
@@ -83,7 +83,8 @@ class ZarrSource(VoxelSource):
         self._store = store.transpose([spatial.index(name) for name in SPACE])
         check_shape(self._store.shape)
         self.shape = nx, ny, nz = self._store.shape
-        self.dtype = voxel_type(np.dtype(self._store.dtype.numpy_dtype))
+        self.stored_type = np.dtype(self._store.dtype.numpy_dtype)
+        self.dtype = voxel_type(self.stored_type)
         x, y, z = (
             min(c or n, n)
             for c, n in zip(self._store.chunk_layout.read_chunk.shape, (nx, ny, nz), strict=True)
@@ -146,8 +147,7 @@ class ZarrSource(VoxelSource):
         chunk = self.chunks[axis]
         of_chunk = math.prod(self.chunks) * self._store.dtype.numpy_dtype.itemsize
         layer = math.prod(counts) // counts[axis] * of_chunk
-        thick = chunk * max(1, AT_ONCE // layer)
-        return axis, [low[axis], *range(low[axis] // chunk * chunk + thick, high[axis], thick), high[axis]]
+        return axis, cuts(low[axis], high[axis], chunk, layer, AT_ONCE)
 
 
 def _along(axis: int, begin: int, end: int) -> tuple[slice, ...]:
