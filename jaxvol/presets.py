@@ -229,7 +229,7 @@ def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:
 
 
 def _range(clim: Any) -> tuple[float, float]:
-    low, high = (float(end) for end in finite_array("clim", clim, (2,)))
+    low, high = np.asarray(finite_array("clim", clim, (2,))).tolist()
     if not low < high:
         raise ValueError(f"clim must be (low, high) with low < high; got {clim}.")
     return low, high

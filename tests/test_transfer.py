@@ -94,6 +94,11 @@ def test_colormap_has_the_colours_of_matplotlib_in_linear_light():
     np.testing.assert_allclose(transfer.opacity()[:-1], np.linspace(0, 1, 256)[:-1], atol=1e-6)
 
 
+def test_colormaps_and_presets_can_be_made_inside_a_program():
+    for make in (lambda: jv.colormap("viridis", (1, 3)), lambda: jv.preset("bonsai", clim=(0, 255))):
+        jax.tree.map(np.testing.assert_array_equal, jax.jit(make)(), make())
+
+
 def test_colours_make_colormaps():
     import matplotlib
 

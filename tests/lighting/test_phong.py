@@ -167,12 +167,18 @@ def lit(
     nodes = np.indices((4, 4, 4)).reshape(3, -1).T - 1.5
     data = (nodes @ np.asarray(gradient, float) * scale).reshape(4, 4, 4)
     volume = jv.Volume(data.astype(np.float32), origin=(-1.5, -1.5, -1.5))
+    direction = np.asarray(direction, float) / np.linalg.norm(direction)
+    place, along = (jnp.asarray(p, jnp.float32) for p in (point, direction))
+    return np.asarray(color_of(lighting, volume, place, along))
+
+
+@eqx.filter_jit
+def color_of(lighting: Phong, volume: jv.Volume, point: Any, direction: Any) -> Any:
     around = Surroundings(volume, jv.colormap("gray", (0.0, 1.0)), Affine(volume))
-    one, direction = jnp.ones(()), np.asarray(direction, float) / np.linalg.norm(direction)
-    zero = jnp.zeros((), jnp.int32)
-    place, along = (apart(jnp.asarray(p, jnp.float32)) for p in (point, direction))
-    sample = Sample(place, along, (), apart(jnp.asarray(COLOR, jnp.float32)), one, one, (zero, zero))
-    return np.asarray(jnp.stack(shade_sample(lighting.shading(around), around, sample)))
+    one, zero = jnp.ones(()), jnp.zeros((), jnp.int32)
+    color = apart(jnp.asarray(COLOR, jnp.float32))
+    sample = Sample(apart(point), apart(direction), (), color, one, one, (zero, zero))
+    return jnp.stack(shade_sample(lighting.shading(around), around, sample))
 
 
 def by_formula(normal: Any, toward: Any, viewer: Any, irradiance: Any, power: float = 10.0) -> np.ndarray:
