@@ -7,13 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 import ipywidgets
-import numpy as np
-from rendercanvas.anywidget import RenderCanvas
 
 from ..camera import Camera
 from ..lighting.shading import Lighting
 from ..march import March
 from ..transfer import TransferFunction
+from .canvas import PromptCanvas
 from .curve import Curve
 from .drawing import Content
 from .model import Frame, Model
@@ -42,11 +41,8 @@ class NotebookView(ipywidgets.HBox):
         self._loop: asyncio.AbstractEventLoop | None = None
         with contextlib.suppress(RuntimeError):
             self._loop = asyncio.get_running_loop()
-        self._frame: Frame | None = None
         self._quiet = False
-        self.canvas = RenderCanvas(size=state.size, max_fps=120)
-        self._context = self.canvas.get_bitmap_context()
-        self.canvas.request_draw(self._present)
+        self.canvas = PromptCanvas(size=state.size)
         self.canvas.add_event_handler(self._pointed, "pointer_down", "pointer_move", "pointer_up", "wheel")
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
@@ -88,8 +84,7 @@ class NotebookView(ipywidgets.HBox):
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
     def _show(self, frame: Frame) -> None:
-        self._frame = frame
-        self._in_loop(self.canvas.request_draw)
+        self._in_loop(lambda: self.canvas.show(frame.pixels, final=frame.stage == "fine"))
 
     def _tell(self, text: str) -> None:
         self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))
@@ -99,12 +94,6 @@ class NotebookView(ipywidgets.HBox):
             call()
         else:
             self._loop.call_soon_threadsafe(call)
-
-    def _present(self) -> None:
-        if self._frame is not None:
-            pixels = self._frame.pixels
-            opaque = np.full((*pixels.shape[:2], 1), 255, np.uint8)
-            self._context.set_bitmap(np.concatenate([pixels, opaque], axis=-1))
 
     def _pointed(self, event: dict[str, Any]) -> None:
         kind, at = event["event_type"], (float(event["x"]), float(event["y"]))

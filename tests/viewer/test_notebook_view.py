@@ -1,5 +1,6 @@
 """Does the notebook's face hand on what the pointer and the controls do? Without a browser."""
 
+import asyncio
 import sys
 
 import numpy as np
@@ -73,14 +74,40 @@ def test_the_controls_of_points_window_and_level_agree(shown):
     assert len(shown.model.state.curve) == len(shown._points.children) == 3
 
 
+def test_the_canvas_waits_for_no_tick(monkeypatch):
+    """An event is handled when it comes, and an image sent in the next turn of the event loop, once more
+    without loss only if it is to stay."""
+    from jaxvol.viewer.canvas import PromptCanvas
+
+    sent, handled, pixels = [], [], np.zeros((4, 6, 3), np.uint8)
+    monkeypatch.setattr(PromptCanvas, "send", lambda self, message, buffers: sent.append(message["mimetype"]))
+
+    async def run():
+        canvas = PromptCanvas(size=(6, 4))
+        resized = {"type": "resize", "width": 6, "height": 4, "pwidth": 6, "pheight": 4, "ratio": 1}
+        canvas._rfb_handle_msg(canvas, resized, [])
+        canvas._has_visible_views = True
+        canvas.add_event_handler(handled.append, "pointer_down")
+        canvas.submit_event(pointer("pointer_down", 1, 1))
+        assert len(handled) == 1
+        for final in (False, True):
+            canvas.show(pixels, final=final)
+            await asyncio.sleep(0)
+            assert (canvas._rfb_lossless_draw_info is not None) == final
+        canvas._is_closed = True
+
+    asyncio.run(run())
+    assert sent == ["image/jpeg"] * 2
+
+
 @pytest.mark.parametrize(
-    ("call", "module", "face", "extra"),
-    [(jv.view, "rendercanvas", "notebook", "notebooks"), (jv.serve, "viser", "page", "view")],
+    ("call", "module", "extra"), [(jv.view, "rendercanvas", "notebooks"), (jv.serve, "viser", "view")]
 )
-def test_without_the_extra_the_error_says_what_to_install(call, module, face, extra, monkeypatch):
-    for name in [n for n in sys.modules if n.partition(".")[0] == module]:
+def test_without_the_extra_the_error_says_what_to_install(call, module, extra, monkeypatch):
+    for name in [module, *(n for n in sys.modules if n.startswith(f"{module}."))]:
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, f"jaxvol.viewer.{face}", raising=False)
-    monkeypatch.delattr(f"jaxvol.viewer.{face}", raising=False)
+    for own in ("notebook", "canvas", "page"):
+        monkeypatch.delitem(sys.modules, f"jaxvol.viewer.{own}", raising=False)
+        monkeypatch.delattr(f"jaxvol.viewer.{own}", raising=False)
     with pytest.raises(ImportError, match=rf"pip install jaxvol\[{extra}\]"):
         call(BALL)
