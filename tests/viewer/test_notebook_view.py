@@ -8,7 +8,7 @@ import pytest
 
 import jaxvol as jv
 
-from .test_model import BALL, LOOK, MARCH
+from .test_model import BALL, LABELS, LOOK, MARCH
 
 
 pytest.importorskip("rendercanvas.anywidget", reason="needs rendercanvas: pip install jaxvol[notebooks]")
@@ -58,20 +58,45 @@ def test_what_is_shown_can_be_rendered(shown):
 
 
 def test_the_controls_of_points_window_and_level_agree(shown):
-    shown._level.value = 150.0
-    assert shown.model.state.curve.level == pytest.approx(150)
-    value, color, opacity, more, _ = shown._points.children[1].children
-    assert value.value == pytest.approx(shown.model.state.curve.values[1])
+    shown._look.level.value = 150.0
+    assert shown.model.state.look.level == pytest.approx(150)
+    value, color, opacity, more, _ = shown._look.points.children[1].children
+    assert value.value == pytest.approx(shown.model.state.look.values[1])
     opacity.value, color.value = 0.5, "#ff0000"
-    assert shown.model.state.curve.opacity(1) == pytest.approx(0.5)
-    assert shown.model.state.curve.colors[1] == pytest.approx((1, 0, 0))
-    last = shown._points.children[2].children[0]
+    assert shown.model.state.look.opacity(1) == pytest.approx(0.5)
+    assert shown.model.state.look.colors[1] == pytest.approx((1, 0, 0))
+    last = shown._look.points.children[2].children[0]
     last.value = last.value + 40
-    assert shown._window.value == pytest.approx(180)
+    assert shown._look.window.value == pytest.approx(180)
     more.click()
-    assert len(shown.model.state.curve) == len(shown._points.children) == 4
-    shown._points.children[0].children[4].click()
-    assert len(shown.model.state.curve) == len(shown._points.children) == 3
+    assert len(shown.model.state.look) == len(shown._look.points.children) == 4
+    shown._look.points.children[0].children[4].click()
+    assert len(shown.model.state.look) == len(shown._look.points.children) == 3
+
+
+def test_the_plot_follows_the_points(shown):
+    plot = shown._look.children[0]
+    before = plot.value
+    assert before.count("<circle") == 2  # the third lies beyond the volume's values
+    shown._look.points.children[1].children[2].value = 0.1
+    assert plot.value != before
+
+
+def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
+    view = jv.view(LABELS, march=MARCH, lit=False, size=(64, 48))
+    try:
+        rows = view._look.children
+        assert [row.children[1].description for row in rows] == ["1", "2"]
+        assert "#1f77b4" in rows[0].children[0].value
+        rows[0].children[1].value = False
+        rows[1].children[2].value = 0.25
+        transfer = view.transfer
+        assert isinstance(transfer, jv.LabelTransferFunction)
+        assert np.asarray(transfer.shown).tolist()[1:3] == [False, True]
+        assert np.asarray(transfer.opacity).tolist()[1:3] == [1.0, 0.25]
+        assert view.volume.labels is not None
+    finally:
+        view.close()
 
 
 def test_the_canvas_waits_for_no_tick(monkeypatch):
