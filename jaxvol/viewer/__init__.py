@@ -54,7 +54,8 @@ def view(
       points or fewer can be edited point by point. A `TransferFunction2D` is moved and stretched along the
       values. Labels of a `LabelTransferFunction` are hidden, and made fainter or denser; such a one is the
       default for voxels that seem to be labels, each in its own colour.
-    - `camera`: by default one that sees the whole volume. Its size does not count.
+    - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
+      it. Its size does not count.
     - `march`: whose transforms are on at first, and whose step is that of the fine image. By default steps of
       half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection` and `EarlyTermination`.
     - `lighting`: the light that can be turned on, by default `Phong`. `lit`: whether it is on at first.

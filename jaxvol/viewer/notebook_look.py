@@ -46,7 +46,8 @@ class LabelControls(ipywidgets.VBox):
         )
         box.observe(lambda event: self._change(label, shown=bool(event["new"])), "value")
         opacity.observe(lambda event: self._change(label, opacity=event["new"]), "value")
-        return ipywidgets.HBox([swatch, box, opacity])
+        own_height = {"flex": "0 0 auto"}  # or all share that of the box
+        return ipywidgets.HBox([swatch, box, opacity], layout=own_height)
 
     def _change(self, label: int, **changes: Any) -> None:
         look = self._model.state.look
@@ -111,7 +112,7 @@ class RangeControls(ipywidgets.VBox):
         if isinstance(look, Curve) and look.editable:
             self.points.children = tuple(self._row(look, index) for index in range(len(look)))
         else:
-            self.points.children = (ipywidgets.HTML(f"<i>{look.count}: too many to edit</i>"),)
+            self.points.children = (ipywidgets.HTML(f"<i>{look.count}, not edited one by one</i>"),)
 
     def _row(self, curve: Curve, index: int) -> ipywidgets.HBox:
         value = ipywidgets.FloatText(value=_rounded(curve.values[index]), layout={"width": "70px"})

@@ -69,7 +69,7 @@ class _RangeControls:
         for each in (self.window, self.level):
             answer(each, lambda: self._edit(lambda c: c.over(self.window.value, self.level.value)))
         if not isinstance(look, Curve) or not look.editable:
-            gui.add_markdown(f"{look.count}: too many to edit")
+            gui.add_markdown(f"{look.count}, not edited one by one")
             return
         self.point = gui.add_dropdown("point", _names(look))
         self.value = gui.add_number("value", look.values[0])

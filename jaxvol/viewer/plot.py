@@ -11,7 +11,7 @@ from .curve import Curve
 from .look import Color, Ranged
 
 
-BINS = 160
+BINS = 128
 
 WIDTH, HEIGHT, FOOT = 320, 84, 14
 """Of the plot, in its own units; `FOOT` is for the numbers under it."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._util.checks import described
 from ..arguments import check_arguments
-from ..automatic import automatic_transfer, labels_shown
+from ..automatic import automatic_transfer, framed, labels_shown, visible_points
 from ..camera import Camera
 from ..compositing import Compositing
 from ..labels import LabelTransferFunction
@@ -78,9 +78,10 @@ def begin(
         raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
     if not isinstance(volume, Volume):
         check_arguments("view(volume, transfer, camera, march)", volume=volume)
+    seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-    seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
+        seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
     given = March(1.0) if march is None else march
     check_arguments(
         "view(volume, transfer, camera, march)",
