@@ -2,8 +2,9 @@
 
 rendercanvas does both at ticks of a scheduler, at most `max_fps` a second, and none while an image waits for
 the browser: some 10 ms for the event, and as many for the image, of the 150 in which a coarse image is to
-follow the pointer. There is no need for them here: the viewer merges events itself, since a newer request
-replaces an older one.
+follow the pointer. The browser's part keeps a move of the pointer back for 20 ms, to join it with those that
+follow. There is no need for this here: browsers report one move for each of their frames, and the viewer
+merges events itself, since a newer request replaces an older one.
 """
 
 from collections.abc import Callable
@@ -18,21 +19,24 @@ from .drawing import Pixels
 class PromptCanvas(RenderCanvas):
     """Calls handlers of events at once, and sends an image as soon as fewer than two wait for the browser.
 
-    `pixels`: of the next image; `final`: whether it is to stay. rendercanvas sends JPEG, and what stays for
-    0.3 s once more without loss, whose compression holds up events for 25 ms: final images only, here.
+    rendercanvas sends what has been shown for 0.3 s once more, without loss, and its compression holds up
+    events for 25 ms. Here images are sent once, as JPEG, those that are to stay in a better quality.
+
+    `pixels`: of the next image.
     """
 
+    _esm = RenderCanvas._esm.replace("setThrottle(20)", "setThrottle(0)")
     pixels: Pixels | None = None
-    final = False
 
     def __init__(self, **how: Any):
         super().__init__(**how)
         self._bitmap = self.get_bitmap_context()
         self.request_draw(self._set_bitmap)
 
-    def show(self, pixels: Pixels, *, final: bool) -> None:
-        """Send an image, in place of those that have not been sent. In the thread of the event loop."""
-        self.pixels, self.final = pixels, final
+    def show(self, pixels: Pixels, quality: int) -> None:
+        """Send an image, in place of those that have not been sent. In the thread of the event loop.
+        `quality`: of JPEG, below 100."""
+        self.pixels, self._quality = pixels, quality
         self.request_draw()
 
     def request_draw(self, draw_function: Callable[[], None] | None = None) -> None:
@@ -49,5 +53,4 @@ class PromptCanvas(RenderCanvas):
             self._bitmap.set_bitmap(np.concatenate([self.pixels, opaque], axis=-1))
 
     def _rfb_schedule_lossless_draw(self, array: Any, delay: float = 0.3) -> None:
-        if self.final:
-            super()._rfb_schedule_lossless_draw(array, delay)
+        pass

@@ -86,7 +86,7 @@ class NotebookView(ipywidgets.HBox):
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
     def _show(self, frame: Frame) -> None:
-        self._in_loop(lambda: self.canvas.show(frame.pixels, final=frame.stage == "fine"))
+        self._in_loop(lambda: self.canvas.show(frame.pixels, frame.quality))
 
     def _tell(self, text: str) -> None:
         self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))

@@ -24,9 +24,6 @@ HOST = "127.0.0.1"
 
 OWN_NAMES = {HOST, "localhost"}
 
-JPEG = {"coarse": 85, "drawing": 88, "fine": 94}
-"""Quality of the images that are sent."""
-
 
 class _Server(viser.ViserServer):
     """viser's server without what leaves this machine."""
@@ -135,7 +132,7 @@ class _Panel:
         self.model.apply(lambda state: replace(state.with_size(width, height), orbit=orbit))
 
     def _show(self, frame: Frame) -> None:
-        self.client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=JPEG[frame.stage])
+        self.client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=frame.quality)
         self.client.flush()
 
     def _tell(self, text: str) -> None:

@@ -100,8 +100,7 @@ def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
 
 
 def test_the_canvas_waits_for_no_tick(monkeypatch):
-    """An event is handled when it comes, and an image sent in the next turn of the event loop, once more
-    without loss only if it is to stay."""
+    """An event is handled when it comes, and an image sent in the next turn of the event loop, and once."""
     from jaxvol.viewer.canvas import PromptCanvas
 
     sent, handled, pixels = [], [], np.zeros((4, 6, 3), np.uint8)
@@ -115,10 +114,11 @@ def test_the_canvas_waits_for_no_tick(monkeypatch):
         canvas.add_event_handler(handled.append, "pointer_down")
         canvas.submit_event(pointer("pointer_down", 1, 1))
         assert len(handled) == 1
-        for final in (False, True):
-            canvas.show(pixels, final=final)
+        for quality in (80, 94):
+            canvas.show(pixels, quality)
             await asyncio.sleep(0)
-            assert (canvas._rfb_lossless_draw_info is not None) == final
+        assert canvas._rfb_lossless_draw_info is None
+        assert "this.setThrottle(0)" in canvas._esm
         canvas._is_closed = True
 
     asyncio.run(run())
