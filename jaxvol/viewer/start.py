@@ -15,7 +15,7 @@ from ..lighting.shading import Lighting
 from ..march import March, Transform
 from ..modes import Mode, compositing_of
 from ..occupancy import BLOCK
-from ..space import node_distance
+from ..space import median_node_distance
 from ..transfer import TransferFunction
 from ..transfer2d import TransferFunction2D
 from ..transforms import (
@@ -129,6 +129,6 @@ def _look(transfer: TransferFunction | TransferFunction2D | LabelTransferFunctio
 
 
 def _voxel(volume: Volume, march: March) -> float:
-    """World length between nodes: the median, over the volume, of the least distance."""
+    """World length between nodes."""
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
-    return float(np.median(np.asarray(node_distance(march.locate(volume), blocks))))
+    return float(median_node_distance(march.locate(volume), blocks))
