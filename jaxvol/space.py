@@ -6,6 +6,7 @@ different `Path`; the rest of the march is unaffected.
 """
 
 from abc import abstractmethod
+from functools import partial
 from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -262,6 +263,12 @@ def node_distance(
         return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))
 
     return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))
+
+
+@partial(jax.jit, static_argnums=1)  # operation by operation, it takes seconds to compile
+def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
+    """The median of `node_distance` over all blocks: what steps are counted in, as voxels."""
+    return jnp.median(node_distance(space, shape))
 
 
 def world_gradient(

@@ -49,12 +49,15 @@ class Frames(NamedTuple):
         return jax.block_until_ready(found)
 
 
-def planned(options: argparse.Namespace, scene: Scene, camera: Camera | None = None) -> Plan | BudgetPlan:
-    """The cheapest way to render the scene within the tolerance that is asked for."""
+def planned(
+    options: argparse.Namespace, scene: Scene, camera: Camera | None = None, *, once: bool = True
+) -> Plan | BudgetPlan:
+    """The cheapest way to render the scene within the tolerance that is asked for. `once`: of one image."""
     how: dict[str, Any] = {
         "transforms": scene.clip,
         "compositing": scene.compositing,
         "lighting": scene.lighting,
+        "once": once,
     }
     seen = scene.transfer, scene.camera if camera is None else camera
     with working(f"planning how to render {options.file}"):
@@ -72,7 +75,8 @@ def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camer
             raise ValueError("--tolerance finds a step; leave out --step.")
         march = March(options.step, (*scene.clip, *FAST), "midpoint")
         return Frames(scene.volume, transfer, march, mode, scene.lighting, scene.source, options.memory)
-    plans = [planned(options, scene, camera) for camera in cameras or (scene.camera,)]
+    seen = cameras or (scene.camera,)
+    plans = [planned(options, scene, camera, once=len(seen) == 1) for camera in seen]
     found = min(plans, key=lambda plan: float(plan.march.step))
     source = None
     if isinstance(found, BudgetPlan):

@@ -8,7 +8,7 @@ from typing import Any
 from ..viewer import serve
 from .data import add_data_options, volume_of
 from .options import transfer_options
-from .scene import look_of
+from .scene import is_automatic, look_of
 
 
 def add_view(commands: Any, shared: argparse.ArgumentParser) -> None:
@@ -33,7 +33,7 @@ def add_view(commands: Any, shared: argparse.ArgumentParser) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     volume = volume_of(options)
-    transfer = look_of(options, volume)
+    transfer = None if is_automatic(options) else look_of(options, volume)
     page = serve(volume, transfer, lit=options.shade, port=options.port, title=options.file.name)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:

@@ -5,7 +5,6 @@ import time
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -18,7 +17,7 @@ from ..march import March, Transform
 from ..modes import Mode, compositing_of
 from ..occupancy import Blocks
 from ..rendering import Rendering
-from ..space import Space, node_distance
+from ..space import Space, median_node_distance
 from ..transfer import Transfer
 from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..volume import Volume
@@ -124,6 +123,7 @@ def plan(
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
     gradients: bool | Any = False,
+    once: bool | Any = False,
     seed: int | Any = 0,
 ) -> Plan:
     """Finds the cheapest way to render a scene within a tolerance, by rendering parts of it.
@@ -145,7 +145,8 @@ def plan(
     - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
       no voxel changes; or if the image changes by less than an eighth of the tolerance, and by less than all
       other errors leave of it. If neither, to float16, on the same terms.
-    - **lighting**: the first of `Lighting.simpler`, of what was given and of `Lighting.smooth` that is within
+    - **lighting**: one that has no simpler variants, such as `Phong`, is part of all these images. Of others,
+      the first of `Lighting.simpler`, of what was given and of `Lighting.smooth` that is within
       the tolerance, compared with the last (as many templates as were given, blended: their own noise does
       not count); the step is halved as long as that changes the lit image by more than what is left.
 
@@ -165,6 +166,9 @@ def plan(
     - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, voxels keep
       their type, and simpler lightings without a gradient are left out. The tolerance is that of the image
       all the same. What is proven (empty space, faces) is proven for this transfer function only.
+    - `once`: whether the march is for a single image. What needs a program of its own, whose compilation
+      takes longer than it saves, is then tried only where nothing else is within the tolerance:
+      `"preintegrated"` and `AdaptiveSampling`.
     - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
       `seconds`.
 
@@ -178,8 +182,11 @@ def plan(
     order = "plan(volume, transfer, camera, tolerance)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
     gradients = flag("gradients", gradients)
-    setting = Setting(volume, transfer, compositing_of(compositing))
-    tolerance, given = _checked(tolerance, transforms, (setting, camera, lighting))
+    once = flag("once", once)
+    scene = Setting(volume, transfer, compositing_of(compositing), lighting)
+    tolerance, given = _checked(tolerance, transforms, (scene, camera))
+    choice = lighting if lighting is not None and _has_variants(lighting) else None
+    setting = scene if choice is None else scene._replace(lighting=None)
     space = March(1.0, given).locate(volume)
     visible = _occupied(setting, given)
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
@@ -187,11 +194,11 @@ def plan(
     over = isinstance(setting.compositing, Over)
     proven, parts = _proven(visible, space, given)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
-    voxel = float(jnp.median(node_distance(space, visible.shape)))
+    voxel = float(median_node_distance(space, visible.shape))
 
     def trials_of(ends: float, goal: float) -> Trials:
         own = (EarlyTermination(ends),) if over else ()
-        steps = goal if lighting is None else goal * (1 - LIT)
+        steps = goal if choice is None else goal * (1 - LIT)
         return Trials(probe, setting, steps, tolerance, voxel, (*given, *proven, *own))
 
     # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
@@ -201,12 +208,14 @@ def plan(
     share = ends if opaque >= OPAQUE else 0.0
     goal = MARGIN * tolerance - share
     trials = trials_of(ends / _brightest(seen), goal)
-    chosen, truth = _marched(trials, parts, lit=lighting is not None)
-    brightest, lit, light_error, light_seconds = _brightest(truth.image), None, 0.0, 0.0
-    if lighting is not None:
+    chosen, truth = _marched(trials, parts, lit=lighting is not None, once=once)
+    brightest, lit, light_error, light_seconds = _brightest(truth.image), lighting, 0.0, 0.0
+    if choice is not None:
         chosen, lit, light_error, light_seconds, brightest = _lit(
-            trials, chosen, lighting, goal, parts, gradients=gradients
+            trials, chosen, choice, goal, parts, gradients=gradients
         )
+    elif lighting is not None:
+        parts.append(Part("light: as given", True, "none is simpler; it is in the images that were compared"))
     march, name = _without(chosen.march, EarlyTermination), "EarlyTermination"
     if share:
         ending = EarlyTermination(share / brightest)
@@ -217,7 +226,7 @@ def plan(
     rounding, said = 0.0, [(f"voxels as {volume.data.dtype}", True, "as they are given, for their gradient")]
     if not gradients:
         allowed = min(ROUNDED * tolerance, max(tolerance - error, 0))
-        setting, rounding, said = stored(probe, setting, chosen.march, lit, allowed)
+        setting, rounding, said = stored(probe, setting._replace(lighting=lit), chosen.march, allowed)
     parts += [Part(*each) for each in said]
     seconds = _seconds(trials, chosen) + light_seconds
     taken = time.perf_counter() - begun
@@ -256,9 +265,14 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     return number, given
 
 
+def _has_variants(lighting: Lighting) -> bool:
+    """Whether there is a choice of lightings that look nearly the same."""
+    return bool(lighting.simpler) or lighting.smooth is not lighting
+
+
 def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
     """The blocks that may change a pixel."""
-    volume, transfer, mode = setting
+    volume, transfer, mode, _ = setting
     if mode.resolves:
         transfer, _ = mode.marched(transfer, March(1.0, given), volume)
     return mode.occupied(transfer, Blocks.of(volume, slopes=transfer.reads_gradient))
@@ -287,9 +301,9 @@ def _proven(
     return (*found, *((SpaceLeaping(),) if leaps else ())), parts
 
 
-def _marched(trials: Trials, parts: list[Part], *, lit: bool) -> tuple[Trial, Truth]:
-    """The cheapest march within the goal, unlit. `lit`: whether it is for an image with light, along which
-    adaptive sampling cannot know how samples change."""
+def _marched(trials: Trials, parts: list[Part], *, lit: bool, once: bool) -> tuple[Trial, Truth]:
+    """The cheapest march within the goal. `lit`: whether it is for an image with light, along which
+    adaptive sampling cannot know how samples change. `once`: as for `plan`."""
     uniform, truth = trials.uniform()
     step, samples = float(uniform.march.step) / trials.voxel, uniform.samples
     name = f"step {float(uniform.march.step):.4g}"
@@ -306,6 +320,10 @@ def _marched(trials: Trials, parts: list[Part], *, lit: bool) -> tuple[Trial, Tr
         return uniform, truth
     if samples <= WORTHWHILE and step >= FAIR:
         why = f"{samples:.1f} samples a pixel: too few to save any"
+        parts.append(Part("preintegrated, AdaptiveSampling", False, why))
+        return uniform, truth
+    if once:
+        why = "not tried for one image: a program of its own takes longer to compile than it saves"
         parts.append(Part("preintegrated, AdaptiveSampling", False, why))
         return uniform, truth
     others = {
@@ -330,11 +348,15 @@ def _lit(
     """The march, the cheapest lighting within what is left of the goal, its error, the seconds that it adds
     to an image, and the brightest colour."""
     probe, setting = trials.probe, trials.setting
-    smooth = probe.render(setting, chosen.march, lighting.smooth)
+
+    def rendered(march: March, lighting: Lighting) -> Rendering:
+        return probe.render(setting._replace(lighting=lighting), march)
+
+    smooth = rendered(chosen.march, lighting.smooth)
     tried = [(each.lighting, each.what) for each in lighting.simpler if each.has_gradient or not gradients]
     left, found = goal - chosen.error, []
     for other, what in (*tried, (lighting, "as given"), (lighting.smooth, "as given, without its noise")):
-        error = probe.distance(probe.render(setting, chosen.march, other), smooth)
+        error = probe.distance(rendered(chosen.march, other), smooth)
         found.append((error if math.isfinite(error) else math.inf, other, what))
         if error <= left:
             break
@@ -349,10 +371,10 @@ def _lit(
     # how light changes along a ray is not known before: shorter steps must not change the image
     march, change = chosen.march, math.inf
     allowed = goal - error if error <= left else goal * (1 - LIT)
-    image = probe.render(setting, march, lit)
+    image = rendered(march, lit)
     for _ in range(HALVED):
         half = March(march.step / 2, march.transforms, march.quadrature)
-        finer = probe.render(setting, half, lit)
+        finer = rendered(half, lit)
         change = 4 / 3 * probe.distance(image, finer)
         if change <= allowed:
             break
@@ -361,7 +383,7 @@ def _lit(
         image, march, change = finer, half, change / 3
     samples = probe.mean(image.samples)
     marched = Trial(march, max(chosen.error, change), samples, chosen.kind)
-    unlit, with_light = (_fastest(trials, march, each) for each in (None, lit))
+    unlit, with_light = (_fastest(probe, setting._replace(lighting=each), march) for each in (None, lit))
     pixels = probe.pixels * probe.share / probe.inside.size
     return marched, lit, error, max(with_light - unlit, 0.0) * pixels, _brightest(image)
 
@@ -371,12 +393,12 @@ def _without(march: March, kind: type[Transform]) -> March:
     return March(march.step, kept, march.quadrature)
 
 
-def _fastest(trials: Trials, march: March, lighting: Lighting | None = None) -> float:
+def _fastest(probe: Probe, setting: Setting, march: March) -> float:
     """Seconds to render the patches, once compiled."""
 
     def once() -> float:
         begun = time.perf_counter()
-        jax.block_until_ready(trials.probe.render(trials.setting, march, lighting).rgba)
+        jax.block_until_ready(probe.render(setting, march).rgba)
         return time.perf_counter() - begun
 
     once()
@@ -388,7 +410,7 @@ def _seconds(trials: Trials, chosen: Trial) -> float:
     steps, so that calls, which take as long for a few pixels as for an image, do not count."""
     times, samples = [], []
     for step in trials.steps("midpoint"):
-        times.append(_fastest(trials, trials.march(step)))
+        times.append(_fastest(trials.probe, trials.setting, trials.march(step)))
         samples.append(float(np.asarray(trials.image(step, "midpoint").samples, np.float64).sum()))
     pixels = trials.probe.pixels
     if samples[0] <= 1.1 * samples[1]:  # nothing is seen

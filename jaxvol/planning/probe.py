@@ -50,6 +50,7 @@ class Setting(NamedTuple):
     volume: Volume
     transfer: Transfer
     compositing: Compositing[Any]
+    lighting: Lighting | None = None
 
 
 class Probe(NamedTuple):
@@ -114,9 +115,9 @@ class Probe(NamedTuple):
     def _totals(self, of_pixels: Any) -> Float[np.ndarray, " patches"]:
         return np.sum(np.asarray(of_pixels, np.float64).reshape(self.inside.shape) * self.inside, axis=1)
 
-    def render(self, setting: Setting, march: March, lighting: Lighting | None = None) -> Rendering:
+    def render(self, setting: Setting, march: March) -> Rendering:
         """These pixels of the image."""
-        volume, transfer, compositing = setting
+        volume, transfer, compositing, lighting = setting
         scene = Scene(volume, transfer, self.source, march, compositing, lighting)
         return render_scene(scene, "all", "replay")
 

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 
-from ..lighting.shading import Lighting
 from ..march import March
 from .probe import Probe, Setting
 
@@ -16,7 +15,7 @@ Voxels = Shaped[np.ndarray, "nx ny nz"]
 
 
 def stored(
-    probe: Probe, setting: Setting, march: March, lighting: Lighting | None, allowed: float
+    probe: Probe, setting: Setting, march: March, allowed: float
 ) -> tuple[Setting, float, list[tuple[str, bool, str]]]:
     """The scene with its voxels in a smaller type, if that changes the image by at most `allowed`; by how
     much it does; and what was kept and left out, with the reasons."""
@@ -30,8 +29,8 @@ def stored(
             change, why = 0.0, "no voxel changes"
         else:
             # rounded, but as float32: the program that is compiled already
-            before = probe.render(setting, march, lighting) if before is None else before
-            change = probe.distance(probe.render(_holding(setting, changed), march, lighting), before)
+            before = probe.render(setting, march) if before is None else before
+            change = probe.distance(probe.render(_holding(setting, changed), march), before)
             why = f"the image changes by {change:.2g}"
         if change <= allowed:
             return _holding(setting, small), change, [*said, (f"voxels as {small.dtype}", True, why)]

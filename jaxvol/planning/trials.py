@@ -4,11 +4,13 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from ..compositing import Over
 from ..march import March, Quadrature, Transform
 from ..rendering import Rendering
+from ..transfer import Transfer
 from ..transforms import AdaptiveSampling
 from ..variation import Windows
 from .probe import Probe, Setting, Truth
@@ -87,8 +89,15 @@ class Trials:
     @property
     def integrable(self) -> bool:
         """Whether cells can be integrated between their ends."""
-        integrator = self.setting.transfer.integrator()
-        return integrator is not None and isinstance(self.setting.compositing, Over)
+        known = False
+
+        def ask(transfer: Transfer) -> None:
+            nonlocal known
+            known = transfer.integrator() is not None
+
+        # as shapes: its tables take seconds to compile, operation by operation
+        eqx.filter_eval_shape(ask, self.setting.transfer)
+        return known and isinstance(self.setting.compositing, Over)
 
     def uniform(self) -> tuple[Trial, Truth]:
         """The longest steps within the goal: by the midpoint rule; or integrated, where that takes more than

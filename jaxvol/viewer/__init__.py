@@ -38,10 +38,11 @@ def view(
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
-    return. Beside the image are window and level, the points of the transfer function, the step, and every
-    transform and the light to be turned on and off. While something changes, the image is as coarse as it
-    must be to follow within some 150 ms (`viewer.pace`); at rest it has all pixels. Its time, its step and an
-    estimate of its error are shown live. It needs `pip install jaxvol[notebooks]`.
+    return. Beside the image are window and level, the points of the transfer function in front of the
+    volume's histogram, or its labels, the step, and every transform and the light to be turned on and off.
+    While something changes, the image is as coarse as it must be to follow within some 150 ms
+    (`viewer.pace`); at rest it has all pixels. Its time, its step and an estimate of its error are shown
+    live. It needs `pip install jaxvol[notebooks]`.
 
     The first image, and the first one with another set of transforms, is compiled, which takes seconds;
     compiled programs are kept for the next time, as by `keep_programs`.
@@ -49,9 +50,12 @@ def view(
     **Arguments:**
 
     - `volume`: what is looked at.
-    - `transfer`: a `TransferFunction`; by default one that is found from the volume's values. One of 16
-      points or fewer can be edited point by point.
-    - `camera`: by default one that sees the whole volume. Its size does not count.
+    - `transfer`: a `TransferFunction`, by default one that is found from the volume's values; one of 16
+      points or fewer can be edited point by point. A `TransferFunction2D` is moved and stretched along the
+      values. Labels of a `LabelTransferFunction` are hidden, and made fainter or denser; such a one is the
+      default for voxels that seem to be labels, each in its own colour.
+    - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
+      it. Its size does not count.
     - `march`: whose transforms are on at first, and whose step is that of the fine image. By default steps of
       half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection` and `EarlyTermination`.
     - `lighting`: the light that can be turned on, by default `Phong`. `lit`: whether it is on at first.
@@ -59,7 +63,7 @@ def view(
     - `background`: linear RGB.
     - `size`: (width, height) of the image in the notebook's pixels.
 
-    **Returns:** a widget. `render(volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a
+    **Returns:** a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a
     widget `v` renders what it shows.
 
     **Raises:** `ValueError` as `render` does, for another kind of transfer function, and for an orthographic

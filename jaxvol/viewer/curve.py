@@ -8,26 +8,24 @@ import numpy as np
 
 from ..display import from_srgb, to_srgb
 from ..transfer import TransferFunction
+from .look import Color, Ranged, with_item
 
 
 MOST = 16
 """Control points that a viewer edits. All transfer functions of so many points or fewer are padded to it, so
 that one program renders them all."""
 
-Color = tuple[float, float, float]
-
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Curve:
+class Curve(Ranged):
     """Control points of a transfer function.
 
     - `values`: in increasing order. `colors`: linear RGB. `extinctions`: 1/length.
     - `unit_distance`: world length of the layer to which opacities refer that are shown and set.
     """
 
-    values: tuple[float, ...]
     colors: tuple[Color, ...]
     extinctions: tuple[float, ...]
     unit_distance: float
@@ -43,28 +41,13 @@ class Curve:
         return len(self.values)
 
     @property
+    def count(self) -> str:
+        return f"{len(self)} points"
+
+    @property
     def editable(self) -> bool:
         """Whether there are so few points that each can be set by itself."""
         return len(self) <= MOST
-
-    @property
-    def window(self) -> float:
-        """Width of the range of values between the first and the last point."""
-        return self.values[-1] - self.values[0]
-
-    @property
-    def level(self) -> float:
-        """Middle of that range."""
-        return (self.values[0] + self.values[-1]) / 2
-
-    def over(self, window: float, level: float) -> "Curve":
-        """The same points, moved and stretched to another range.
-
-        **Raises:** `ValueError` for a window that is not positive, and numbers that are not finite."""
-        if not (math.isfinite(level) and math.isfinite(window) and window > 0):
-            raise ValueError(f"window must be above 0, and level a number; got {window} and {level}.")
-        parts = [(v - self.level) / self.window for v in self.values]
-        return replace(self, values=tuple(level + window * part for part in parts))
 
     def opacity(self, index: int) -> float:
         """Of a layer of `unit_distance`, at a point."""
@@ -97,13 +80,13 @@ class Curve:
             near = 1e-4 * self.window  # apart, so that no three are equal
             low = self.values[index - 1] + near if index else -math.inf
             high = self.values[index + 1] - near if index + 1 < len(self) else math.inf
-            curve = replace(curve, values=_with(curve.values, index, min(max(value, low), high)))
+            curve = replace(curve, values=with_item(curve.values, index, min(max(value, low), high)))
         if color is not None:
             r, g, b = (float(c) for c in from_srgb(np.asarray(color)))
-            curve = replace(curve, colors=_with(curve.colors, index, (r, g, b)))
+            curve = replace(curve, colors=with_item(curve.colors, index, (r, g, b)))
         if opacity is not None:
             extinction = -math.log1p(-min(opacity, 1 - 2.0**-24)) / self.unit_distance
-            curve = replace(curve, extinctions=_with(curve.extinctions, index, extinction))
+            curve = replace(curve, extinctions=with_item(curve.extinctions, index, extinction))
         return curve
 
     def split(self, index: int) -> "Curve":
@@ -139,11 +122,10 @@ class Curve:
         return replace(self, **left)
 
     def transfer(self) -> TransferFunction:
-        """The transfer function, as it is."""
         return TransferFunction(self.values, self.colors, self.extinctions)
 
     def padded(self) -> TransferFunction:
-        """The same function, by `MOST` points where there are fewer: beyond the last one it is constant."""
+        """By `MOST` points where there are fewer: beyond the last one it is constant."""
         missing = max(MOST - len(self), 0)
         step = max(self.window, 1e-3 * abs(self.values[-1]))
         beyond = tuple(self.values[-1] + step * (k + 1) for k in range(missing))
@@ -156,10 +138,6 @@ class Curve:
     def _check(self, index: int) -> None:
         if not 0 <= index < len(self):
             raise ValueError(f"there is no point {index}; there are {len(self)}.")
-
-
-def _with(items: tuple[T, ...], index: int, item: T) -> tuple[T, ...]:
-    return (*items[:index], item, *items[index + 1 :])
 
 
 def _inserted(items: tuple[T, ...], index: int, item: T) -> tuple[T, ...]:

@@ -15,6 +15,7 @@ from ..display import to_srgb
 from ..metrics import rmse
 from ..render import render
 from ..volume import Volume
+from .plot import Histogram
 from .state import Choices, State
 from .tiles import SIDE, Grid
 
@@ -31,12 +32,14 @@ class Content:
     """What does not change while a volume is looked at.
 
     - `compositing`: how cells become a pixel. `background`: linear RGB.
+    - `histogram`: of the volume.
     """
 
     volume: Volume
     choices: Choices
     compositing: Compositing[Any]
     background: tuple[float, float, float]
+    histogram: Histogram
 
 
 class Drawing:
@@ -47,12 +50,13 @@ class Drawing:
         self.content, self.state, self.coarser = content, state, coarser
         self.march = content.choices.march(state, coarser)
         self.lighting = content.choices.light(state)
-        self.transfer = state.curve.padded()
+        self.transfer = state.look.padded()
 
     @property
     def program(self) -> tuple[Any, ...]:
         """What another program must be compiled for."""
-        return (self.state.on, self.state.lit, self.transfer.values.shape)
+        leaves, structure = jax.tree.flatten(self.transfer)
+        return self.state.on, self.state.lit, structure, *(leaf.shape for leaf in leaves)
 
     def tile(self, grid: Grid, column: int, row: int) -> Pixels:
         """The pixels of a tile."""

@@ -38,6 +38,11 @@ class Frame:
     latency: float
     step: float
 
+    @property
+    def quality(self) -> int:
+        """Of the JPEG as which it is sent to a browser."""
+        return {"coarse": 85, "drawing": 88, "fine": 94}[self.stage]
+
 
 class Model:
     """The state of a viewer, drawn whenever it changes.

@@ -3,33 +3,30 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import ipywidgets
-import numpy as np
-from rendercanvas.anywidget import RenderCanvas
 
 from ..camera import Camera
 from ..lighting.shading import Lighting
 from ..march import March
-from ..transfer import TransferFunction
-from .curve import Curve
+from ..transfer import Transfer
+from ..volume import Volume
+from .canvas import PromptCanvas
 from .drawing import Content
 from .model import Frame, Model
+from .notebook_look import WIDE, look_controls
 from .state import State
 
 
 PER_NOTCH = 1.2
 """How much nearer one notch of a mouse wheel brings the camera, which browsers report as 100."""
 
-WIDE = {"width": "330px"}
-
 
 class NotebookView(ipywidgets.HBox):
     """What `view` returns: an image with its controls, a widget of ipywidgets.
 
-    - `camera`, `transfer`, `march`, `lighting`: as they are now, to be passed to `render`.
+    - `volume`, `camera`, `transfer`, `march`, `lighting`: as they are now, to be passed to `render`.
     - `model`: the viewer's state, `model.state`; `model.wait()` waits until it is drawn.
     - `canvas`: the image, a canvas of rendercanvas.
     - `close()` ends the viewer's thread. A cell that shows another viewer does not.
@@ -42,11 +39,7 @@ class NotebookView(ipywidgets.HBox):
         self._loop: asyncio.AbstractEventLoop | None = None
         with contextlib.suppress(RuntimeError):
             self._loop = asyncio.get_running_loop()
-        self._frame: Frame | None = None
-        self._quiet = False
-        self.canvas = RenderCanvas(size=state.size, max_fps=120)
-        self._context = self.canvas.get_bitmap_context()
-        self.canvas.request_draw(self._present)
+        self.canvas = PromptCanvas(size=state.size)
         self.canvas.add_event_handler(self._pointed, "pointer_down", "pointer_move", "pointer_up", "wheel")
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
@@ -54,9 +47,14 @@ class NotebookView(ipywidgets.HBox):
         self.model = Model(content, state, self._show, self._tell)
         self._first = state
         self._at: tuple[float, float] | None = None
-        self._points = ipywidgets.VBox()
         self.children = (self.canvas, ipywidgets.VBox(self._controls(), layout={"margin": "0 0 0 12px"}))
         self.model.draw()
+
+    @property
+    def volume(self) -> Volume:
+        """What is looked at. Of voxels that are labels, shown without a transfer function, it is a smooth
+        volume with them."""
+        return self.model.content.volume
 
     @property
     def camera(self) -> Camera:
@@ -64,9 +62,9 @@ class NotebookView(ipywidgets.HBox):
         return self.model.state.orbit.camera(self.model.state.size)
 
     @property
-    def transfer(self) -> TransferFunction:
+    def transfer(self) -> Transfer:
         """The transfer function."""
-        return self.model.state.curve.transfer()
+        return self.model.state.look.transfer()
 
     @property
     def march(self) -> March:
@@ -88,8 +86,7 @@ class NotebookView(ipywidgets.HBox):
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
     def _show(self, frame: Frame) -> None:
-        self._frame = frame
-        self._in_loop(self.canvas.request_draw)
+        self._in_loop(lambda: self.canvas.show(frame.pixels, frame.quality))
 
     def _tell(self, text: str) -> None:
         self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))
@@ -99,12 +96,6 @@ class NotebookView(ipywidgets.HBox):
             call()
         else:
             self._loop.call_soon_threadsafe(call)
-
-    def _present(self) -> None:
-        if self._frame is not None:
-            pixels = self._frame.pixels
-            opaque = np.full((*pixels.shape[:2], 1), 255, np.uint8)
-            self._context.set_bitmap(np.concatenate([pixels, opaque], axis=-1))
 
     def _pointed(self, event: dict[str, Any]) -> None:
         kind, at = event["event_type"], (float(event["x"]), float(event["y"]))
@@ -134,12 +125,6 @@ class NotebookView(ipywidgets.HBox):
 
     def _controls(self) -> list[ipywidgets.Widget]:
         state, choices = self.model.state, self.model.content.choices
-        low, high = state.curve.values[0], state.curve.values[-1]
-        wide = max(high - low, 1e-12)
-        self._window = _slider("window", wide, wide / 100, 4 * wide, wide / 100)
-        self._level = _slider("level", state.curve.level, low - wide, high + wide, wide / 100)
-        for each in (self._window, self._level):
-            each.observe(self._ranged, "value")
         step = ipywidgets.FloatLogSlider(
             value=state.step, base=2, min=-4, max=4, step=0.25, description="step (voxels)", layout=WIDE
         )
@@ -148,13 +133,11 @@ class NotebookView(ipywidgets.HBox):
         light = _box("light", state.lit, lambda on: self.model.change(lit=on))
         reset = ipywidgets.Button(description="reset view", layout={"width": "110px"})
         reset.on_click(lambda _: self._reset())
-        self._rows()
+        self._look = look_controls(self.model)
         return [
             self._status,
             _heading("transfer function"),
-            self._window,
-            self._level,
-            self._points,
+            self._look,
             _heading("march and light"),
             step,
             *(self._switch(name) for name in choices.names),
@@ -169,87 +152,12 @@ class NotebookView(ipywidgets.HBox):
             lambda on: self.model.apply(lambda state: state.with_transform(name, on)),
         )
 
-    def _ranged(self, change: Any) -> None:
-        window, level = self._window.value, self._level.value
-        self._edit(lambda curve: curve.over(window, level))
-
-    def _edit(self, change: Callable[[Curve], Curve]) -> None:
-        """Change the curve, and let the controls show it; not while they are being made to."""
-        if self._quiet:
-            return
-        before = len(self.model.state.curve)
-        self.model.apply(lambda state: replace(state, curve=change(state.curve)))
-        curve = self.model.state.curve
-        if len(curve) != before:
-            self._rows()
-        self._quiet = True
-        try:
-            self._window.value, self._level.value = curve.window, curve.level
-            for index, row in enumerate(self._points.children):
-                if curve.editable:
-                    row.children[0].value = _rounded(curve.values[index])
-        finally:
-            self._quiet = False
-
-    def _rows(self) -> None:
-        """A row of controls for each point."""
-        curve = self.model.state.curve
-        many = ipywidgets.HTML(f"<i>{len(curve)} points: too many to edit</i>")
-        rows = (self._row(curve, index) for index in range(len(curve)))
-        self._points.children = tuple(rows) if curve.editable else (many,)
-
-    def _row(self, curve: Curve, index: int) -> ipywidgets.HBox:
-        value = ipywidgets.FloatText(value=_rounded(curve.values[index]), layout={"width": "70px"})
-        color = ipywidgets.ColorPicker(value=_hex(curve, index), concise=True, layout={"width": "32px"})
-        opacity = ipywidgets.FloatSlider(
-            value=curve.opacity(index),
-            min=0,
-            max=1,
-            step=0.005,
-            readout_format=".3f",
-            layout={"width": "150px"},
-        )
-        more = _button("+", "one more point behind this one")
-        less = _button("−", "remove this point")
-        value.observe(lambda change: self._edit(lambda c: c.changed(index, value=change["new"])), "value")
-        opacity.observe(lambda change: self._edit(lambda c: c.changed(index, opacity=change["new"])), "value")
-        color.observe(
-            lambda change: self._edit(lambda c: c.changed(index, color=_rgb(change["new"]))), "value"
-        )
-        more.on_click(lambda _: self._edit(lambda c: c.split(index)))
-        less.on_click(lambda _: self._edit(lambda c: c.without(index)))
-        return ipywidgets.HBox([value, color, opacity, more, less])
-
 
 def _heading(text: str) -> ipywidgets.HTML:
     return ipywidgets.HTML(f"<b>{text}</b>")
-
-
-def _slider(name: str, value: float, low: float, high: float, step: float) -> ipywidgets.FloatSlider:
-    return ipywidgets.FloatSlider(
-        value=value, min=low, max=high, step=step, description=name, readout_format=".4g", layout=WIDE
-    )
 
 
 def _box(name: str, on: bool, switch: Callable[[bool], Any]) -> ipywidgets.Checkbox:
     box = ipywidgets.Checkbox(value=on, description=name, indent=False, layout=WIDE)
     box.observe(lambda change: switch(bool(change["new"])), "value")
     return box
-
-
-def _button(text: str, tooltip: str) -> ipywidgets.Button:
-    return ipywidgets.Button(description=text, tooltip=tooltip, layout={"width": "30px", "padding": "0"})
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
-
-
-def _hex(curve: Curve, index: int) -> str:
-    return "#" + "".join(f"{round(255 * c):02x}" for c in curve.display_color(index))
-
-
-def _rgb(text: str) -> tuple[float, float, float]:
-    """Of `#rrggbb`."""
-    r, g, b = (int(text[at : at + 2], 16) / 255 for at in (1, 3, 5))
-    return r, g, b

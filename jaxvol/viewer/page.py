@@ -6,7 +6,6 @@ import io
 import logging
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,21 +13,16 @@ from urllib.parse import urlsplit
 import numpy as np
 import viser
 
-from .curve import Curve
 from .drawing import Content
 from .model import Frame, Model
 from .orbit import Orbit
+from .page_look import add_look, answer
 from .state import State
 
 
 HOST = "127.0.0.1"
 
 OWN_NAMES = {HOST, "localhost"}
-
-ADD, REMOVE = "add behind", "remove"
-
-JPEG = {"coarse": 85, "drawing": 88, "fine": 94}
-"""Quality of the images that are sent."""
 
 
 class _Server(viser.ViserServer):
@@ -129,7 +123,7 @@ class _Panel:
         self.status = self.gui.add_markdown("starting …  \n")
         self.model = Model(content, state, self._show, self._tell)
         with self.gui.add_folder("transfer function"):
-            self._look(state.curve)
+            add_look(self.gui, self.model)
         with self.gui.add_folder("march and light"):
             self._march(state)
 
@@ -138,7 +132,7 @@ class _Panel:
         self.model.apply(lambda state: replace(state.with_size(width, height), orbit=orbit))
 
     def _show(self, frame: Frame) -> None:
-        self.client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=JPEG[frame.stage])
+        self.client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=frame.quality)
         self.client.flush()
 
     def _tell(self, text: str) -> None:
@@ -146,89 +140,13 @@ class _Panel:
 
     def _march(self, state: State) -> None:
         step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
-        _answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
+        answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
         for name in self.model.content.choices.names:
             self._switch(name, name in state.on)
         light = self.gui.add_checkbox("light", state.lit)
-        _answer(light, lambda: self.model.change(lit=bool(light.value)))
+        answer(light, lambda: self.model.change(lit=bool(light.value)))
 
     def _switch(self, name: str, on: bool) -> None:
         may_wrap = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", name)  # where words meet
         box = self.gui.add_checkbox(may_wrap, on)
-        _answer(box, lambda: self.model.apply(lambda s: s.with_transform(name, bool(box.value))))
-
-    def _look(self, curve: Curve) -> None:
-        wide = max(curve.window, 1e-12)
-        low, high = curve.values[0] - wide, curve.values[-1] + wide
-        self.window = self.gui.add_slider("window", wide / 100, 4 * wide, wide / 100, wide)
-        self.level = self.gui.add_slider("level", low, high, wide / 100, curve.level)
-        for each in (self.window, self.level):
-            _answer(each, lambda: self._edit(lambda c: c.over(self.window.value, self.level.value)))
-        if not curve.editable:
-            self.gui.add_markdown(f"{len(curve)} points: too many to edit")
-            return
-        self.point = self.gui.add_dropdown("point", _names(curve))
-        self.value = self.gui.add_number("value", curve.values[0])
-        self.color = self.gui.add_rgb("color", _rgb(curve, 0))
-        self.opacity = self.gui.add_slider("opacity", 0.0, 1.0, 0.001, curve.opacity(0))
-        number = self.gui.add_button_group("points", (ADD, REMOVE))
-        _answer(self.point, self._refresh)
-        _answer(self.value, lambda: self._edit(lambda c: c.changed(self._at, value=self.value.value)))
-        _answer(self.opacity, lambda: self._edit(lambda c: c.changed(self._at, opacity=self.opacity.value)))
-        _answer(self.color, lambda: self._edit(lambda c: c.changed(self._at, color=_unit(self.color.value))))
-        change = {ADD: Curve.split, REMOVE: Curve.without}
-        number.on_click(_async(lambda: self._edit(lambda c: change[number.value](c, self._at))))
-
-    @property
-    def _at(self) -> int:
-        """Index of the point that is chosen."""
-        return int(self.point.value.partition(":")[0]) - 1
-
-    def _edit(self, change: Callable[[Curve], Curve]) -> None:
-        """Change the curve, and let the controls show it."""
-        self.model.apply(lambda state: replace(state, curve=change(state.curve)))
-        curve = self.model.state.curve
-        self.window.value, self.level.value = curve.window, curve.level
-        if curve.editable:
-            index = min(self._at, len(curve) - 1)
-            self.point.options = _names(curve)
-            self.point.value = _names(curve)[index]
-            self._refresh()
-
-    def _refresh(self) -> None:
-        """Show the point that is chosen."""
-        curve, index = self.model.state.curve, self._at
-        self.value.value, self.color.value = curve.values[index], _rgb(curve, index)
-        self.opacity.value = curve.opacity(index)
-
-
-def _answer(control: Any, call: Callable[[], Any]) -> None:
-    """Call when a control was changed in the browser; not when this program changed it."""
-
-    @control.on_update
-    async def _(event: Any) -> None:
-        if event.client is not None:
-            call()
-
-
-def _async(call: Callable[[], Any]) -> Callable[[Any], Any]:
-    # viser runs coroutines in its loop, one after the other, and plain functions in any order
-    async def called(_: Any) -> None:
-        call()
-
-    return called
-
-
-def _names(curve: Curve) -> tuple[str, ...]:
-    """Of its points."""
-    return tuple(f"{index + 1}: {value:.5g}" for index, value in enumerate(curve.values))
-
-
-def _rgb(curve: Curve, index: int) -> tuple[int, int, int]:
-    r, g, b = (round(255 * channel) for channel in curve.display_color(index))
-    return r, g, b
-
-
-def _unit(color: tuple[int, int, int]) -> tuple[float, float, float]:
-    r, g, b = (channel / 255 for channel in color)
-    return r, g, b
+        answer(box, lambda: self.model.apply(lambda s: s.with_transform(name, bool(box.value))))

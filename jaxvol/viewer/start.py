@@ -6,16 +6,18 @@ import numpy as np
 
 from .._util.checks import described
 from ..arguments import check_arguments
-from ..automatic import automatic_transfer
+from ..automatic import automatic_transfer, framed, labels_shown, visible_points
 from ..camera import Camera
 from ..compositing import Compositing
+from ..labels import LabelTransferFunction
 from ..lighting import Phong
 from ..lighting.shading import Lighting
 from ..march import March, Transform
 from ..modes import Mode, compositing_of
 from ..occupancy import BLOCK
-from ..space import node_distance
+from ..space import median_node_distance
 from ..transfer import TransferFunction
+from ..transfer2d import TransferFunction2D
 from ..transforms import (
     AdaptiveSampling,
     AlphaCorrection,
@@ -27,8 +29,12 @@ from ..transforms import (
 from ..volume import Volume
 from .curve import Curve
 from .drawing import Content
+from .labelled import Labelled
+from .look import Look
 from .orbit import Orbit
+from .plot import Histogram
 from .state import Choices, State
+from .table import Table
 
 
 OFFERED: tuple[Transform, ...] = (
@@ -43,6 +49,9 @@ OFFERED: tuple[Transform, ...] = (
 
 ON = AlphaCorrection, SpaceLeaping, EarlyTermination
 """Those that are on where no march is given."""
+
+SHOWN = TransferFunction, TransferFunction2D, LabelTransferFunction
+"""Transfer functions of which a viewer can change something."""
 
 STEP = 0.5
 """Voxels between the samples of a fine image where no march is given."""
@@ -62,15 +71,18 @@ def begin(
 ) -> tuple[Content, State]:
     """What is looked at, and how at first. Arguments as for `view`.
 
-    **Raises:** `ValueError` as `render` does, for a transfer function that is no `TransferFunction`, and for
+    **Raises:** `ValueError` as `render` does, for a transfer function of another kind than `SHOWN`, and for
     an orthographic camera."""
-    if transfer is not None and not isinstance(transfer, TransferFunction):
-        raise ValueError(f"the viewer shows a TransferFunction; got {described(transfer)}.")
+    if transfer is not None and not isinstance(transfer, SHOWN):
+        kinds = " or ".join(kind.__name__ for kind in SHOWN)
+        raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
     if not isinstance(volume, Volume):
         check_arguments("view(volume, transfer, camera, march)", volume=volume)
     seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
+    if transfer is None:
+        volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
+        seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
     given = March(1.0) if march is None else march
-    transfer = automatic_transfer(volume) if transfer is None else transfer
     check_arguments(
         "view(volume, transfer, camera, march)",
         volume=volume,
@@ -96,17 +108,27 @@ def begin(
     step = STEP if march is None else float(given.step) / voxel
     state = State(
         Orbit.of(seen),
-        Curve.of(transfer, voxel),
+        _look(transfer, voxel),
         (1, 1),
         1.0,
         frozenset(kind.__name__ for kind in on),
         lit or lighting is not None,
     )
     state = state.with_step(step).with_size(*size)
-    return Content(volume, choices, compositing_of(compositing), (color[0], color[1], color[2])), state
+    look = compositing_of(compositing), (color[0], color[1], color[2])
+    return Content(volume, choices, *look, Histogram.of(volume)), state
+
+
+def _look(transfer: TransferFunction | TransferFunction2D | LabelTransferFunction, voxel: float) -> Look:
+    """What can be changed of a transfer function. `voxel`: the length to which opacities are to refer."""
+    if isinstance(transfer, LabelTransferFunction):
+        return Labelled.of(transfer)
+    if isinstance(transfer, TransferFunction2D):
+        return Table.of(transfer)
+    return Curve.of(transfer, voxel)
 
 
 def _voxel(volume: Volume, march: March) -> float:
-    """World length between nodes: the median, over the volume, of the least distance."""
+    """World length between nodes."""
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
-    return float(np.median(np.asarray(node_distance(march.locate(volume), blocks))))
+    return float(median_node_distance(march.locate(volume), blocks))

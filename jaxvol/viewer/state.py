@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from ..lighting.shading import Lighting
 from ..march import March, Transform
-from .curve import Curve
+from .look import Look
 from .orbit import Orbit
 
 
@@ -17,13 +17,13 @@ SHORTEST, LONGEST = 1 / 16, 16
 class State:
     """All that the controls of a viewer change.
 
-    - `orbit`: the camera. `curve`: the transfer function. `size`: (width, height) of the view, pixels.
+    - `orbit`: the camera. `look`: the transfer function. `size`: (width, height) of the view, pixels.
     - `step`: distance between samples, in voxels.
     - `on`: names of the transforms that are applied. `lit`: whether there is light.
     """
 
     orbit: Orbit
-    curve: Curve
+    look: Look
     size: tuple[int, int]
     step: float
     on: frozenset[str]

@@ -22,7 +22,7 @@ def found(data: np.ndarray, transfer: jv.TransferFunction, allowed: float):
     assert volume.data.dtype == jnp.float32
     camera = jv.Camera.looking_at(volume, (0.5, -1, 0.4), size=(64, 48))
     probe = Probe.of(camera, Affine(volume), jnp.ones((6, 6, 6), bool), 0)
-    return stored(probe, Setting(volume, transfer, Over()), MARCH, None, allowed)
+    return stored(probe, Setting(volume, transfer, Over()), MARCH, allowed)
 
 
 def stretched(top: float, low: float = 0.0) -> tuple[np.ndarray, jv.TransferFunction]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,9 +13,11 @@ from jaxvol.display import to_srgb
 from jaxvol.metrics import rmse
 from jaxvol.viewer.curve import Curve
 from jaxvol.viewer.drawing import Drawing
+from jaxvol.viewer.labelled import Labelled
 from jaxvol.viewer.model import Model
 from jaxvol.viewer.pace import BUDGET, LADDER, Pace
 from jaxvol.viewer.start import begin
+from jaxvol.viewer.table import Table
 from jaxvol.viewer.tiles import SIDE, Grid
 
 
@@ -29,6 +32,10 @@ LOOK = jv.TransferFunction.from_points(
     [(60, (0.1, 0.2, 0.9), 0.0), (90, (0.9, 0.3, 0.1), 0.2), (200, (1, 1, 1), 0.8)]
 )
 MARCH = jv.March(0.4, (jv.AlphaCorrection(), jv.SpaceLeaping()), "midpoint")
+
+
+LABELS = jv.Volume(np.repeat(np.arange(3, dtype=np.uint8), 8)[:, None, None] * np.ones((1, 24, 24), np.uint8))
+"""Slabs of the labels 0, 1 and 2."""
 
 
 def begun(march=MARCH, **more):
@@ -81,10 +88,8 @@ def test_changes_need_no_other_program(shown):
     """What a drag or a slider changes is traced: nothing is compiled again."""
     content, state = shown.model.content, shown.model.state
     changed = state.with_step(state.step * 1.7)
-    changed = replace(
-        changed, orbit=state.orbit.turned(0.1, 0.2).zoomed(1.3), curve=state.curve.over(90, 110)
-    )
-    changed = replace(changed, curve=changed.curve.split(1), size=(517, 333))
+    changed = replace(changed, orbit=state.orbit.turned(0.1, 0.2).zoomed(1.3), look=state.look.over(90, 110))
+    changed = replace(changed, look=changed.look.split(1), size=(517, 333))
     before = Drawing(content, state)
     before.tile(Grid(1, 1, (SIDE, SIDE)), 0, 0)
     compiled: list[str] = []
@@ -98,7 +103,7 @@ def test_changes_need_no_other_program(shown):
     assert after.program == before.program
     assert np.ptp(pixels) > 50
     assert not [event for event in compiled if "compile" in event]
-    state = replace(state, curve=Curve.of(jv.colormap("gray", (0, 255)), 1.0))
+    state = replace(state, look=Curve.of(jv.colormap("gray", (0, 255)), 1.0))
     Drawing(content, state).tile(Grid(1, 1, (SIDE, SIDE)), 0, 0)
     assert [event for event in compiled if "compile" in event]  # it would have been seen
 
@@ -119,7 +124,7 @@ def test_a_drag_turns_the_image_and_a_transform_and_a_point_change_it(shown):
     assert _middle(moved)[0] - _middle(start)[0] == pytest.approx(30, abs=2)
     assert _middle(moved)[1] - _middle(start)[1] == pytest.approx(0, abs=2)
     drawn(lambda s: state)
-    red = drawn(lambda s: replace(s, curve=s.curve.changed(2, color=(1.0, 0.0, 0.0))))
+    red = drawn(lambda s: replace(s, look=s.look.changed(2, color=(1.0, 0.0, 0.0))))
     middle = tuple(n // 2 for n in SIZE[::-1])
     assert red[middle][2] < start[middle][2] - 30  # less blue in what was white
 
@@ -136,7 +141,7 @@ def test_bad_input_changes_nothing_and_is_told(shown):
         lambda s: s.with_step(math.nan),
         lambda s: s.with_step(0),
         lambda s: s.with_size(0, 100),
-        lambda s: replace(s, curve=s.curve.over(-1, 0)),
+        lambda s: replace(s, look=s.look.over(-1, 0)),
     ):
         assert shown.model.apply(change) is not None
     assert shown.model.state is state
@@ -213,14 +218,54 @@ def test_the_pace_settles_on_what_is_fast_enough():
 def test_a_viewer_begins_with_the_automatic_transfer_function():
     _, state = begin(BALL, None, None, None, **HOW)
     _, same = begin(BALL, jv.automatic_transfer(BALL), None, None, **HOW)
-    assert state.curve == same.curve
+    assert state.look == same.look
+
+
+def drawn(volume: jv.Volume, transfer: Any, change: Any = lambda look: look) -> Any:
+    """A tile of a scene from the right side of the slabs, after a change of its look."""
+    camera = jv.Camera.looking_at(volume, (0, 0, 1), view_up=(0, 1, 0))
+    content, state = begin(volume, transfer, camera, MARCH, **{**HOW, "lit": False})
+    state = replace(state, look=change(state.look))
+    return Drawing(content, state).tile(Grid(1, 1, (SIDE, SIDE)), 0, 0).astype(float), state.look
+
+
+def test_a_volume_of_labels_is_shown_by_them_and_one_is_hidden():
+    def blue(image):
+        return np.count_nonzero((image[..., 2] > 1.5 * image[..., 0]) & (image[..., 2] > 80))
+
+    both, look = drawn(LABELS, None)
+    hidden, changed = drawn(LABELS, None, lambda look: look.changed(1, shown=False))
+    fainter, _ = drawn(LABELS, None, lambda look: look.changed(1, opacity=0.02))
+    assert isinstance(look, Labelled)
+    assert look.labels == (1, 2)
+    assert blue(both) > 2000 > 100 > blue(hidden)
+    assert fainter.mean() > both.mean()
+    expected = look.function.with_visibility({1: False})
+    for one, other in zip(*map(jax.tree.leaves, (changed.transfer(), expected)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="there is no label 3; there are 1, 2"):
+        look.changed(3, shown=True)
+    with pytest.raises(ValueError, match="from 0 to 4"):
+        look.changed(1, opacity=math.nan)
+
+
+def test_a_function_of_value_and_magnitude_is_shown_and_its_values_are_moved():
+    given = jv.TransferFunction2D.from_transfer(LOOK, (2.0, 20.0), 0.5)
+    image, look = drawn(BALL, given)
+    moved, changed = drawn(BALL, given, lambda look: look.over(look.window, look.level + 300))
+    assert np.ptp(image) > 50
+    assert np.ptp(moved) == 0  # out of the volume's values
+    assert isinstance(look, Table)
+    np.testing.assert_allclose(look.transfer().extinction, given.extinction)
+    np.testing.assert_allclose(changed.transfer().values, np.asarray(given.values) + 300)
+    assert look.count == "3 x 2 points"
 
 
 def test_what_the_viewer_does_not_show_is_refused():
     with pytest.raises(ValueError, match="volume must be a jaxvol Volume"):
         begin(np.zeros((3, 3, 3)), None, None, None, **HOW)
-    with pytest.raises(ValueError, match="shows a TransferFunction"):
-        begin(BALL, jv.LabelTransferFunction({0: LOOK}), None, None, **HOW)
+    with pytest.raises(ValueError, match="shows a TransferFunction or TransferFunction2D or Label"):
+        begin(BALL, MARCH, None, None, **HOW)
     with pytest.raises(ValueError, match="perspective"):
         begin(BALL, LOOK, jv.Camera.looking_at(BALL, parallel=True), None, **HOW)
     with pytest.raises(ValueError, match="background"):

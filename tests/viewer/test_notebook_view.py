@@ -1,5 +1,6 @@
 """Does the notebook's face hand on what the pointer and the controls do? Without a browser."""
 
+import asyncio
 import sys
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import jaxvol as jv
 
-from .test_model import BALL, LOOK, MARCH
+from .test_model import BALL, LABELS, LOOK, MARCH
 
 
 pytest.importorskip("rendercanvas.anywidget", reason="needs rendercanvas: pip install jaxvol[notebooks]")
@@ -57,30 +58,81 @@ def test_what_is_shown_can_be_rendered(shown):
 
 
 def test_the_controls_of_points_window_and_level_agree(shown):
-    shown._level.value = 150.0
-    assert shown.model.state.curve.level == pytest.approx(150)
-    value, color, opacity, more, _ = shown._points.children[1].children
-    assert value.value == pytest.approx(shown.model.state.curve.values[1])
+    shown._look.level.value = 150.0
+    assert shown.model.state.look.level == pytest.approx(150)
+    value, color, opacity, more, _ = shown._look.points.children[1].children
+    assert value.value == pytest.approx(shown.model.state.look.values[1])
     opacity.value, color.value = 0.5, "#ff0000"
-    assert shown.model.state.curve.opacity(1) == pytest.approx(0.5)
-    assert shown.model.state.curve.colors[1] == pytest.approx((1, 0, 0))
-    last = shown._points.children[2].children[0]
+    assert shown.model.state.look.opacity(1) == pytest.approx(0.5)
+    assert shown.model.state.look.colors[1] == pytest.approx((1, 0, 0))
+    last = shown._look.points.children[2].children[0]
     last.value = last.value + 40
-    assert shown._window.value == pytest.approx(180)
+    assert shown._look.window.value == pytest.approx(180)
     more.click()
-    assert len(shown.model.state.curve) == len(shown._points.children) == 4
-    shown._points.children[0].children[4].click()
-    assert len(shown.model.state.curve) == len(shown._points.children) == 3
+    assert len(shown.model.state.look) == len(shown._look.points.children) == 4
+    shown._look.points.children[0].children[4].click()
+    assert len(shown.model.state.look) == len(shown._look.points.children) == 3
+
+
+def test_the_plot_follows_the_points(shown):
+    plot = shown._look.children[0]
+    before = plot.value
+    assert before.count("<circle") == 2  # the third lies beyond the volume's values
+    shown._look.points.children[1].children[2].value = 0.1
+    assert plot.value != before
+
+
+def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
+    view = jv.view(LABELS, march=MARCH, lit=False, size=(64, 48))
+    try:
+        rows = view._look.children
+        assert [row.children[1].description for row in rows] == ["1", "2"]
+        assert "#1f77b4" in rows[0].children[0].value
+        rows[0].children[1].value = False
+        rows[1].children[2].value = 0.25
+        transfer = view.transfer
+        assert isinstance(transfer, jv.LabelTransferFunction)
+        assert np.asarray(transfer.shown).tolist()[1:3] == [False, True]
+        assert np.asarray(transfer.opacity).tolist()[1:3] == [1.0, 0.25]
+        assert view.volume.labels is not None
+    finally:
+        view.close()
+
+
+def test_the_canvas_waits_for_no_tick(monkeypatch):
+    """An event is handled when it comes, and an image sent in the next turn of the event loop, and once."""
+    from jaxvol.viewer.canvas import PromptCanvas
+
+    sent, handled, pixels = [], [], np.zeros((4, 6, 3), np.uint8)
+    monkeypatch.setattr(PromptCanvas, "send", lambda self, message, buffers: sent.append(message["mimetype"]))
+
+    async def run():
+        canvas = PromptCanvas(size=(6, 4))
+        resized = {"type": "resize", "width": 6, "height": 4, "pwidth": 6, "pheight": 4, "ratio": 1}
+        canvas._rfb_handle_msg(canvas, resized, [])
+        canvas._has_visible_views = True
+        canvas.add_event_handler(handled.append, "pointer_down")
+        canvas.submit_event(pointer("pointer_down", 1, 1))
+        assert len(handled) == 1
+        for quality in (80, 94):
+            canvas.show(pixels, quality)
+            await asyncio.sleep(0)
+        assert canvas._rfb_lossless_draw_info is None
+        assert "this.setThrottle(0)" in canvas._esm
+        canvas._is_closed = True
+
+    asyncio.run(run())
+    assert sent == ["image/jpeg"] * 2
 
 
 @pytest.mark.parametrize(
-    ("call", "module", "face", "extra"),
-    [(jv.view, "rendercanvas", "notebook", "notebooks"), (jv.serve, "viser", "page", "view")],
+    ("call", "module", "extra"), [(jv.view, "rendercanvas", "notebooks"), (jv.serve, "viser", "view")]
 )
-def test_without_the_extra_the_error_says_what_to_install(call, module, face, extra, monkeypatch):
-    for name in [n for n in sys.modules if n.partition(".")[0] == module]:
+def test_without_the_extra_the_error_says_what_to_install(call, module, extra, monkeypatch):
+    for name in [module, *(n for n in sys.modules if n.startswith(f"{module}."))]:
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, f"jaxvol.viewer.{face}", raising=False)
-    monkeypatch.delattr(f"jaxvol.viewer.{face}", raising=False)
+    for own in ("notebook", "canvas", "page"):
+        monkeypatch.delitem(sys.modules, f"jaxvol.viewer.{own}", raising=False)
+        monkeypatch.delattr(f"jaxvol.viewer.{own}", raising=False)
     with pytest.raises(ImportError, match=rf"pip install jaxvol\[{extra}\]"):
         call(BALL)
