@@ -384,8 +384,10 @@ def test_pieces_of_large_files_are_read_from_end_to_end(tmp_path):
 # ---- memory ----
 
 
-@pytest.mark.parametrize("dtype", ["float64", "int64", "uint32"])
-@pytest.mark.parametrize("kind", ["array", "npy", "raw"])
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [("array", "float64"), ("array", "int64"), ("npy", "int64"), ("npy", "uint32"), ("raw", "float64")],
+)
 def test_voxels_that_are_converted_take_little_more_than_what_they_become(kind, dtype, tmp_path, monkeypatch):
     """What is counted of a brick while it is read (`split.COPIES`): itself, and a layer of what is stored."""
     monkeypatch.setattr(sources, "AT_ONCE", 2**15)
