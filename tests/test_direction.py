@@ -13,6 +13,7 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, Phong, PointLight
 from jaxvol.path_tracing.walks import WalkScene
 from jaxvol.space import Affine, world_gradient
+from jaxvol.volume import part_of, with_voxels
 
 from .scenes import SIZE, anisotropic_noise, in_float64, slow, soft_transfer, to_float64
 
@@ -249,6 +250,11 @@ def test_bricks_keep_the_direction():
     whole = jv.render(turned, SPARSE, camera, march)
     parts = jv.render_bricks(turned, SPARSE, camera, march, bricks=(2, 1, 2))
     np.testing.assert_allclose(parts.rgba, whole.rgba, rtol=0, atol=2e-6)
+    # the whole as a part of itself, with its voxels in another order in memory
+    stored = with_voxels(turned, jnp.asarray(turned.data).transpose(1, 2, 0))
+    moved = part_of(stored, jnp.zeros(3, jnp.int32), turned.shape, (1, 2, 0))
+    found = jv.render(moved, SPARSE, camera, march)
+    np.testing.assert_allclose(found.rgba, whole.rgba, rtol=0, atol=2e-6)
 
 
 def test_the_identity_is_no_direction():

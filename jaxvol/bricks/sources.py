@@ -7,7 +7,7 @@ data[x, y, z], whatever the order of axes in a file.
 import math
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -97,22 +97,24 @@ class VoxelSource(ABC):
         time of a single file tell, changed since the source was made.
         """
         box = self._box(low, high)
-        if self.stored_type in (None, self.dtype):
+        if self.stored_type is None or self.stored_type == self.dtype:
             return converted(self._stored(*box, axes), box, axes, self.name)
         voxels = empty_box(*box, axes, self.dtype)
-        slowest, (first, last) = self.order[0], box
-        plane = math.prod(b - a for a, b in zip(*box, strict=True)) // (last[slowest] - first[slowest])
-        of_chunk = plane * self.chunks[slowest] * self.stored_type.itemsize
-        for begin, end in pairwise(
-            cuts(first[slowest], last[slowest], self.chunks[slowest], of_chunk, AT_ONCE)
-        ):
-            low_, high_ = list(first), list(last)
-            low_[slowest], high_[slowest] = begin, end
-            layer = (low_[0], low_[1], low_[2]), (high_[0], high_[1], high_[2])
-            along = axes.index(slowest)
-            there = voxels[(slice(None),) * along + (slice(begin - first[slowest], end - first[slowest]),)]
-            there[:] = converted(self._stored(*layer, axes), layer, axes, self.name)
+        for layer in self._layers_of(box, self.stored_type.itemsize):
+            place = [slice(a - x, b - x) for a, b, x in zip(*layer, box[0], strict=True)]
+            voxels[permuted(place, axes)] = converted(self._stored(*layer, axes), layer, axes, self.name)
         return voxels
+
+    def _layers_of(self, box: Box, of_voxel: int) -> Iterator[Box]:
+        """A box, cut along the first axis of storage into parts of no more than AT_ONCE bytes, or of single
+        chunks. `of_voxel`: bytes of one."""
+        axis, (low, high) = self.order[0], box
+        plane = math.prod(b - a for a, b in zip(low, high, strict=True)) // (high[axis] - low[axis])
+        chunk = self.chunks[axis]
+        for begin, end in pairwise(cuts(low[axis], high[axis], chunk, plane * chunk * of_voxel, AT_ONCE)):
+            first, last = list(low), list(high)
+            first[axis], last[axis] = begin, end
+            yield (first[0], first[1], first[2]), (last[0], last[1], last[2])
 
     def read_async(self, low: Corner, high: Corner, axes: Axes = XYZ) -> "Future[np.ndarray]":
         """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""

@@ -151,6 +151,19 @@ def test_a_surface_does_not_move_with_the_order_of_storage(order):
     np.testing.assert_allclose(found.normal, whole.normal, rtol=0, atol=2e-5)
 
 
+def test_an_image_of_one_channel_of_an_array_of_five_axes(tmp_path):
+    zarr, data = pytest.importorskip("zarr"), noise()
+    array = np.stack([data.T, 255 - data.T])[None]
+    stored = zarr.create_array(
+        store=str(tmp_path / "a.zarr"), shape=array.shape, chunks=(1, 1, 8, 8, 8), dtype="u1"
+    )
+    stored[:] = array
+    how = {"axes": "tczyx", "index": {"c": 1}, "cache": None}
+    found = jv.render_bricks(tmp_path / "a.zarr", TRANSFER, CAMERA, MARCH, **PLACE, **how)
+    whole = jv.render(jv.Volume(255 - data, **PLACE), TRANSFER, CAMERA, MARCH)
+    np.testing.assert_allclose(found.rgba, whole.rgba, atol=2e-6)
+
+
 def test_an_array_of_xarray_is_taken_by_its_names():
     xarray = pytest.importorskip("xarray")
     data = noise()

@@ -63,6 +63,8 @@ def test_a_pixel_at_the_nearest_block_that_is_visible():
     seen = nearest_pixel(source, camera(200), transfer(), summary)
     top = 2 * (200 + 63 - 44) / 100  # the ball's last nodes, at z = 41, lie in the blocks up to 44
     assert seen == pytest.approx(top)
+    coarse = nearest_pixel(source, camera(200), transfer(), scan(source, 16))
+    assert coarse == pytest.approx(2 * (200 + 63 - 48) / 100)
     assert nearest_pixel(source, camera(200), transfer(210.0), summary) == np.inf
     aside = jv.Camera((31.5, 31.5, 263), (500, 31.5, 263), view_up=(0, 0, 1), view_angle=20)
     assert nearest_pixel(source, aside, transfer(), summary) == np.inf

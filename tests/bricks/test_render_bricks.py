@@ -150,10 +150,10 @@ def test_random_splits_and_cameras_look_like_the_whole(engine):
 
 
 @cache
-def of_fog(method, bricks):
+def of_fog(method, bricks, order="C"):
     volume, probe, transfer = fog()
-    march = jv.March(1.0, (probe, jv.Jitter(0)))
-    return jv.render_bricks(volume, transfer, SIDE, march, bricks=bricks, method=method)
+    march, data = jv.March(1.0, (probe, jv.Jitter(0))), np.asarray(volume.data, order=order)
+    return jv.render_bricks(data, transfer, SIDE, march, bricks=bricks, method=method)
 
 
 @cache
@@ -162,9 +162,9 @@ def whole_fog():
     return jv.render(volume, transfer, SIDE, jv.March(1.0, (probe, jv.Jitter(0))))
 
 
-@pytest.mark.parametrize("bricks", [(1, 1, 4), (2, 3, 2)])
-def test_bricks_of_a_curved_grid_are_read_once_each(bricks):
-    found = of_fog("overlap", bricks)
+@pytest.mark.parametrize(("bricks", "order"), [((1, 1, 4), "C"), ((2, 3, 2), "F")])
+def test_bricks_of_a_curved_grid_are_read_once_each(bricks, order):
+    found = of_fog("overlap", bricks, order)
     assert_same(whole_fog(), found)
     assert found.bricks.loads == found.bricks.needed == np.prod(bricks)
     assert found.bricks.reloads == 0
@@ -386,6 +386,10 @@ LABELLED = jv.LabelTransferFunction({1: TRANSFER})
         ({"bricks": (2, 2)}, "bricks must be three numbers"),
         ({"bricks": (0, 1, 1)}, r"bricks must be three numbers .*, each .* at least 1.*; got \(0, 1, 1\)"),
         ({"bricks": (2, 1.5, 2)}, "bricks must be three numbers .* got .*1.5"),
+        (
+            {"bricks": (1000, 1000, 1000)},
+            r"bricks must be no more than 65536 .* got .*1000, 1000\), .* 41 x 35 x 50 voxels into 66640",
+        ),
         ({"method": np.array(["overlap", "reload"])}, "method must be one of overlap, reload, naive"),
         ({"tolerance": "x"}, "tolerance must be"),
         ({"tolerance": -5.0, "level": 0}, "tolerance must be"),
@@ -415,11 +419,22 @@ def test_bad_arguments_are_named(changes, message):
         )
 
 
-def test_too_little_memory_is_named_before_anything_is_read():
-    class Unread(ArraySource):
-        def read(self, *args, **kwargs):
-            raise AssertionError("read")
+class Unread(ArraySource):
+    def read(self, *args, **kwargs):
+        raise AssertionError("read")
 
+
+def test_bricks_that_are_too_large_with_their_overlap_are_named_before_anything_is_read():
+    """Two bricks of a scan, of which the one is read beyond its curved face: by 300 million voxels."""
+    data, probe = np.broadcast_to(np.uint8(0), (1200, 1200, 2400)), fog()[1]
+    given = Unread(data), fog()[2], SIDE, jv.March(0.05, (probe,))
+    with pytest.raises(
+        ValueError, match=r"fewer than 2\*\*31 voxels; got 1200 x 1200 x \d+ along x, y and z"
+    ):
+        jv.render_bricks(*given, bricks=(1, 1, 2))
+
+
+def test_too_little_memory_is_named_before_anything_is_read():
     camera = outside(jv.Volume(balls()), 16)
     with pytest.raises(ValueError, match="memory must be at least"):
         jv.render_bricks(Unread(balls()), TRANSFER, camera, jv.March(1.0), memory=1000)

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 
 import jax.numpy as jnp
 import ml_dtypes
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import files
+from jaxvol.bricks import files, sources
 from jaxvol.bricks.files import FileSource
 from jaxvol.bricks.opening import levels_of, source_of
 from jaxvol.bricks.sources import ArraySource
@@ -132,6 +133,16 @@ def test_a_memory_map_keeps_its_voxels_when_its_file_is_replaced(mode, tmp_path)
     assert isinstance(source_of(mapped), FileSource)
     new.write_bytes(b"\7" * np.prod(SHAPE))
     new.replace(path)
+    source = source_of(mapped)
+    np.testing.assert_array_equal(source.read((0, 0, 0), SHAPE), 1)
+    assert source.fingerprint() is None
+
+
+def test_a_memory_map_keeps_its_voxels_when_its_file_is_deleted(tmp_path):
+    path = tmp_path / "data"
+    path.write_bytes(b"\1" * np.prod(SHAPE))
+    mapped = np.memmap(path, np.uint8, "r", shape=SHAPE)
+    path.unlink()
     source = source_of(mapped)
     np.testing.assert_array_equal(source.read((0, 0, 0), SHAPE), 1)
     assert source.fingerprint() is None
@@ -371,6 +382,30 @@ def test_pieces_of_large_files_are_read_from_end_to_end(tmp_path):
 
 
 # ---- memory ----
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [("array", "float64"), ("array", "int64"), ("npy", "int64"), ("npy", "uint32"), ("raw", "float64")],
+)
+def test_voxels_that_are_converted_take_little_more_than_what_they_become(kind, dtype, tmp_path, monkeypatch):
+    """What is counted of a brick while it is read (`split.COPIES`): itself, and a layer of what is stored."""
+    monkeypatch.setattr(sources, "AT_ONCE", 2**15)
+    data = np.random.default_rng(0).integers(0, 1000, (50, 60, 70)).astype(dtype)
+    np.save(tmp_path / "a.npy", data)
+    source = {
+        "array": lambda: source_of(data),
+        "npy": lambda: source_of(tmp_path / "a.npy"),
+        "raw": lambda: source_of(x_fastest(tmp_path / "a.raw", data), shape=data.shape, dtype=dtype),
+    }[kind]()
+    low, high = (3, 2, 1), (50, 60, 70)
+    tracemalloc.start()
+    found = source.read(low, high, source.order)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < found.nbytes + 6 * 2**15
+    np.testing.assert_array_equal(found, data[3:, 2:, 1:].transpose(source.order))
+    np.testing.assert_array_equal(source.read(low, high, (1, 2, 0)), data[3:, 2:, 1:].transpose(1, 2, 0))
 
 
 @pytest.mark.parametrize("kind", ["raw", "memmap"])

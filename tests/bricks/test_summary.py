@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import streaming, summary_files
+from jaxvol.bricks import streaming, summary as summaries, summary_files
+from jaxvol.bricks.dtypes import range_of
 from jaxvol.bricks.opening import source_of
 from jaxvol.bricks.sources import ArraySource
 from jaxvol.bricks.streaming import slabs
-from jaxvol.bricks.summary import scan
+from jaxvol.bricks.summary import LAYERS, scan
 from jaxvol.bricks.summary_files import summary_of
 from jaxvol.occupancy import BLOCK, Blocks
 
@@ -115,6 +116,35 @@ def test_blocks_equal_those_of_the_volume_in_memory(dtype, shape):
     data = voxels(dtype, shape)
     for memory in (10_000, 10**7):
         assert_equal(scan(source_of(data), memory=memory).blocks(), Blocks.of(jv.Volume(data)))
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_layers_of_16_bit_floats_are_compared_as_float32(dtype):
+    """Of more layers than are converted at a time, the last ones shorter."""
+    data = voxels(dtype, (2 * LAYERS * BLOCK + 7, 5, 9))
+    assert_equal(scan(source_of(data)).blocks(), Blocks.of(jv.Volume(data)))
+    assert range_of(data) == (float(data.min()), float(data.max()))
+    data[70, 3, 8] = np.nan
+    assert np.all(np.isnan(range_of(data)))
+
+
+def test_blocks_are_looked_through_in_parts(monkeypatch):
+    transfer = jv.TransferFunction2D.from_transfer(
+        jv.TransferFunction.from_points([(0, (0, 0, 0), 0.0), (90, (1, 1, 1), 0.5)]), (0.0, 9.0)
+    )
+    summary, asked = scan(source_of(voxels("int8", SHAPE))), []
+    expected = np.asarray(transfer.visible(summary.blocks()))
+
+    def visible(blocks):
+        asked.append(blocks.low.shape)
+        return transfer.visible(blocks)
+
+    np.testing.assert_array_equal(summary.where(visible), expected)
+    assert asked == [expected.shape]
+    monkeypatch.setattr(summaries, "AT_ONCE", 2 * expected[0].size)
+    asked.clear()
+    np.testing.assert_array_equal(summary.where(visible), expected)
+    assert asked == [(2, *expected.shape[1:])] * 3
 
 
 def test_a_real_volume(real_volume):

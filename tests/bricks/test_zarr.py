@@ -12,6 +12,7 @@ import tensorstore
 import zarr
 
 import jaxvol as jv
+from jaxvol.bricks import sources
 from jaxvol.bricks.opening import levels_of, source_of
 from jaxvol.bricks.zarr import ZarrSource
 
@@ -54,6 +55,35 @@ def test_arrays_of_the_zarr_package(dtype, layout, tmp_path):
     assert isinstance(source, ZarrSource)
     assert source.chunks == (8, 8, 16)
     assert_reads(source, data)
+
+
+def test_arrays_that_are_open_are_read_from_their_folder(tmp_path):
+    data = voxels("int16")
+    array = zarr.create_array(
+        tmp_path / "a.zarr",
+        shape=data.T.shape,
+        dtype="i2",
+        chunks=(8, 8, 16),
+        dimension_names=("z", "y", "x"),
+    )
+    array[...] = data.T
+    assert_reads(source_of(array), data)
+    group = zarr.create_group(tmp_path / "b.zarr")
+    inner = group.create_array("inner", shape=SHAPE, dtype="i2", chunks=(8, 8, 16))
+    inner[...] = data
+    assert_reads(source_of(group["inner"]), data)
+    with pytest.raises(ValueError, match=r"axes: .*no such option.*|no image|multiscales"):
+        source_of(group)
+    within = zarr.create_array({}, shape=SHAPE, dtype="i2")
+    with pytest.raises(ValueError, match=r"source: .*Array.* no.* in a folder .* pass the path .*array\[:\]"):
+        source_of(within)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "int64"])
+def test_types_that_are_converted_are_read_layer_by_layer(dtype, tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "AT_ONCE", 2**13)
+    data = np.random.default_rng(0).integers(-99, 99, SHAPE).astype(dtype)
+    assert_reads(source_of(written(tmp_path / "a.zarr", data, (5, 8, 16))), data.astype(np.float32))
 
 
 @pytest.mark.parametrize("dtype", ["int8", "uint16", "float16", "float64", "int32", "bool"])

@@ -132,12 +132,14 @@ def on_each(image: jax.Array) -> np.ndarray:
 
 
 def owned_bricks():
-    """Bricks of four devices, some in front of others on every ray, against the whole volume on one."""
+    """Bricks of four devices, some in front of others on every ray, against the whole volume on one. They are
+    kept as they are stored, with z in front."""
     volume, march = blocks(), jv.March(0.05, MOVING[:3])
     camera = around(volume, SIZE)
     one = jv.render(volume, thin(), camera, march)
+    data, place = np.asfortranarray(volume.data), {"spacing": volume.spacing, "origin": volume.origin}
     found = jv.render_bricks(
-        volume, thin(), camera, march, bricks=(2, 2, 2), devices=all_devices()[:4], own="bricks"
+        data, thin(), camera, march, **place, bricks=(2, 2, 2), devices=all_devices()[:4], own="bricks"
     )
     assert found.bricks.loads == found.bricks.needed == 8
     # leaps end at bricks, so that the number of samples may differ
