@@ -4,6 +4,8 @@ import ast
 import importlib
 import inspect
 import pkgutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -128,3 +130,14 @@ def test_a_class_is_abstract_or_final():
             if base.__module__.startswith("jaxvol") and base not in DO_NOTHING:
                 abstract = inspect.isabstract(base) or bool(getattr(base, "__abstractvars__", ()))
                 assert abstract, f"{kind.__name__} inherits from {base.__name__}, which is not abstract"
+
+
+def test_an_import_computes_nothing():
+    """So that JAX can still be told of other processes, whose devices are to take part."""
+    code = (
+        "import jaxvol, jax, socket; free = socket.create_server(('localhost', 0)); "
+        "port = free.getsockname()[1]; free.close(); "
+        "jax.distributed.initialize(f'localhost:{port}', 1, 0)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr[-2000:]

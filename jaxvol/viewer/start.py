@@ -37,16 +37,6 @@ from .state import Choices, State
 from .table import Table
 
 
-OFFERED: tuple[Transform, ...] = (
-    EmptySpaceJitter(seed=0),
-    Jitter(seed=0),
-    AdaptiveSampling(0.005),
-    AlphaCorrection(),
-    SpaceLeaping(),
-    EarlyTermination(1 / 256),
-)
-"""Transforms that can be turned on, beside those that are given."""
-
 ON = AlphaCorrection, SpaceLeaping, EarlyTermination
 """Those that are on where no march is given."""
 
@@ -95,7 +85,7 @@ def begin(
     if len(color) != 3 or not np.isfinite(color).all():
         raise ValueError(f"background must be linear RGB; got {background!r}.")
     own = {type(transform) for transform in given.transforms}
-    others = tuple(transform for transform in OFFERED if type(transform) not in own)
+    others = tuple(transform for transform in _offered() if type(transform) not in own)
     on = own if march is not None else set(ON)
     voxel = _voxel(volume, given)
     choices = Choices(
@@ -117,6 +107,19 @@ def begin(
     state = state.with_step(step).with_size(*size)
     look = compositing_of(compositing), (color[0], color[1], color[2])
     return Content(volume, choices, *look, Histogram.of(volume)), state
+
+
+def _offered() -> tuple[Transform, ...]:
+    """Transforms that can be turned on, beside those that are given. Not a constant: their arrays are made on
+    a device, and none may be in use before `jax.distributed.initialize`."""
+    return (
+        EmptySpaceJitter(seed=0),
+        Jitter(seed=0),
+        AdaptiveSampling(0.005),
+        AlphaCorrection(),
+        SpaceLeaping(),
+        EarlyTermination(1 / 256),
+    )
 
 
 def _look(transfer: TransferFunction | TransferFunction2D | LabelTransferFunction, voxel: float) -> Look:
