@@ -286,10 +286,10 @@ def transformations():
     every = all_devices()
     one = image(extinctions[0], None)
     np.testing.assert_allclose(jax.jit(image, static_argnums=1)(extinctions[0], tuple(every)), one, atol=1e-6)
-    # batches are rounded otherwise than single images, on one device too
+    # programs for batches of different sizes round differently: samples move by the last bit of a position
     one = jax.vmap(partial(image, given=None))(extinctions)
     for over in (jax.vmap(partial(image, given=every)), jax.jit(jax.vmap(partial(image, given=every)))):
-        np.testing.assert_allclose(over(extinctions), one, atol=1e-6)
+        np.testing.assert_allclose(over(extinctions), one, atol=2e-6)
     slopes = jnp.stack([slope(each, None) for each in extinctions])
     assert_same_gradient(jax.vmap(partial(slope, given=every))(extinctions), slopes)
 
