@@ -215,6 +215,7 @@ def test_leaps_do_not_show(method, jitter):
     assert float(np.sum(leaping.samples)) < 0.7 * float(np.sum(plain.samples))
 
 
+@pytest.mark.slow
 def test_rays_shift_where_nothing_is_crossed():
     """A plane behind empty space: jitter moves the cells, and not the root."""
     volume = ramp(np.append(np.zeros(20), np.linspace(0.0, 1.0, 21)))

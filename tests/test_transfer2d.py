@@ -407,9 +407,13 @@ def leapt() -> Any:
 @pytest.mark.parametrize(
     ("make", "adjoint", "lit"),
     [
-        (smooth, "replay", False),
         (of_bytes, "replay", False),
-        *slow((smooth, "replay", True), (smooth, "forward", False), (smooth, "direct", False)),
+        *slow(
+            (smooth, "replay", False),
+            (smooth, "replay", True),
+            (smooth, "forward", False),
+            (smooth, "direct", False),
+        ),
         *slow((leapt, "replay", False), (leapt, "forward", False), (leapt, "replay", True)),
     ],
 )

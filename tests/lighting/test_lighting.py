@@ -819,7 +819,7 @@ def loss_of_an_image(kind, lighting, points=8):
     return loss, (volume, transfer, camera)
 
 
-@pytest.mark.parametrize(("kind", "points"), [("uint8", 8), ("float32", 40), *slow(("float32", 8))])
+@pytest.mark.parametrize(("kind", "points"), [("uint8", 8), *slow(("float32", 40), ("float32", 8))])
 def test_there_is_a_gradient_of_an_image_by_baked_light(kind, points):
     """A slow test below checks its values, which take minutes to compile."""
     loss, scene = loss_of_an_image(kind, by_hand(baked=8), points)

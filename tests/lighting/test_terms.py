@@ -121,7 +121,7 @@ def test_the_photons_that_are_needed_are_those_above_the_cutoff():
     assert needed == [7, 6, 3, 0]
 
 
-@pytest.mark.parametrize("occlusion", ["hard", "soft"])
+@pytest.mark.parametrize("occlusion", ["hard", *slow("soft")])
 def test_samples_shaded_together_are_shaded_as_each_alone(occlusion):
     """In groups that need all photons, some of them, and none."""
     for bright in (1.0, 0.3, 0.1, 0.05):
@@ -163,6 +163,7 @@ def lit(lighting, points=64):
     return np.stack(jax.jit(lambda s: shader(s))(samples_in(shader.around, np.ones(points))), axis=-1)
 
 
+@pytest.mark.slow
 def test_one_template_for_a_material_is_the_first_for_all_pixels():
     first = jax.tree.map(lambda leaf: leaf[:, :1], TEMPLATES)
     for_material, alone, for_pixel = (

@@ -472,6 +472,7 @@ def test_it_follows_tolerance_and_transfer_function_in_one_program():
     assert kind.traces == 2  # one outside `jax.jit`, one inside
 
 
+@pytest.mark.slow
 def test_tolerances_may_be_vmapped_over():
     scene = changed(scene_of())
     tolerances = jnp.asarray([0.1, 0.01])
