@@ -404,17 +404,15 @@ def leapt() -> Any:
     return of_bytes(jv.SpaceLeaping())
 
 
+HOW = ("replay", False), ("forward", False)
+
+
 @pytest.mark.parametrize(
     ("make", "adjoint", "lit"),
     [
         (of_bytes, "replay", False),
-        *slow(
-            (smooth, "replay", False),
-            (smooth, "replay", True),
-            (smooth, "forward", False),
-            (smooth, "direct", False),
-        ),
-        *slow((leapt, "replay", False), (leapt, "forward", False), (leapt, "replay", True)),
+        *slow(*((smooth, *how) for how in (*HOW, ("replay", True), ("direct", False)))),
+        *slow(*((leapt, *how) for how in (*HOW, ("replay", True)))),
     ],
 )
 def test_gradients_match_central_differences(make, adjoint, lit):

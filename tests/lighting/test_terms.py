@@ -28,7 +28,7 @@ from jaxvol.lighting.shading import (
 )
 from jaxvol.space import Affine
 
-from ..scenes import scaled_phantom, soft_transfer
+from ..scenes import scaled_phantom, slow, soft_transfer
 
 
 FLESH = Material(0.5, 0.15, 1.4)
