@@ -338,7 +338,7 @@ MUTATIONS = [
     Mutation(
         "sources: NaN in a brick is not noticed",
         "bricks/dtypes.py",
-        "if not fine:",
+        "if not np.all(np.isfinite(range_of(voxels))):",
         "if False:",
         ("bricks/test_sources.py::test_a_voxel_that_is_not_finite_is_refused_with_its_place[nan-float32]",),
     ),
