@@ -79,11 +79,11 @@ def render_bricks(
     The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
     is read. Of each ray it is kept how far it has come. A brick that no ray needs is not read: one in which
     nothing is visible, outside of the view, or behind what is opaque. The image is that of `render`, lit or
-    not, whatever the bricks and the order in which voxels are stored. In float32 colours and opacity agree to
-    2e-5, the components of a normal to 2e-5, and depth to 1e-6 of itself, as far as floats resolve it (voxels
-    of three real volumes, from far away and inside: 7e-6, 0 and 1 ulp). `samples` may be others, since what
-    is empty is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray whose
-    last samples would lie in empty bricks is not exhausted here.
+    not, whatever the bricks and the order in which voxels are stored. In float32, colours, opacity and the
+    components of a normal agree to 2e-5, and depth to 1e-6 of itself, some units in its last place (seen in
+    three real volumes, from outside, far away and inside: 7e-6, 0 and 8e-8). `samples` may be others, since
+    what is empty is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray
+    whose last samples would lie in empty bricks is not exhausted here.
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
