@@ -378,7 +378,9 @@ def _lit(
         change = 4 / 3 * probe.distance(image, finer)
         if change <= allowed:
             break
-        why = f"with light, twice the step changes the image by {change:.2g}"
+        longer = f"step {float(march.step):.4g}"
+        parts[:] = [part._replace(kept=part.kept and part.name != longer) for part in parts]
+        why = f"halved: with light, twice as long steps change the image by {change:.2g}"
         parts.append(Part(f"step {float(half.step):.4g}", True, why))
         image, march, change = finer, half, change / 3
     samples = probe.mean(image.samples)
