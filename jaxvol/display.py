@@ -88,7 +88,11 @@ def save_image(
     shapes = [SHAPES[count] for count in sorted(held, key=(3, 4, 0).index)]
     if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in held):
         where = f" for a {Path(path).suffix.lower()}" if len(held) < len(SHAPES) else ""
-        hint = " One channel, such as a depth, is written as .tif or .npy." if channels == 0 else ""
+        hint = (
+            " One channel is written as .tif or .npy; repeat it for a grey picture of three."
+            if channels == 0
+            else ""
+        )
         raise ValueError(f"image{where} must have shape {' or '.join(shapes)}; got {image.shape}.{hint}")
     path = image_file("path", path, channels)
     bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
@@ -197,7 +201,7 @@ CHANNELS: dict[str, tuple[int, ...]] = {
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
     """Check that an image with this many channels can be written to `path`, before it is rendered."""
-    path, what = Path(path), {0: "depth", 3: "colours", 4: "colours and opacity"}[channels]
+    path, what = Path(path), {0: "one channel", 3: "colours", 4: "colours and opacity"}[channels]
     allowed = [ending for ending, counts in CHANNELS.items() if channels in counts]
     if path.suffix.lower() not in allowed:
         raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(allowed)}; got {path}.")

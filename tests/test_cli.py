@@ -1,6 +1,7 @@
 """The command line, run as users run it."""
 
 import contextlib
+import html
 import json
 import re
 import signal
@@ -33,7 +34,7 @@ def scene_of(volume_file):
 SMALL = ["--size", "40", "30", "--resolution", "24"]
 
 
-def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
+def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys, monkeypatch):
     assert main(["demo", "-o", str(tmp_path / "demo"), *SMALL, "--only", "head", "grain"]) == 0
     printed = capsys.readouterr().out
     for name in ("head.png", "before.png", "after.png"):
@@ -46,6 +47,13 @@ def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
     page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
     assert sorted(re.findall(r'src="([^"]+)"', page)) == ["after.png", "before.png", "head.png"]
     assert "http" not in page  # no network
+    shown = [html.unescape(code) for code in re.findall("<pre>(.*?)</pre>", page, re.DOTALL)]
+    assert len(shown) == 2
+    monkeypatch.chdir(tmp_path)
+    for code in shown:  # makes the same pictures
+        exec(code, {})
+    for name in ("head.png", "before.png", "after.png"):
+        np.testing.assert_array_equal(imread(tmp_path / name), imread(tmp_path / "demo" / name))
     assert main(["render", "--like", str(tmp_path / "demo" / "head.png")]) == 2
     assert "was made by: jaxvol demo --only head grain --resolution 24 --size 40 30. Run that." in (
         capsys.readouterr().err
@@ -55,6 +63,9 @@ def test_demo_writes_pictures_and_says_what_it_took(tmp_path, capsys):
 @pytest.mark.slow
 def test_demo_fits_a_transfer_function(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path), *SMALL, "--only", "fit"]) == 0
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    (code,) = re.findall("<pre>(.*?)</pre>", page, re.DOTALL)
+    compile(html.unescape(code), "page", "exec")
     true, found, start = (
         imread(tmp_path / f"fit_{name}.png").astype(float) for name in ("true", "found", "start")
     )
@@ -434,7 +445,7 @@ BAD = {
         ["FILE", "--transparent", "-o", "x.jpg"],
         "colours and opacity must end in one of .png",
     ),
-    "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of depth must end in one of .tif"),
+    "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of one channel must end in one of .tif"),
     "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
     "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
     "no transfer": (["FILE", "--transfer", "nowhere.json"], "nowhere.json cannot be read"),

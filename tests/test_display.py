@@ -86,7 +86,7 @@ BAD = {
         "x.png",
         np.zeros((4, 5)),
         r"image for a \.png must have shape \(height, width, 3\) or \(height, width, 4\); got \(4, 5\)\. "
-        r"One channel, such as a depth, is written as \.tif or \.npy",
+        r"One channel is written as \.tif or \.npy; repeat it",
     ),
     "NaN depth": ("x.npy", np.full((4, 4), np.nan), "image must not be NaN"),
     "a folder": (

@@ -35,18 +35,8 @@ PANELS = {
 }
 """How many pictures of scenes stand side by side, and below each other, on pages of several."""
 
-STALE = {
-    "experiments/results/path_traced.png",
-    "experiments/results/tomography.png",
-}
-"""Pictures that were kept before their scripts drew larger ones. Drawn anew, they are to be left out here."""
 
-
-def _marked(name):
-    return pytest.param(name, marks=pytest.mark.xfail(strict=True)) if name in STALE else name
-
-
-@pytest.mark.parametrize("name", map(_marked, PICTURES))
+@pytest.mark.parametrize("name", PICTURES)
 def test_no_picture_is_smaller(name):
     height, width = imread(ROOT / name).shape[:2]
     columns, rows = PANELS.get(name, (1, 1))

@@ -15,7 +15,7 @@ from .._util.checks import integer, output_file
 from .._util.whole_files import whole_file, whole_folder
 from ..display import displayed, save_image
 from .frames import frames_of
-from .options import scene_options, view_options
+from .options import add_output, scene_options, view_options
 from .orbit import angles_of, axis_of, turned, views_of
 from .progress import working
 from .recorded import checksum, settings_of, text_of, transfer_from_file
@@ -36,15 +36,8 @@ def add_animate(commands: Any, shared: argparse.ArgumentParser) -> None:
         help="render a volume file from a camera that turns about it",
         description="Render a volume file from a camera that turns about it.",
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=Path("orbit.gif"),
-        metavar="FILE",
-        help="what to write: .gif, .mp4 (needs jaxvol[video]), or a folder, of one .png for each frame; "
-        "default: %(default)s",
-    )
+    kinds = ".gif, .mp4 (needs jaxvol[video]), or a folder, of one .png for each frame"
+    add_output(parser, "orbit.gif", f"what to write: {kinds}")
     parser.add_argument("--frames", type=int, default=36, help="number of images (default: 36)")
     parser.add_argument(
         "--degrees", type=float, default=360, help="angle that the camera turns about --axis (default: 360)"

@@ -4,7 +4,6 @@ import argparse
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,6 +27,7 @@ from ..transforms.alpha_correction import AlphaCorrection
 from ..volume import Volume
 from .demo_page import page
 from .frames import FAST, Frames
+from .options import add_output, add_size
 from .progress import working
 from .recorded import settings_of, text_of
 from .render import rendered
@@ -42,8 +42,8 @@ def add_demo(commands: Any, shared: argparse.ArgumentParser) -> None:
     parser = commands.add_parser(
         "demo", parents=[shared], help="show what the toolkit does", description=text
     )
-    parser.add_argument("-o", "--output", type=Path, default=Path("jaxvol-demo"), metavar="FOLDER")
-    parser.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
+    add_output(parser, "jaxvol-demo", "where to write", "FOLDER")
+    add_size(parser)
     parser.add_argument("--resolution", type=int, default=320, help="voxels per axis of the head")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="some of the pictures")
     parser.set_defaults(run=_demo)
@@ -60,7 +60,9 @@ def _demo(options: argparse.Namespace) -> None:
         said: dict[str, str] = {}
         for part in options.only:
             said |= PARTS[part](options, save)
-        (folder / "index.html").write_text(page(said), encoding="utf-8")
+        (folder / "index.html").write_text(
+            page(said, options.resolution, tuple(options.size)), encoding="utf-8"
+        )
     print(f"open {options.output / 'index.html'}")
 
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 
 class Section(NamedTuple):
-    """A part of the page: pictures in a row, each with a caption."""
+    """A part of the page: pictures in a row, each with a caption, and the code that makes them, where
+    RESOLUTION and SIZE stand for the numbers that were given."""
 
     title: str
     text: str
@@ -26,9 +27,10 @@ import numpy as np
 import jaxvol as jv
 from scipy.ndimage import gaussian_filter
 
-phantom = jv.phantom("head", 320)
-smooth = gaussian_filter(np.asarray(phantom.data, np.float32), 1.5)
-head = jv.Volume(smooth, phantom.spacing, phantom.origin)
+phantom = jv.phantom("head", RESOLUTION)
+# 16 bits hold 128 levels for each of the phantom's
+smooth = gaussian_filter(128 * np.asarray(phantom.data, np.float32), 1.5)
+head = jv.Volume(np.round(smooth).astype(np.uint16), phantom.spacing, phantom.origin)
 march = jv.March(
     float(head.spacing[0]) / 3,
     (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()),
@@ -36,8 +38,8 @@ march = jv.March(
 )
 rendering = jv.render(
     head,
-    jv.preset("head", unit_distance=0.01),
-    jv.Camera.looking_at(head, (0.65, -1, 0.15)).zoom(1.65),
+    jv.preset("head", (0, 128 * 255), unit_distance=0.01),
+    jv.Camera.looking_at(head, (0.65, -1, 0.15), size=SIZE).zoom(1.65),
     march,
     lighting=jv.lighting.Phong(),
 )
@@ -50,11 +52,14 @@ jv.save_png("head.png", rendering.image(background=(1, 1, 1)))""",
         "the same step exact there; nothing else is changed.",
         {"before": "No transform", "after": "AlphaCorrection()"},
         """\
+import jaxvol as jv
+
 cube = jv.phantom("linear", 64)
 look = jv.TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
-camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0)).zoom(1.05)
-for transforms in ((), (jv.AlphaCorrection(),)):
-    rendering = jv.render(cube, look, camera, jv.March(0.25, transforms))""",
+camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=SIZE).zoom(1.05)
+for name, transforms in (("before", ()), ("after", (jv.AlphaCorrection(),))):
+    rendering = jv.render(cube, look, camera, jv.March(0.25, transforms))
+    jv.save_png(f"{name}.png", rendering.image(background=(0, 0, 0)))""",
     ),
     Section(
         "A fit by gradients, in seconds",
@@ -63,10 +68,20 @@ for transforms in ((), (jv.AlphaCorrection(),)):
         "renderer. The view below was in none of the images.",
         {"fit_start": "Where it began", "fit_found": "What it found", "fit_true": "The truth"},
         """\
-march = jv.March(step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
+import jaxvol as jv
+
+engine = jv.phantom("engine", 48)
+true = jv.preset("engine", unit_distance=0.04)
+fast = (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination())
+march = jv.March(float(engine.spacing[0]) / 2, fast, "midpoint")
+sides = (0.5, -1, 0.4), (-1, -0.3, 0.5)
+cameras = [jv.Camera.looking_at(engine, side, size=(48, 48)).zoom(1.4) for side in sides]
+views = [(c, jv.render(engine, true, c, march).image(background=(1, 1, 1))) for c in cameras]
 residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
 found = jv.fit(residual, jv.flat_grey(engine, points=8), max_steps=12)
-found.parameters  # a TransferFunction""",
+unseen = jv.Camera.looking_at(engine, (0.8, 0.9, 0.7), size=SIZE).zoom(1.4)
+rendering = jv.render(engine, found.parameters, unseen, march)
+jv.save_png("fit_found.png", rendering.image(background=(1, 1, 1)))""",
     ),
 )
 
@@ -81,8 +96,9 @@ pre { background: #f5f5f5; padding: 0.8rem 1rem; overflow-x: auto; font-size: 0.
 """
 
 
-def page(said: Mapping[str, str]) -> str:
-    """The page. `said`: the names of the pictures that there are, each with what it took."""
+def page(said: Mapping[str, str], resolution: int, size: tuple[int, int]) -> str:
+    """The page. `said`: the names of the pictures that there are, each with what it took. `resolution` and
+    `size`: with which they were made."""
     body = [
         "<h1>What jaxvol does</h1>",
         "<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render "
@@ -95,7 +111,8 @@ def page(said: Mapping[str, str]) -> str:
             body.append(f"<h2>{section.title}</h2>\n<p>{html.escape(section.text)}</p>")
             figures = "".join(_figure(name, text, said[name]) for name, text in there.items())
             body.append(f'<div class="row{" three" if len(there) > 2 else ""}">{figures}</div>')
-            body.append(f"<pre>{html.escape(section.code)}</pre>")
+            code = section.code.replace("RESOLUTION", str(resolution)).replace("SIZE", str(size))
+            body.append(f"<pre>{html.escape(code)}</pre>")
     head = f'<meta charset="utf-8"><title>jaxvol demo</title><style>{STYLE}</style>'
     text = "\n".join(body)
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{text}\n</body></html>\n'

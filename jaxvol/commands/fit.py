@@ -9,7 +9,7 @@ from ..fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, 
 from ..march import March
 from .data import volume_of
 from .frames import FAST
-from .options import scene_options
+from .options import add_clim, add_output, scene_options
 from .progress import working
 
 
@@ -30,13 +30,7 @@ def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
         help="a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
         "parallel_scale, window",
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=Path("transfer.json"),
-        help="JSON to write (default: %(default)s)",
-    )
+    add_output(parser, "transfer.json", "JSON to write")
     start = parser.add_argument_group("start")
     start.add_argument(
         "--start", type=Path, metavar="JSON", help="a transfer function written by this command"
@@ -44,9 +38,7 @@ def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
     start.add_argument(
         "--points", type=int, default=8, help="else, flat grey with this many points (default: 8)"
     )
-    start.add_argument(
-        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of their values (default: all)"
-    )
+    add_clim(start, "range of their values (default: all)")
     solver = parser.add_argument_group("solver")
     solver.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
     solver.add_argument("--max-steps", type=int, default=100)

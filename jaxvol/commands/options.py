@@ -28,6 +28,22 @@ def shared_options() -> argparse.ArgumentParser:
     return shared
 
 
+def add_output(parser: argparse.ArgumentParser, default: str, kind: str, metavar: str = "FILE") -> None:
+    """Add where a command writes. `kind`: what it writes, for the help."""
+    text = f"{kind} (default: %(default)s)"
+    parser.add_argument("-o", "--output", type=Path, default=Path(default), metavar=metavar, help=text)
+
+
+def add_size(parser: argparse.ArgumentParser) -> None:
+    """Add the size of an image."""
+    parser.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
+
+
+def add_clim(group: argparse._ArgumentGroup, text: str) -> None:
+    """Add a range of values. `text`: of what, for the help."""
+    group.add_argument("--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help=text)
+
+
 def scene_options() -> argparse.ArgumentParser:
     """Options of all commands that render a volume file."""
     scene = argparse.ArgumentParser(add_help=False)
@@ -46,7 +62,7 @@ def scene_options() -> argparse.ArgumentParser:
 def view_options() -> argparse.ArgumentParser:
     """Options of all commands that look at a volume through a camera."""
     view = argparse.ArgumentParser(add_help=False, parents=[transfer_options()])
-    view.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
+    add_size(view)
     view.add_argument(
         "--like",
         type=Path,
@@ -108,9 +124,7 @@ def transfer_options() -> argparse.ArgumentParser:
         "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"
     )
     group.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
-    group.add_argument(
-        "--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of values that it covers"
-    )
+    add_clim(group, "range of values that it covers")
     group.add_argument("--unit-distance", type=float, help="length to which opacities refer (default: 1)")
     return look
 

@@ -14,7 +14,7 @@ from ..display import image_file, save_image
 from ..rendering import Rendering
 from ..unseen import why_unseen
 from .frames import Frames, frames_of
-from .options import scene_options, view_options
+from .options import add_output, scene_options, view_options
 from .orbit import axis_of, turned, views_of
 from .progress import working
 from .recorded import settings_of, text_of, transfer_from_file
@@ -31,14 +31,9 @@ def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=Path("out.png"),
-        metavar="FILE",
-        help="image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32); default: "
-        "%(default)s. A .png holds the options that made it: see --like",
+    kinds = ".png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32)"
+    add_output(
+        parser, "out.png", f"image to write: {kinds}. A .png holds the options that made it: see --like"
     )
     parser.add_argument(
         "--transparent",

@@ -378,7 +378,9 @@ def _lit(
         change = 4 / 3 * probe.distance(image, finer)
         if change <= allowed:
             break
-        why = f"with light, twice the step changes the image by {change:.2g}"
+        longer = f"step {float(march.step):.4g}"
+        parts[:] = [part._replace(kept=part.kept and part.name != longer) for part in parts]
+        why = f"halved: with light, twice as long steps change the image by {change:.2g}"
         parts.append(Part(f"step {float(half.step):.4g}", True, why))
         image, march, change = finer, half, change / 3
     samples = probe.mean(image.samples)
@@ -407,10 +409,11 @@ def _fastest(probe: Probe, setting: Setting, march: March) -> float:
 
 def _seconds(trials: Trials, chosen: Trial) -> float:
     """Time of an image on this machine, to within a factor of some 2. What a sample costs is taken from two
-    steps, so that calls, which take as long for a few pixels as for an image, do not count."""
+    steps, so that calls, which take as long for a few pixels as for an image, do not count. The program of
+    their images was compiled for another one before."""
     times, samples = [], []
     for step in trials.steps("midpoint"):
-        times.append(_fastest(trials.probe, trials.setting, trials.march(step)))
+        times.append(trials.seconds["midpoint", step])
         samples.append(float(np.asarray(trials.image(step, "midpoint").samples, np.float64).sum()))
     pixels = trials.probe.pixels
     if samples[0] <= 1.1 * samples[1]:  # nothing is seen

@@ -1,10 +1,12 @@
 """Which steps, quadratures and strides are within a tolerance, and what do they cost?"""
 
 import math
+import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from ..compositing import Over
@@ -55,6 +57,7 @@ class Trials:
 
     - `goal`: the error that they may have. `beyond`: that of the image, above which the plan fails.
     - `voxel`: world length that steps are counted in. `transforms`: of all marches.
+    - `seconds`: that each image took, by quadrature and step, compilation included where there was any.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class Trials:
     ):
         self.probe, self.setting, self.goal, self.beyond = probe, setting, goal, beyond
         self.voxel, self.transforms = voxel, transforms
+        self.seconds: dict[tuple[Quadrature, float], float] = {}
         self._images: dict[tuple[Quadrature, float], Rendering] = {}
 
     def march(self, step: float, quadrature: Quadrature = "midpoint", *more: Transform) -> March:
@@ -77,8 +81,10 @@ class Trials:
     def image(self, step: float, quadrature: Quadrature) -> Rendering:
         """Of steps of this length, in voxels."""
         if (quadrature, step) not in self._images:
-            march = self.march(step, quadrature)
-            self._images[quadrature, step] = self.probe.render(self.setting, march)
+            march, begun = self.march(step, quadrature), time.perf_counter()
+            image = jax.block_until_ready(self.probe.render(self.setting, march))
+            self._images[quadrature, step] = image
+            self.seconds[quadrature, step] = time.perf_counter() - begun
         return self._images[quadrature, step]
 
     def steps(self, quadrature: Quadrature) -> tuple[float, float]:

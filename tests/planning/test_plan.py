@@ -160,6 +160,34 @@ def test_a_narrow_peak_is_integrated(sphere):
 
 
 @pytest.mark.slow
+def test_for_one_image_no_other_program_is_tried(sphere):
+    """The midpoint rule is within this tolerance, too, if with more samples."""
+    volume, _, camera = sphere
+    peak = jv.TransferFunction([0.0, 0.3, 0.4, 0.5, 1.0], np.full((5, 3), 0.8), [0.0, 0.0, 60.0, 0.0, 0.0])
+    found = jv.plan(volume, peak, camera, TOLERANCE, once=True)
+    assert found.within
+    assert found.march.quadrature == "midpoint"
+    assert any("not tried for one image" in part.why for part in found.parts)
+    assert error_of(found, volume, peak, camera) <= TOLERANCE
+
+
+@pytest.mark.slow
+def test_light_without_variants_is_in_the_error(sphere):
+    volume, transfer, camera = sphere
+    light = jv.lighting.Phong()
+    found = jv.plan(volume, transfer, camera, TOLERANCE / 2, lighting=light, once=True)
+    fine = jv.March(float(volume.spacing.min()) / 32, (jv.AlphaCorrection(),), "midpoint")
+    image, truth = (
+        jv.render(volume, transfer, camera, march, lighting=light) for march in (found.march, fine)
+    )
+    error = max(rmse(image.image(c), truth.image(c)) for c in ((0, 0, 0), (1, 1, 1)))
+    assert found.within
+    assert found.lighting is light
+    assert "light: as given" in str(found)
+    assert TOLERANCE / 20 < error <= found.error <= TOLERANCE / 2
+
+
+@pytest.mark.slow
 def test_colours_above_1_let_rays_end_later(sphere):
     volume, _, camera = sphere
     thick = soft_transfer(0.05)
