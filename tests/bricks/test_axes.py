@@ -140,7 +140,8 @@ def lit_surface():
     return jv.render(jv.Volume(steep(), **PLACE), COLORS, CAMERA, MARCH, **LIT)
 
 
-@pytest.mark.parametrize("order", ["yzx", *slow("xyz", "xzy", "yxz", "zxy", "zyx")])
+@pytest.mark.slow  # as users compile: by the fast tests' programs sums are rounded in other orders
+@pytest.mark.parametrize("order", ["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"])
 def test_a_surface_does_not_move_with_the_order_of_storage(order):
     axes: Any = tuple("xyz".index(name) for name in order)
     data, whole = stored_in(steep(), axes), lit_surface()
