@@ -83,7 +83,9 @@ def render_bricks(
     components of a normal agree to 2e-5, and depth to 1e-6 of itself, some units in its last place (seen in
     three real volumes, from outside, far away and inside: 7e-6, 0 and 8e-8). `samples` may be others, since
     what is empty is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray
-    whose last samples would lie in empty bricks is not exhausted here.
+    whose last samples would lie in empty bricks is not exhausted here. `error`, under `AdaptiveSampling`, is
+    another estimate of the same error, above or below that of `render` (of ultrasound, at a tolerance of
+    0.003: from 0.004 above to 0.018 below, where the largest was 0.03).
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
@@ -129,7 +131,8 @@ def render_bricks(
       `ToroidalMap`), and what a ray shows must not depend on what lies in front but by its transmittance
       (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by `"over"`). An `EarlyTermination` sees what
       is in front on the same device alone: up to `opacity_left` of the colours behind are added, which one
-      device leaves out. Each device keeps some 300 bytes for each pixel. No gradients.
+      device leaves out, and depth changes with them. Without it, depth agrees to 1e-5 of itself (8e-6 seen,
+      by an eye within the volume). Each device keeps some 300 bytes for each pixel. No gradients.
 
     **Returns:** as `render`, and in `Rendering.bricks` what it took.
 
