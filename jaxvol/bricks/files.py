@@ -203,7 +203,7 @@ def raw(
     if path.name.lower().endswith(".gz"):
         raise ValueError(
             f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: "
-            f"gunzip {path}."
+            f"gunzip -k {path}."
         )
     (nx, ny, nz), stored, fields = raw_header(path, Header(shape, dtype), 48)
     check_size(path, file_size(path), nx * ny * nz * stored.itemsize)

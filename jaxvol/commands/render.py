@@ -104,7 +104,13 @@ def rendered(
     if frames.source is not None:
         bricks = rendering.bricks
         counts = " x ".join(map(str, bricks.counts))
-        print(f"{path}: {bricks.loads} bricks of {counts} read, {bricks.bytes_read} bytes")
+        print(f"{path}: {bricks.loads} of {counts} bricks read, {bricks.bytes_read} bytes")
+        if frames.volume.shape != shape:
+            copy = " x ".join(map(str, frames.volume.shape))
+            print(
+                f"{path}: what was not given (transfer function, view, step) was chosen by {copy} of the "
+                "voxels; the whole volume may call for another choice"
+            )
     if np.any(rendering.exhausted):
         print(
             f"{path}: incomplete: rays used up their {frames.march.most_samples} samples; use a longer step"
