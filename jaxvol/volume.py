@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
-from ._util.axes import Axes
+from ._util.axes import XYZ, Axes
 from ._util.checks import Arrayable, described, finite_array, is_traced, require
 from ._util.named_axes import along_xyz, is_named
 from ._util.vec3 import Scalar, Vec3
@@ -120,7 +120,9 @@ class Volume(eqx.Module):
 
     def in_grid_order(self, of_data: Array) -> Array:
         """What was computed of parts of `data`, with its last three axes along x, y, z: `data` may be a part
-        of a grid that is kept in the order of storage (`part_of`)."""
+        of a grid that is kept in the order of storage (`part_of`). The same array, if they are."""
+        if self.fetch.axes == XYZ:
+            return of_data
         return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
 
     @property

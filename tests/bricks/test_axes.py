@@ -123,10 +123,10 @@ def test_images_do_not_depend_on_the_order_of_storage(tmp_path, bricks):
         assert found.bricks.stored == SHAPE, name  # with what is read around bricks
 
 
-ORDERS = "xyz", "xzy", "yxz", "yzx", "zxy", "zyx"
+WORDS = "xyz", "xzy", "yxz", "yzx", "zxy", "zyx"
 
 
-@pytest.mark.parametrize(("order", "least"), [("yzx", 0), *slow(*((order, 60000) for order in ORDERS))])
+@pytest.mark.parametrize(("order", "least"), [("yzx", 0), *slow(*((order, 60000) for order in WORDS))])
 def test_a_lit_surface_does_not_depend_on_the_order_of_storage(order, least):
     """From 60 000 on, values are so large against their differences that their rounding moves a surface by
     1e-3 of a voxel, and turns the normal and the light by more than images may differ. (The fast tests'
