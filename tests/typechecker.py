@@ -10,8 +10,8 @@ check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 class InnerFunctions:
     """Whether functions inside others are checked, too.
 
-    They are made anew in each call of the outer function. To decorate them again each time takes a third of
-    the time of the fast tests, so that only the slow tests do."""
+    They are made anew in each call of the outer function. To decorate them again each time takes up to a
+    third of the time of tests that mostly trace, so that only the slow tests do."""
 
     checked = True
 

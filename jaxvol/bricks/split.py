@@ -24,8 +24,8 @@ EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
 MOST_BRICKS = 2**16
-"""How many a user may ask for. Each has its turn, in which it is looked for along all rays: milliseconds,
-also where it is not read. So these take minutes before anything is rendered."""
+"""How many a user may ask for. Each has its turn, in which it is looked for along all rays, also where it is
+not read: without a limit, an image of a billion bricks would not end."""
 
 COPIES = 2.5
 """Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of
