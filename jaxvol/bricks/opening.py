@@ -19,6 +19,9 @@ from .zarr import ZarrSource, array_metadata
 Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 """A source, a volume, the path of a file or folder, or an array."""
 
+METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs"
+"""Files, of which a Zarr array or group has at least one."""
+
 OF_RAW, OF_ZARR = ("shape", "dtype"), ("axes", "index", "missing")
 
 
@@ -78,6 +81,8 @@ def levels_of(
     place = {"spacing": triple("spacing", spacing), "origin": triple("origin", origin)}
     path = _folder_of(thing) if type(thing).__module__.partition(".")[0] == "zarr" else thing
     if isinstance(path, str | os.PathLike):
+        if not str(path):
+            raise ValueError("source must be an array, a volume, or the path of a file or folder; got ''.")
         return _of_path(Path(path), options, place)
     _refuse(described(thing), options, ())
     if isinstance(thing, VoxelSource | Volume):
@@ -100,6 +105,11 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
             f"path: there is no file {path} (working directory {Path.cwd()}). Check the spelling."
         )
     if path.is_dir():
+        if not any((path / name).is_file() for name in METADATA):
+            raise ValueError(
+                f"path: {path} is a folder without Zarr in it: it has none of {', '.join(METADATA)}. Give the "
+                "folder of an array or of an OME-Zarr image; for a DICOM series, pass jv.load(path)."
+            )
         _refuse(str(path), options, OF_ZARR)
         return _of_zarr(path, options, place)
     name = path.name.lower()

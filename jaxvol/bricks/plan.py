@@ -22,7 +22,8 @@ from ..volume import Volume
 from .opening import Openable, levels_of
 from .render import bricks_of, budget, render_bricks
 from .sources import VoxelSource
-from .split import TooLittleMemory
+from .split import TooLittleMemory, check_smallest
+from .summary_files import check_cache
 
 
 IN_MEMORY = 9
@@ -163,6 +164,9 @@ def plan(
     begun, room = time.perf_counter(), budget(memory)
     place = {name: value for name, value in (("spacing", spacing), ("origin", origin)) if value is not None}
     opened, *_ = levels_of(volume, **place, **(source or {}))
+    # before anything takes time
+    check_cache(cache)
+    check_smallest(opened.shape, opened.dtype, room)
     stride = 1
     while IN_MEMORY * opened.dtype.itemsize * math.prod(-(-n // stride) for n in opened.shape) > room:
         stride += 1

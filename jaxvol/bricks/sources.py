@@ -81,7 +81,7 @@ class VoxelSource(ABC):
             min(-(-(s - 1) // c) + 1, -(-n // c)) * c
             for s, c, n in zip(size, self.chunks, self.shape, strict=True)
         )
-        return math.prod(chunks) * self.dtype.itemsize
+        return math.prod(chunks) * (self.stored_type or self.dtype).itemsize
 
     def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
         """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
@@ -182,7 +182,7 @@ class ArraySource(VoxelSource):
         self.chunks = (1, ny, nz) if slowest == 0 else (nx, 1, nz) if slowest == 1 else (nx, ny, 1)
 
     def touched(self, size: tuple[int, int, int]) -> int:
-        return math.prod(size) * self.dtype.itemsize
+        return math.prod(size) * self._data.dtype.itemsize
 
     def fingerprint(self) -> dict[str, Any] | None:
         return None

@@ -161,6 +161,19 @@ def split(
         parts[max(left, key=lambda axis: (short[axis], size[axis]))] += 1
 
 
+def check_smallest(shape: Node, dtype: Any, memory: int) -> None:
+    """**Raises** `TooLittleMemory` if no march at all has bricks that fit: not even one that reads nothing
+    around them but what interpolation takes."""
+    x, y, z = (min(EDGE, n - 1) for n in shape)
+    margin = Margin((1, 1, 1), steps=0, length=0.0, light=0.0, around=1, slopes=False)
+    least = bytes_of(stored_of(BrickGrid(shape, (x, y, z)), margin, None), dtype, margin)
+    if memory < least:
+        raise TooLittleMemory(
+            f"memory must be at least {least} bytes, which the smallest bricks take, of {x} x {y} x {z} "
+            f"cells, however short the step; most marches take more. Got {memory}."
+        )
+
+
 def divided(shape: Node, counts: Node) -> BrickGrid:
     """So many bricks along each axis, or fewer along one of too few voxels.
 

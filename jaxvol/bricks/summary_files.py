@@ -51,6 +51,7 @@ def summary_of(
     files as they were.
     """
     cell = integer("cell", cell, BLOCK)
+    check_cache(cache)
     before = None if cache is None or source.beside is None else source.fingerprint()
     if before is None or source.beside is None:
         return scan(source, cell, memory=memory, progress=progress)
@@ -72,18 +73,26 @@ def summary_of(
     return summary
 
 
-def _path(beside: Path, cell: int, cache: str | os.PathLike[str] | Any) -> Path:
-    name = f"{beside.name}.jaxvol-summary-{cell}.npz"
-    if cache == "beside":
-        return beside.with_name(name)
+def check_cache(cache: Any) -> None:
+    """**Raises** `ValueError` for what is neither "beside", nor a folder that is there or can be made, nor
+    None; whether or not the source has files there."""
+    if cache is None:
+        return
     if not isinstance(cache, str | os.PathLike):
         raise ValueError(f'cache must be "beside", a folder, or None; got {described(cache)}.')
-    if not (folder := Path(cache)).absolute().parent.is_dir():
+    if cache != "beside" and not (folder := Path(cache)).absolute().parent.is_dir():
         raise ValueError(
             f"cache: there is no folder {folder.absolute().parent} in which {folder.name} could be made. "
             "Check the spelling, or make it."
         )
+
+
+def _path(beside: Path, cell: int, cache: str | os.PathLike[str]) -> Path:
+    name = f"{beside.name}.jaxvol-summary-{cell}.npz"
+    if cache == "beside":
+        return beside.with_name(name)
     # data of the same name may lie in different folders
+    folder = Path(cache)
     return folder / f"{hashlib.blake2b(str(beside).encode(), digest_size=4).hexdigest()}-{name}"
 
 

@@ -82,8 +82,12 @@ def test_memory_stays_within_the_budget_and_30_percent(tmp_path):
 
 WAY = """
     import sys, time
+    import signal
     import jaxvol as jv
     from tests.bricks.test_memory import rendered
+
+    # as in a terminal, however the tests are run
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def wait(*_):
         print("here", flush=True)

@@ -1,16 +1,23 @@
 """Does a plan with a budget choose bricks where they are needed, and only there?"""
 
+import re
+import sys
+
 import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.bricks import source_of
 from jaxvol.bricks.plan import IN_MEMORY
+from jaxvol.bricks.render import bricks_of
+from jaxvol.bricks.split import TooLittleMemory, check_smallest, split
 from jaxvol.metrics import rmse
 
 from ..scenes import scaled_phantom, soft_transfer
 
 
 TOLERANCE = 0.02
+PLANNING = sys.modules["jaxvol.bricks.plan"]  # the name is that of a function, too
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +33,7 @@ def scene(tmp_path_factory):
 def planned(scene, memory, path=None) -> jv.BudgetPlan:
     file, volume, transfer, camera = scene
     place = {"spacing": volume.spacing, "origin": volume.origin}
-    found = jv.plan(path or file, transfer, camera, TOLERANCE, memory=memory, **place)
+    found = jv.plan(file if path is None else path, transfer, camera, TOLERANCE, memory=memory, **place)
     assert isinstance(found, jv.BudgetPlan)
     return found
 
@@ -66,9 +73,37 @@ def test_a_volume_that_does_not_fit_is_rendered_by_bricks(scene):
     assert {type(each) for each in found.march.transforms} >= {jv.AlphaCorrection, jv.SpaceLeaping}
 
 
-def test_less_memory_than_a_copy_takes_is_named(scene):
-    with pytest.raises(ValueError, match=r"memory must hold a copy of 2 voxels along each axis .* got 100"):
+def test_too_little_memory_is_named_before_anything_is_planned(scene, monkeypatch):
+    monkeypatch.setattr(PLANNING, "plan_in_memory", None)
+    least = r"memory must be at least \d+ bytes, which the smallest bricks take, of 16 x 16 x 16 cells"
+    with pytest.raises(ValueError, match=least + r".* Got 100\."):
         planned(scene, 100)
+    flat = np.zeros((4, 512, 512), np.uint8)
+    with pytest.raises(
+        ValueError, match=r"memory must hold a copy of 2 voxels along each axis .* got 500000"
+    ):
+        planned(scene, 500_000, flat)
+
+
+def test_the_least_memory_that_is_named_holds_bricks():
+    """It is no more than what a march takes that reads little around a brick."""
+    data = np.random.default_rng(0).uniform(size=(64, 64, 64)).astype(np.float32)
+    with pytest.raises(TooLittleMemory) as refused:
+        check_smallest(data.shape, data.dtype, 1)
+    least = int(re.findall(r"\d+", str(refused.value))[0])
+    check_smallest(data.shape, data.dtype, least)
+    with pytest.raises(TooLittleMemory):
+        check_smallest(data.shape, data.dtype, least - 1)
+    camera = jv.Camera.looking_at(jv.Volume(data), size=(8, 8))
+    stream = bricks_of(source_of(data), soft_transfer(), camera, jv.March(1e-3), memory=10**9)
+    with pytest.raises(TooLittleMemory):
+        split(data.shape, data.dtype, least - 1, stream.margin, None)
+
+
+def test_a_cache_that_is_none_is_named_before_anything_is_planned(scene, monkeypatch):
+    monkeypatch.setattr(PLANNING, "plan_in_memory", None)
+    with pytest.raises(ValueError, match="cache must be"):
+        jv.plan(np.zeros((8, 8, 8)), scene[2], scene[3], TOLERANCE, memory=10**6, cache=7)
 
 
 def test_what_is_no_volume_is_named(scene):

@@ -392,6 +392,8 @@ def test_where_files_lie(tmp_path, reads):
     assert not (tmp_path / "missing").exists()
     with pytest.raises(ValueError, match="cache must be"):
         summary_of(source, cache=3)
+    with pytest.raises(ValueError, match="cache must be"):  # of arrays, too, which have no files
+        summary_of(source_of(voxels("uint8", SHAPE)), cache=3)
     summary_of(source_of(voxels("uint8", SHAPE)))
     assert summary_files_in(tmp_path) == []
 
