@@ -107,8 +107,8 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
     if path.is_dir():
         if not any((path / name).is_file() for name in METADATA):
             raise ValueError(
-                f"path: {path} is a folder without Zarr in it: it has none of {', '.join(METADATA)}. Give the "
-                "folder of an array or of an OME-Zarr image; for a DICOM series, pass jv.load(path)."
+                f"path: {path} is a folder without Zarr in it: it has none of {', '.join(METADATA)}. Give "
+                "the folder of an array or of an OME-Zarr image; for a DICOM series, pass jv.load(path)."
             )
         _refuse(str(path), options, OF_ZARR)
         return _of_zarr(path, options, place)

@@ -80,7 +80,7 @@ def test_too_little_memory_is_named_before_anything_is_planned(scene, monkeypatc
         planned(scene, 100)
     flat = np.zeros((4, 512, 512), np.uint8)
     with pytest.raises(
-        ValueError, match=r"memory must hold a copy of 2 voxels along each axis .* got 500000"
+        ValueError, match=r"memory must hold a copy of 2 voxels along each axis"
     ):
         planned(scene, 500_000, flat)
 
