@@ -79,9 +79,7 @@ def test_too_little_memory_is_named_before_anything_is_planned(scene, monkeypatc
     with pytest.raises(ValueError, match=least + r".* Got 100\."):
         planned(scene, 100)
     flat = np.zeros((4, 512, 512), np.uint8)
-    with pytest.raises(
-        ValueError, match=r"memory must hold a copy of 2 voxels along each axis"
-    ):
+    with pytest.raises(ValueError, match=r"memory must hold a copy of 2 voxels along each axis"):
         planned(scene, 500_000, flat)
 
 
