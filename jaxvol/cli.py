@@ -73,7 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (ValueError, OSError, ImportError) as fault:
-        print(f"jaxvol {command}: error: {' '.join(str(fault).split())}", file=sys.stderr)
+        text = " ".join(str(fault).split()).removeprefix("path: ")  # the argument's name in Python
+        print(f"jaxvol {command}: error: {text}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         remove_unfinished()

@@ -3,6 +3,7 @@
 import contextlib
 import html
 import json
+import math
 import re
 import signal
 import subprocess
@@ -17,7 +18,10 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
+from jaxvol.automatic.sampling import SAMPLED
+from jaxvol.bricks import source_of
 from jaxvol.cli import main
+from jaxvol.commands.data import copy_of
 from jaxvol.lighting import Phong
 from jaxvol.metrics import rmse
 
@@ -391,6 +395,16 @@ def test_a_volume_is_rendered_brick_by_brick(volume_file, tmp_path, capsys):
     assert "memory must" in capsys.readouterr().err
 
 
+def test_what_is_chosen_by_a_copy_is_chosen_by_the_voxels_that_count_for_the_whole():
+    volume = jv.Volume(np.asarray(jv.phantom("head", 160).data)[:, :140, :130], (1, 1, 2))
+    assert math.prod(volume.shape) > SAMPLED
+    copy = copy_of(source_of(volume), 2**28)
+    assert max(copy.shape) <= 80
+    whole, found = jv.automatic_transfer(volume), jv.automatic_transfer(copy)
+    for name in ("values", "colors", "extinction"):
+        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_a_plan_with_memory_is_by_bricks_where_the_volume_does_not_fit(volume_file, tmp_path, capsys):
     words = [str(volume_file), "--size", "16", "16", "--preset", "engine", "--memory"]
@@ -426,9 +440,7 @@ def test_a_fit_that_is_interrupted_goes_on_from_its_checkpoint(volume_file, seen
     assert printed.splitlines()[-1] == f"jaxvol fit: interrupted; the same command resumes from {kept}"
     assert not (tmp_path / "t.json").exists()
     steps = len(json.loads(kept.read_bytes().splitlines()[1])["losses"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # some parameters are not determined by the images
-        assert main([*words, "--max-steps", str(steps), "-o", str(tmp_path / "t.json")]) == 0
+    assert main([*words, "--max-steps", str(steps), "-o", str(tmp_path / "t.json")]) == 0
     assert jv.read_transfer(tmp_path / "t.json").values.shape == (8,)
 
 
@@ -450,8 +462,9 @@ BAD = {
     "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
     "no transfer": (["FILE", "--transfer", "nowhere.json"], "nowhere.json cannot be read"),
     "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--parallel goes with --direction"),
-    "no file": (["nowhere.raw"], "there is no file"),
-    "preset": (["FILE", "--preset", "moon"], "preset must be one of"),
+    "no file": (["nowhere.raw"], "error: there is no file"),
+    "preset": (["nowhere.raw", "--preset", "moon"], "preset must be one of"),
+    "cmap": (["nowhere.raw", "--cmap", "moon"], "cmap must be"),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
     "size": (["FILE", "--size", "0", "5"], "size must be"),
     "camera": (["FILE", "--camera", "1", "1", "1", "1", "1", "1"], "position must differ from focal_point"),
@@ -508,9 +521,13 @@ def test_fit_finds_a_transfer_function_that_makes_the_pictures(volume_file, seen
     output = tmp_path / "folder" / "transfer.json"
     cameras = ["--cameras", str(tmp_path / "cameras.json")]
     command = ["fit", str(volume_file), "--images", *seen, *cameras, "-o", str(output)]
-    with pytest.warns(UserWarning, match="not determined"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         assert main([*command, "--max-steps", "20"]) == 0
     printed = capsys.readouterr().out
+    assert re.search(
+        r"not determine is arbitrary: colours or extinction of points? 0.* of 8, counted", printed
+    )
     assert float(printed.partition("RMSE ")[2].split()[0]) < 0.01
     transfer = jv.read_transfer(output)
     assert transfer.values.shape == (8,)
@@ -523,7 +540,6 @@ BAD_FIT = {
     "no picture's file": ({"--images": ["CAMERAS", "CAMERAS"]}, "cannot be read as a picture"),
     "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
     "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "one camera for each of 3 images; got 2"),
-    "solver": ({"--solver": ["newton"]}, "solver must be one of"),
     "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
     "start": ({"--start": ["CAMERAS"]}, "must be an object with values, colors, extinction"),
     "clim": ({"--clim": ["5", "4"]}, "clim must be (low, high)"),
@@ -592,6 +608,10 @@ def test_a_transfer_function_is_read_as_it_was_written(tmp_path):
             "render: error: argument --memory: must be a number of bytes, such as 256M or 2G; got 'lots'",
         ),
         (["render", "x.raw", "--memory", "0"], "argument --memory: must be at least 1 byte; got '0'"),
+        (
+            ["fit", "x.raw", "--images", "a.png", "--cameras", "c.json", "--solver", "newton"],
+            "fit: error: argument --solver: invalid choice: 'newton'",
+        ),
         (["datasets", "fetch"], "datasets fetch: error: the following arguments are required: NAME"),
         (["paint"], "jaxvol: error: argument COMMAND: invalid choice: 'paint' (choose from"),
     ],

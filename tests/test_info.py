@@ -1,5 +1,7 @@
 """Does `jaxvol info` tell what a file holds?"""
 
+import re
+
 import numpy as np
 
 from jaxvol.cli import main
@@ -29,7 +31,14 @@ def test_info_tells_shape_place_and_values(tmp_path, capsys):
 def test_info_takes_the_header_of_a_raw_file(tmp_path, capsys):
     (tmp_path / "a.raw").write_bytes(bytes(range(24)))
     assert main(["info", str(tmp_path / "a.raw")]) == 2
-    assert "jaxvol info: error: path: the shape and dtype" in capsys.readouterr().err
+    assert "jaxvol info: error: the shape and dtype" in capsys.readouterr().err
     header = ["--shape", "4", "3", "2", "--dtype", "uint8", "--spacing", "1", "1", "2"]
     assert main(["info", str(tmp_path / "a.raw"), *header]) == 0
-    assert "4 x 3 x 2 voxels" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "4 x 3 x 2 voxels" in told
+    assert "assumed" not in told
+    assert main(["info", str(tmp_path / "a.raw"), *header[:-4]]) == 0
+    assert re.search(r"spacing +1 1 1 \(assumed: the file does not say\)", capsys.readouterr().out)
+    (tmp_path / "a.raw.json").write_text('{"spacing": [1, 1, 1]}')
+    assert main(["info", str(tmp_path / "a.raw"), *header[:-4]]) == 0
+    assert "assumed" not in capsys.readouterr().out

@@ -106,7 +106,7 @@ def _near_axis(offset: Array) -> tuple[Array, tuple]:
         rgba = jv.render_rays(volume, uniform(EXTINCTION), origins, directions, march, outputs="rgba").rgba
         return jnp.sum(rgba[..., 3]), rgba[..., 3]
 
-    shift = jnp.stack([0 * offset, offset, 0 * offset])
+    shift = jnp.stack([0 * offset, offset, 0 * offset])[None]
     origins = jnp.array([[0.0, 0.0, -60.0], [0.0, -60.0, -80.0], [-60.0, 0.0, -12.0]]) + shift
     gradient, opacity = jax.grad(loss, has_aux=True)((probe(*NEAR), jnp.ones((8, 8, 8)), origins))
     return opacity, gradient

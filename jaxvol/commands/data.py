@@ -4,6 +4,7 @@ import argparse
 import math
 from pathlib import Path
 
+from ..automatic.sampling import SAMPLED
 from ..bricks import VoxelSource, levels_of
 from ..bricks.plan import IN_MEMORY, copied
 from ..formats import load
@@ -36,13 +37,10 @@ def source_of(options: argparse.Namespace) -> VoxelSource:
     return levels_of(options.file, **{name: value for name, value in given.items() if value is not None})[0]
 
 
-COPIED = 2**22
-"""Voxels, at most, of a copy from which a histogram and a place are taken."""
-
-
 def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel, which fits into so many bytes, stretched to the bounds of the whole."""
-    most = min(COPIED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
+    """A copy of every n-th voxel, stretched to the bounds of the whole. It has the voxels by which colours are
+    chosen for the whole, if they fit into so many bytes, and fewer if not."""
+    most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
     stride = 1
     while math.prod(-(-n // stride) for n in source.shape) > most and min(source.shape) // (stride + 1) >= 2:
         stride += 1

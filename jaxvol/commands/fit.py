@@ -1,11 +1,15 @@
 """`jaxvol fit`: a transfer function that makes given images of a volume."""
 
 import argparse
+import re
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from .._util.checks import output_file
 from ..fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
+from ..fitting.driver import UNDETERMINED, Solver
+from ..fitting.uncertainty import Uncertainty
 from ..march import March
 from .data import volume_of
 from .frames import FAST
@@ -40,7 +44,7 @@ def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
     )
     add_clim(start, "range of their values (default: all)")
     solver = parser.add_argument_group("solver")
-    solver.add_argument("--solver", default="levenberg_marquardt", help="or gauss_newton, bfgs, adam")
+    solver.add_argument("--solver", choices=get_args(Solver), default="levenberg_marquardt")
     solver.add_argument("--max-steps", type=int, default=100)
     solver.add_argument(
         "--checkpoint",
@@ -53,15 +57,18 @@ def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
 
 def _fit(options: argparse.Namespace) -> None:
     output_file("--output", options.output)
+    # what is wrong with these is told before the volume is read
+    views = read_views(options.images, options.cameras)
+    start = read_transfer(options.start) if options.start else None
     with working(f"reading {options.file}"):
         volume = volume_of(options)
     # half a voxel
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     march = March(step, FAST, "midpoint")
-    views = read_views(options.images, options.cameras)
-    file = options.start
-    start = read_transfer(file) if file else flat_grey(volume, options.points, options.clim)
-    with working("fitting, steps") as told:
+    if start is None:
+        start = flat_grey(volume, options.points, options.clim)
+    with working("fitting, steps") as told, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=UNDETERMINED)  # told below, of points
         result = fit(
             ImageResidual(
                 lambda transfer, camera: (volume, transfer, camera, march), views, options.background
@@ -76,3 +83,15 @@ def _fit(options: argparse.Namespace) -> None:
     path = write_transfer(options.output, result.parameters)
     error = (2 * result.loss) ** 0.5
     print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")
+    if points := _undetermined(result.uncertainty):
+        numbers, many = ", ".join(map(str, points)), "s" if len(points) > 1 else ""
+        print(
+            f"{path}: what the images do not determine is arbitrary: colours or extinction of point{many} "
+            f"{numbers} of {len(result.parameters.values)}, counted from 0"
+        )
+
+
+def _undetermined(found: Uncertainty | None) -> list[int]:
+    """Points of a transfer function with numbers that the images do not determine."""
+    names = [] if found is None else [name for each in found.undetermined for name in each]
+    return sorted({int(index) for name in names for index in re.findall(r"\[(\d+)", name)})

@@ -49,6 +49,11 @@ class Frames(NamedTuple):
         return jax.block_until_ready(found)
 
 
+def planning(options: argparse.Namespace) -> str:
+    """What is going on while a plan is made."""
+    return f"planning how to render {options.file}"
+
+
 def planned(
     options: argparse.Namespace, scene: Scene, camera: Camera | None = None, *, once: bool = True
 ) -> Plan | BudgetPlan:
@@ -60,10 +65,9 @@ def planned(
         "once": once,
     }
     seen = scene.transfer, scene.camera if camera is None else camera
-    with working(f"planning how to render {options.file}"):
-        if scene.source is None:
-            return plan(scene.volume, *seen, tolerance_of(options), **how)
-        return plan(scene.source, *seen, tolerance_of(options), memory=options.memory, **how)
+    if scene.source is None:
+        return plan(scene.volume, *seen, tolerance_of(options), **how)
+    return plan(scene.source, *seen, tolerance_of(options), memory=options.memory, **how)
 
 
 def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camera] = ()) -> Frames:
@@ -76,7 +80,11 @@ def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camer
         march = March(options.step, (*scene.clip, *FAST), "midpoint")
         return Frames(scene.volume, transfer, march, mode, scene.lighting, scene.source, options.memory)
     seen = cameras or (scene.camera,)
-    plans = [planned(options, scene, camera, once=len(seen) == 1) for camera in seen]
+    plans = []
+    with working(planning(options)) as told:
+        for camera in seen:
+            plans.append(planned(options, scene, camera, once=len(seen) == 1))
+            told(len(plans), len(seen))
     found = min(plans, key=lambda plan: float(plan.march.step))
     source = None
     if isinstance(found, BudgetPlan):

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from .._util.files import Header
+from ..formats import says_its_spacing
 from ..volume import Volume
 from .data import add_data_options, volume_of
 
@@ -25,11 +27,19 @@ def add_info(commands: Any, shared: argparse.ArgumentParser) -> None:
         description="Print shape, type, place in the world and values of a volume file, as jaxvol loads it.",
     )
     add_data_options(parser)
-    parser.set_defaults(run=lambda options: print(described_volume(volume_of(options))))
+    parser.set_defaults(run=_info)
 
 
-def described_volume(volume: Volume) -> str:
-    """Lines of text about a volume: its voxels, its place in the world, its values.
+def _info(options: argparse.Namespace) -> None:
+    volume = volume_of(options)
+    header = Header(options.shape, options.dtype)
+    assumed = options.spacing is None and not says_its_spacing(options.file, header)
+    print(described_volume(volume, assumed=assumed))
+
+
+def described_volume(volume: Volume, *, assumed: bool = False) -> str:
+    """Lines of text about a volume: its voxels, its place in the world, its values. `assumed`: whether its
+    spacing was not told.
 
     The bars are a histogram of 64 bins from the least to the greatest value, each as high as the logarithm of
     its count.
@@ -40,7 +50,7 @@ def described_volume(volume: Volume) -> str:
     rows = [
         ("shape", f"{shape} voxels (x, y, z), {data.size / 1e6:.3g} million"),
         ("type", f"{data.dtype}, {data.nbytes / 1e6:.3g} MB of memory"),
-        ("spacing", _numbers(volume.spacing)),
+        ("spacing", _numbers(volume.spacing) + (" (assumed: the file does not say)" if assumed else "")),
         ("origin", _numbers(volume.origin)),
         ("direction", _direction(volume)),
         (
@@ -50,7 +60,7 @@ def described_volume(volume: Volume) -> str:
         ("values", f"{low:g} to {high:g}, mean {data.mean(dtype=np.float64):.6g}"),
         ("percentiles", ", ".join(f"{p} %: {v:g}" for p, v in zip(SHARES, _percentiles(data), strict=True))),
         ("lowest", f"{np.mean(data == data.min()):.1%} of the voxels have the least value"),
-        ("histogram", f"{low:g} |{_bars(data)}| {high:g}"),
+        ("histogram", f"{low:g} |{_bars(data)}| {high:g}, heights by logarithm"),
     ]
     if volume.labels is not None:
         found = np.unique(np.asarray(volume.labels))

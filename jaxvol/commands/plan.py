@@ -3,8 +3,9 @@
 import argparse
 from typing import Any
 
-from .frames import planned
+from .frames import planned, planning
 from .options import scene_options, view_options
+from .progress import working
 from .scene import scene_of
 
 
@@ -23,4 +24,7 @@ def add_plan(commands: Any, shared: argparse.ArgumentParser) -> None:
 def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
-    print(planned(options, scene_of(options)))
+    scene = scene_of(options)
+    with working(planning(options)):
+        found = planned(options, scene)
+    print(found)

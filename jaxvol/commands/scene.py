@@ -54,6 +54,7 @@ def scene_of(options: argparse.Namespace) -> Scene:
     """The scene that the options describe."""
     mode = _mode(options)
     clip = _clip(options)
+    given = transfer_given(options)
     source = None
     with working(f"reading {options.file}"):
         if options.memory is None:
@@ -64,7 +65,7 @@ def scene_of(options: argparse.Namespace) -> Scene:
         if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
             volume, transfer = shown
         else:
-            transfer = look_of(options, volume)
+            transfer = transfer_of(options, volume) if given is None else given
         points = visible_points(volume, transfer) if is_automatic(options) else None
     return Scene(
         volume, transfer, _view(options, volume, points), mode, _lighting(options, mode), clip, source
@@ -101,8 +102,9 @@ def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting |
     return Phong() if shade else None
 
 
-def look_of(options: argparse.Namespace, volume: Volume) -> Transfer:
-    """The transfer function that the options specify."""
+def transfer_given(options: argparse.Namespace) -> Transfer | None:
+    """The transfer function that the options give by themselves, before anything is read of the volume; None
+    where it depends on that. What is wrong with them is told in either case."""
     kept = getattr(options, "kept_transfer", None)
     if options.transfer or kept is not None:
         for name in ("clim", "opacity", "unit_distance"):
@@ -112,16 +114,31 @@ def look_of(options: argparse.Namespace, volume: Volume) -> Transfer:
                 )
         return read_transfer(options.transfer) if kept is None else kept
     if is_automatic(options):
-        return automatic_transfer(volume)
-    unit_distance = 1.0 if options.unit_distance is None else options.unit_distance
+        return None
     if options.preset and options.opacity is not None:
         raise ValueError("--opacity is for colormaps; a preset has its own.")
     if options.preset:
-        return preset(options.preset, options.clim, unit_distance)
-    clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
+        return preset(options.preset, options.clim, _unit_distance(options))
+    over_range = _colormap(options, options.clim or (0, 1))
+    return over_range if options.clim else None
+
+
+def transfer_of(options: argparse.Namespace, volume: Volume) -> Transfer:
+    """The transfer function for a volume, where the options alone do not give one."""
+    if is_automatic(options):
+        return automatic_transfer(volume)
+    return _colormap(options, (float(volume.data.min()), float(volume.data.max())))
+
+
+def _unit_distance(options: argparse.Namespace) -> float:
+    return 1.0 if options.unit_distance is None else options.unit_distance
+
+
+def _colormap(options: argparse.Namespace, clim: tuple[float, float]) -> Transfer:
+    """The colormap that the options name, over a range of values."""
     surface = getattr(options, "compositing", "over") == "isosurface"
     cmap = options.cmap or ("white" if surface else "gray")
-    return colormap(cmap, clim, options.opacity or "linear", unit_distance)
+    return colormap(cmap, clim, options.opacity or "linear", _unit_distance(options))
 
 
 def _view(options: argparse.Namespace, volume: Volume, points: Float[np.ndarray, "n 3"] | None) -> Camera:

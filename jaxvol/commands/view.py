@@ -8,7 +8,7 @@ from typing import Any
 from ..viewer import serve
 from .data import add_data_options, volume_of
 from .options import transfer_options
-from .scene import is_automatic, look_of
+from .scene import is_automatic, transfer_given, transfer_of
 
 
 def add_view(commands: Any, shared: argparse.ArgumentParser) -> None:
@@ -32,8 +32,10 @@ def add_view(commands: Any, shared: argparse.ArgumentParser) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
+    transfer = transfer_given(options)
     volume = volume_of(options)
-    transfer = None if is_automatic(options) else look_of(options, volume)
+    if transfer is None and not is_automatic(options):
+        transfer = transfer_of(options, volume)
     page = serve(volume, transfer, lit=options.shade, port=options.port, title=options.file.name)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:

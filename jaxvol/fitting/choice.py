@@ -16,7 +16,7 @@ from .._util.checks import described, integer, number, require
 from .._util.trees import PyTree
 from .candidates import Candidate
 from .constraints import Free, size
-from .driver import Fit, Outcome, fit
+from .driver import UNDETERMINED, Fit, Outcome, fit
 from .held_out import HeldOut, ModelResidual, as_residual, cameras_of, check_apart, data_norm
 from .residuals import ImageResidual, Residual, check_residual
 
@@ -219,7 +219,7 @@ def choose(
     fits: list[Fit] = []
     for at, candidate in enumerate(candidates):
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*directions are not determined")
+            warnings.filterwarnings("ignore", message=UNDETERMINED)
             found = fit(
                 ModelResidual(seen, candidate.expand),
                 candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters),

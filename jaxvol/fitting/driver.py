@@ -33,6 +33,9 @@ OptimistixSolver: TypeAlias = (
     optx.AbstractLeastSquaresSolver[Any, Any, Any, Any] | optx.AbstractMinimiser[Any, Any, Any]
 )
 
+UNDETERMINED = ".*directions are not determined"
+"""Pattern of the warning that names such directions, for those who tell it otherwise."""
+
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
 

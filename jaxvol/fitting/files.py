@@ -99,7 +99,9 @@ def _json(path: File) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as fault:
         raise ValueError(f"{path} cannot be read ({fault.strerror}).") from fault
-    except (json.JSONDecodeError, UnicodeDecodeError) as fault:
+    except UnicodeDecodeError as fault:
+        raise ValueError(f"{path} is not JSON: it is no text. Are files given in another order?") from fault
+    except json.JSONDecodeError as fault:
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 

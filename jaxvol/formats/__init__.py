@@ -25,7 +25,7 @@ from .dicom import dicom_files, read_dicom, read_dicom_folder
 from .kretz import read_kretz, refuse_kretz
 from .medical import read_medical
 from .metaimage import read_metaimage
-from .raw import read_raw
+from .raw import raw_header, read_raw
 from .save import save as save
 from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files
 
@@ -161,6 +161,14 @@ PLACELESS: tuple[str, ...] = (".raw", ".raw.gz", ".npy", *TIFF)
 def says_where_it_lies(path: Path) -> bool:
     """Whether a file says where in the world the axes of its volume point."""
     return not path.name.lower().endswith(PLACELESS)
+
+
+def says_its_spacing(path: Path, header: Header) -> bool:
+    """Whether a file of voxels, or the header beside it, says how far they lie apart."""
+    name = path.name.lower()
+    if name.endswith((".raw", ".raw.gz")):
+        return "spacing" in raw_header(path, header, 31)[2]
+    return not name.endswith(".npy")
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
