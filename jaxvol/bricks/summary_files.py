@@ -87,7 +87,7 @@ def check_cache(cache: Any) -> None:
         )
 
 
-def _path(beside: Path, cell: int, cache: str | os.PathLike[str]) -> Path:
+def _path(beside: Path, cell: int, cache: str | os.PathLike[str] | Any) -> Path:
     name = f"{beside.name}.jaxvol-summary-{cell}.npz"
     if cache == "beside":
         return beside.with_name(name)

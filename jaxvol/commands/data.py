@@ -38,8 +38,8 @@ def source_of(options: argparse.Namespace) -> VoxelSource:
 
 
 def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel, stretched to the bounds of the whole. It has the voxels by which colours are
-    chosen for the whole, if they fit into so many bytes, and fewer if not."""
+    """A copy of every n-th voxel, stretched to the bounds of the whole. It has those voxels by which
+    colours are chosen for the whole, if they fit into so many bytes, and fewer if not."""
     most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
     stride = 1
     while math.prod(-(-n // stride) for n in source.shape) > most and min(source.shape) // (stride + 1) >= 2:
