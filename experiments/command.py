@@ -30,7 +30,8 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
     - `output`: default of `--output`, the folder to write into, which is made.
     - `options`: the other options, by name: the default of an integer, or what `add_argument` takes.
 
-    The arguments as they were given are `argv` among the options.
+    The arguments as they were given, but for the output, are `argv` among the options: what was asked for,
+    wherever it is written.
     """
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     options["output"] = {"type": Path, "default": output, "metavar": "FOLDER"}
@@ -41,10 +42,16 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
     def made(run: Callable[[Namespace], None]) -> Main:
         def main(argv: Sequence[str] | None = None) -> None:
             given = sys.argv[1:] if argv is None else list(argv)
-            chosen = parser.parse_args(given, Namespace(argv=given))
+            chosen = parser.parse_args(given, Namespace(argv=_without_output(given)))
             chosen.output.mkdir(parents=True, exist_ok=True)
             run(chosen)
 
         return main
 
     return made
+
+
+def _without_output(given: Sequence[str]) -> list[str]:
+    """Arguments without `--output FOLDER` or `--output=FOLDER`."""
+    pairs = zip(["", *given], given, strict=False)
+    return [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]

@@ -5,6 +5,7 @@ import os
 import platform
 import shlex
 import subprocess
+import time
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ import jax
 
 
 RESULTS = Path(__file__).parent / "results"
+BEGUN = time.monotonic()
+"""When this was imported: at the start of the process."""
+
 PACKAGES = ("jaxvol", "jax", "jaxlib", "equinox", "numpy", "scikit-image", "matplotlib")
 
 
@@ -29,6 +33,7 @@ def write(path: Path, question: str, result: Any, *, seed: int, command: list[st
         "seed": seed,
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
         "commit": commit(),
+        "seconds": round(time.monotonic() - BEGUN),
         "device": _device(),
         "result": result,
     }
@@ -40,6 +45,10 @@ def write(path: Path, question: str, result: Any, *, seed: int, command: list[st
 def read(path: Path) -> dict[str, Any]:
     """A record that `write` wrote."""
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+OTHERS = ":(top,exclude)experiments/results"
+"""All files but results, in Git's words."""
 
 
 def _device() -> dict[str, Any]:
@@ -61,7 +70,7 @@ def _processor() -> str:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with + if files differ from it; None outside a checkout."""
+    """The checkout's commit, with + if files other than results differ from it; None outside a checkout."""
     here = Path(__file__).parent
 
     def git(*words: str) -> str:
@@ -70,6 +79,8 @@ def commit() -> str | None:
         ).stdout.strip()
 
     try:
-        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain") else "")
+        return git("rev-parse", "--short", "HEAD") + (
+            "+" if git("status", "--porcelain", "--", ":/", OTHERS) else ""
+        )
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 from skimage.io import imread
 
 from experiments import (
+    again,
     bricks,
     fit_transfer,
     gradient_errors,
@@ -42,8 +44,9 @@ FIGURES = sorted(
     {path.stem for path in (ROOT / "paper_figs").glob("*fig*.py")} - {"chae_fig5", "kim_fig9"} | {"gallery"}
 )
 """Figures that need no recorded results."""
-EXPERIMENTS = sorted(path.stem for path in (ROOT / "experiments" / "results").glob("*.json"))
-"""Experiments with stored records."""
+RECORDS = sorted(path.stem for path in record.RESULTS.glob("*.json"))
+EXPERIMENTS = [name for name in RECORDS if (ROOT / "experiments" / f"{name}.py").is_file()]
+"""Those whose record has their name."""
 PLANS = "planning", "planning_seed_1"
 """Records of the experiment `planning`."""
 
@@ -129,7 +132,7 @@ def test_all_figures_are_measured_and_rendered_anew(tmp_path):
 
 def test_charts_are_drawn_again_from_their_records(tmp_path):
     images = {"elevation_angle", "path_traced", "tomography"}  # which no record holds
-    assert set(redraw.DRAWN) == set(EXPERIMENTS) - images
+    assert set(redraw.DRAWN) == set(RECORDS) - images
     redraw.main(["--only", "speed", "overhead", "--output", str(tmp_path)])
     for name in ("speed", "overhead"):
         assert imread(tmp_path / f"{name}.png").shape == imread(record.RESULTS / f"{name}.png").shape
@@ -156,6 +159,29 @@ def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_pat
 def test_an_unknown_figure_is_refused():
     with pytest.raises(ValueError, match=r"only must be some of fig01.*; got fig02"):
         index.make(common.OUTPUT, only=["fig02"])
+
+
+@pytest.mark.slow
+def test_a_result_is_recorded_again_under_its_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(again.ARGUMENTS, "accuracy", "jitter_accuracy --quick --seed 1")
+    (tmp_path / "accuracy.json").write_text("old")
+    again.main(["--only", "accuracy", "--output", str(tmp_path)])
+    assert {file.name for file in tmp_path.iterdir()} == {"accuracy.json", "accuracy.png"}
+    found = record.read(tmp_path / "accuracy.json")
+    assert found["command"] == "python -m experiments.jitter_accuracy --quick --seed 1"
+    assert found["seconds"] > 0
+    assert found["commit"] in capsys.readouterr().out
+    monkeypatch.setitem(again.ARGUMENTS, "accuracy", "jitter_accuracy --no-such-option")
+    before = (tmp_path / "accuracy.json").read_bytes()
+    with pytest.raises(subprocess.CalledProcessError):
+        again.main(["--only", "accuracy", "--output", str(tmp_path)])
+    assert (tmp_path / "accuracy.json").read_bytes() == before
+
+
+def test_every_record_can_be_made_again(capsys):
+    assert set(again.NAMES) == {*EXPERIMENTS, *again.ARGUMENTS}
+    again.main(["--list"])
+    assert len(capsys.readouterr().out.splitlines()) == len(again.NAMES)
 
 
 @pytest.mark.slow

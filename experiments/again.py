@@ -1,0 +1,69 @@
+"""Records results again, one after the other, each by the command of its record and in a process of its own.
+
+`python -m experiments.again` records all, which takes a day on two cores; `--only speed shading` some;
+`--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine that
+does nothing else: most results are times. A result replaces the old one when it is there as a whole, so that
+Ctrl-C loses one of them. All records are of one engine if files are not changed meanwhile.
+"""
+
+import shutil
+import subprocess
+import sys
+from argparse import Namespace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from . import common, record
+from .command import command
+
+
+ARGUMENTS = {
+    "accuracy": "accuracy --repetitions 5",
+    "bricks": "bricks --size 40 --repetitions 3",
+    "jitter_accuracy": "jitter_accuracy --repetitions 7",
+    "overhead": "overhead --sizes 512",
+    "planning_seed_1": "planning --scenes 40 --every 2 --seed 1",
+    "scan_conversion": "scan_conversion --size 256 --repetitions 3",
+    "shading": "shading --repetitions 25",
+    "speed": "speed --gradients --sizes 512 --repetitions 7",
+}
+"""What records are made by, where it is not the experiment of their name without options."""
+
+NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
+
+
+def recorded(name: str, folder: Path) -> None:
+    """Measures a result and puts its files into the folder: the record, charts and pages of its name.
+
+    **Raises** `subprocess.CalledProcessError` if the experiment fails; the folder is then as it was."""
+    experiment, *options = ARGUMENTS.get(name, name).split()
+    with TemporaryDirectory() as new:
+        module = f"experiments.{experiment}"
+        subprocess.run([sys.executable, "-m", module, *options, "--output", new], check=True)
+        for file in sorted(each for each in Path(new).iterdir() if each.is_file()):
+            shutil.move(file, folder / file.name.replace(experiment, name, 1))
+
+
+def told(name: str, folder: Path) -> str:
+    """What a record says of how it was made."""
+    found = record.read(folder / f"{name}.json")
+    seconds = found.get("seconds")
+    took = "" if seconds is None else f"{seconds / 60:.1f} min"
+    return f"{name:20} {took:>10}  {found['commit'] or ''}"
+
+
+@command(
+    __doc__,
+    record.RESULTS,
+    only=common.some_of(dict.fromkeys(NAMES), "NAME"),
+    list={"action": "store_true", "help": "print how long each took, and measure nothing"},
+)
+def main(chosen: Namespace) -> None:
+    for name in chosen.only:
+        if not chosen.list:
+            recorded(name, chosen.output)
+        print(told(name, chosen.output), flush=True)
+
+
+if __name__ == "__main__":
+    main()
