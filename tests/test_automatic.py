@@ -1,5 +1,6 @@
 """Does a transfer function that is guessed from a histogram show what is there?"""
 
+import jax
 import numpy as np
 import pytest
 
@@ -226,3 +227,12 @@ def test_floats_two_values_and_many_are_no_labels():
     assert labels_shown(jv.Volume(labels().astype(np.float32))) is None
     assert labels_shown(jv.Volume((labels() > 0).astype(np.uint8))) is None
     assert labels_shown(jv.Volume(np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4))) is None
+
+
+def test_a_traced_volume_is_refused_and_one_from_outside_is_not():
+    volume = jv.phantom("head", 16)
+    with pytest.raises(ValueError, match="volume is traced here, and its histogram is needed"):
+        jax.jit(jv.automatic_transfer)(volume)
+    found, inside = jv.automatic_transfer(volume), jax.jit(lambda _: jv.automatic_transfer(volume))(0.0)
+    np.testing.assert_array_equal(found.extinction, inside.extinction)
+    np.testing.assert_array_equal(found.colors, inside.colors)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float, Shaped
 
@@ -39,8 +40,18 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
     Source: Otsu, "A Threshold Selection Method from Gray-Level Histograms", 1979.
     """
-    if not isinstance(volume, Volume) or is_traced(volume.data):
-        raise ValueError(f"volume must be a jaxvol Volume, not traced; got {described(volume)}.")
+    if not isinstance(volume, Volume):
+        raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
+    if is_traced(volume):
+        raise ValueError(
+            "volume is traced here, and its histogram is needed: call automatic_transfer outside of jax.jit, "
+            "jax.vmap and jax.grad, and pass what it returns."
+        )
+    with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
+        return _of_histogram(volume)
+
+
+def _of_histogram(volume: Volume) -> TransferFunction:
     values = sampled(volume).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
