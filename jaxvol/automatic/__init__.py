@@ -8,5 +8,5 @@ look at the voxels that `sampling.py` chooses.
 
 from .framing import framed as framed, visible_points as visible_points
 from .labels import labels_shown as labels_shown
-from .transfer import automatic_transfer as automatic_transfer
+from .transfer import automatic_transfer as automatic_transfer, transfer_by_copy as transfer_by_copy
 from .upright import FRONT as FRONT, front_of as front_of, upright as upright

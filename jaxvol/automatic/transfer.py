@@ -48,10 +48,16 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
             "jax.vmap and jax.grad, and pass what it returns."
         )
     with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
-        return _of_histogram(volume)
+        return _of_histogram(volume, np.asarray(volume.data))
 
 
-def _of_histogram(volume: Volume) -> TransferFunction:
+def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
+    """The same for a volume of which there is a copy of every n-th voxel, in the same place, and a part as it
+    is: whether values are grain, a copy does not tell."""
+    return _of_histogram(copy, part)
+
+
+def _of_histogram(volume: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
     values = sampled(volume).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
@@ -59,7 +65,7 @@ def _of_histogram(volume: Volume) -> TransferFunction:
         return TransferFunction(ends, [linear(TISSUE)] * 2, extinction_of([0.5] * 2, unit_of(volume)))
     first, second = thresholds(values)
     faces = _faces(np.asarray(volume.data))
-    whole = np.mean(faces > first) < CUT and is_body(np.asarray(volume.data), first, second)
+    whole = np.mean(faces > first) < CUT and is_body(part, first, second)
     points = _shell(low, first, second, high) if whole else _dense(first, second, high)
     at, colors, opacities = zip(*points, strict=True)
     return TransferFunction(

@@ -4,6 +4,9 @@ import argparse
 import math
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Shaped
+
 from ..automatic.sampling import SAMPLED
 from ..bricks import VoxelSource, levels_of
 from ..bricks.plan import IN_MEMORY, copied
@@ -35,6 +38,16 @@ def source_of(options: argparse.Namespace) -> VoxelSource:
     """The volume in the file, of which parts are read."""
     given = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
     return levels_of(options.file, **{name: value for name, value in given.items() if value is not None})[0]
+
+
+MIDDLE = 128
+"""Voxels along each axis, at most, that are looked at as they are."""
+
+
+def middle_of(source: VoxelSource) -> Shaped[np.ndarray, "nx ny nz"]:
+    """Voxels in the middle of a volume, data[x, y, z]."""
+    low = [max(0, (n - MIDDLE) // 2) for n in source.shape]
+    return source.read(low, [min(n, begin + MIDDLE) for n, begin in zip(source.shape, low, strict=True)])
 
 
 def copy_of(source: VoxelSource, memory: int) -> Volume:

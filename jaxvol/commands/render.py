@@ -108,8 +108,7 @@ def rendered(
         if frames.volume.shape != shape:
             copy = " x ".join(map(str, frames.volume.shape))
             print(
-                f"{path}: what was not given (transfer function, view, step) was chosen by {copy} of the "
-                "voxels; the whole volume may call for another choice"
+                f"{path}: what was not given (transfer function, view, step) was chosen by {copy} of the voxels"
             )
     if np.any(rendering.exhausted):
         print(

@@ -4,7 +4,7 @@ import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from ..automatic import (
     FRONT,
@@ -12,6 +12,7 @@ from ..automatic import (
     framed,
     front_of,
     labels_shown,
+    transfer_by_copy,
     upright,
     visible_points,
 )
@@ -29,7 +30,7 @@ from ..projections import Average
 from ..transfer import Transfer
 from ..transforms.clip import Clip
 from ..volume import Volume
-from .data import copy_of, source_of, volume_of
+from .data import copy_of, middle_of, source_of, volume_of
 from .orbit import views_shown
 from .progress import working
 
@@ -65,7 +66,8 @@ def scene_of(options: argparse.Namespace) -> Scene:
         if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
             volume, transfer = shown
         else:
-            transfer = transfer_of(options, volume) if given is None else given
+            part = None if source is None else middle_of(source)
+            transfer = transfer_of(options, volume, part) if given is None else given
         points = visible_points(volume, transfer) if is_automatic(options) else None
     return Scene(
         volume, transfer, _view(options, volume, points), mode, _lighting(options, mode), clip, source
@@ -123,10 +125,13 @@ def transfer_given(options: argparse.Namespace) -> Transfer | None:
     return over_range if options.clim else None
 
 
-def transfer_of(options: argparse.Namespace, volume: Volume) -> Transfer:
-    """The transfer function for a volume, where the options alone do not give one."""
+def transfer_of(
+    options: argparse.Namespace, volume: Volume, part: Shaped[np.ndarray, "nx ny nz"] | None = None
+) -> Transfer:
+    """The transfer function for a volume, where the options alone do not give one. `part`: of the voxels as
+    they are, where the volume is a copy."""
     if is_automatic(options):
-        return automatic_transfer(volume)
+        return automatic_transfer(volume) if part is None else transfer_by_copy(volume, part)
     return _colormap(options, (float(volume.data.min()), float(volume.data.max())))
 
 
