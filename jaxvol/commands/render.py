@@ -107,9 +107,8 @@ def rendered(
         print(f"{path}: {bricks.loads} of {counts} bricks read, {bricks.bytes_read} bytes")
         if frames.volume.shape != shape:
             copy = " x ".join(map(str, frames.volume.shape))
-            print(
-                f"{path}: what was not given (transfer function, view, step) was chosen by {copy} of the voxels"
-            )
+            what = "transfer function, view, step"
+            print(f"{path}: what was not given ({what}) was chosen by {copy} of the voxels")
     if np.any(rendering.exhausted):
         print(
             f"{path}: incomplete: rays used up their {frames.march.most_samples} samples; use a longer step"
