@@ -134,9 +134,9 @@ def of_curved(
     alive = ~at.finished
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
-    offsets = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
-    if march.quadrature != "left":
-        offsets = [offset + half for offset in offsets for half in (0, 0.5)]
+    fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
+    offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
+    returns = [_End.of(rays, back) for _, back in rays.gaps]
 
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
         depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
@@ -145,7 +145,15 @@ def of_curved(
 
     def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
         coordinate, inside = points(index)
-        return jnp.where(inside, grid.brick_of(coordinate), grid.number)
+        found = jnp.where(inside, grid.brick_of(coordinate), grid.number)
+        # A ray that comes back into the volume may leave it before the next of these points: where it comes
+        # back counts, too.
+        more = [
+            jnp.where(end.within(index, offset, march.step), grid.brick_of(end.coordinate), grid.number)
+            for end in returns
+            for offset in fronts
+        ]
+        return jnp.concatenate([found, jnp.stack(more)]) if more else found
 
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
         front = index.astype(rays.length.dtype) * march.step
@@ -183,10 +191,11 @@ def of_curved(
         index, low, high = state
         index_ = index[None] + number
         coordinate, inside = points(index_)
-        inside &= (mine[None] & (index_ <= (until + beyond)[None]) & (index_ >= 0))[None]
-        point = jnp.stack(coordinate)
-        low = jnp.minimum(low, jnp.min(jnp.where(inside[None], point, jnp.inf), axis=(1, 2, 3, 4)))
-        high = jnp.maximum(high, jnp.max(jnp.where(inside[None], point, -jnp.inf), axis=(1, 2, 3, 4)))
+        counts = mine[None] & (index_ <= (until + beyond)[None]) & (index_ >= 0)
+        low, high = _around(low, high, coordinate, inside & counts[None])
+        for end in returns:
+            held = [end.within(index_, offset, march.step) & counts for offset in fronts]
+            low, high = _around(low, high, end.coordinate, jnp.any(jnp.stack(held), axis=(0, 1)))
         return index + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)
@@ -194,3 +203,35 @@ def of_curved(
         lambda state: jnp.any(mine & (state[0] <= until + beyond)), widen, (first - beyond, nothing, -nothing)
     )
     return Found(cells, jnp.where(mine, until, first), low, high, jnp.any(mine))
+
+
+class _End(NamedTuple):
+    """Where rays come back into the volume: the depth, the grid coordinate there, and whether they do."""
+
+    depth: Float[Array, "*rays"]
+    coordinate: Vec3
+    there: Bool[Array, "*rays"]
+
+    @classmethod
+    def of(cls, rays: Ray, depth: Float[Array, "*rays"]) -> "_End":
+        known = jnp.isfinite(depth)
+        depth = jnp.where(known, depth, 0)
+        coordinate, inside = vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)
+        return cls(depth, coordinate, known & inside)
+
+    def within(
+        self, index: Int[Array, "cells *rays"], offset: Float[Array, "*rays"], step: Float[Array, ""]
+    ) -> Bool[Array, "cells *rays"]:
+        """Whether that is in cells that begin at `offset` + index."""
+        front, back = ((offset[None] + (index + more).astype(offset.dtype)) * step for more in (0, 1))
+        return self.there[None] & (front <= self.depth[None]) & (self.depth[None] < back)
+
+
+def _around(
+    low: Float[Array, "3"], high: Float[Array, "3"], coordinate: Vec3, counts: Bool[Array, "..."]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """A box, and the points that count."""
+    point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
+    low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
+    high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
+    return low, high

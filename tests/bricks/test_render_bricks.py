@@ -171,6 +171,16 @@ def test_bricks_of_a_curved_grid_are_read_once_each(bricks, order):
     assert found.bricks.reloads == 0
 
 
+def test_a_stretch_behind_a_gap_that_is_shorter_than_a_step_is_seen():
+    """No sample of equal steps lies in such a stretch; its cell is cut at its two ends."""
+    volume, probe, transfer = fog()
+    camera = jv.Camera((84, 68, 61), probe.center, (0, 0.3, 1), 40, size=(48, 48))
+    march = jv.March(6.0, (probe, jv.AlphaCorrection()))
+    whole = jv.render(volume, transfer, camera, march)
+    found = jv.render_bricks(volume, transfer, camera, march, bricks=(1, 1, 2))
+    assert_same(whole, found)
+
+
 @pytest.mark.parametrize("bricks", [(1, 1, 4), (2, 3, 2)])
 def test_without_overlap_bricks_are_read_again(bricks):
     found = of_fog("reload", bricks)
