@@ -111,7 +111,8 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
         with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
             array = jnp.asarray(cast, dtype=float)
     except (TypeError, ValueError) as fault:
-        raise ValueError(f"{name} must be numbers of shape {shape_text}; got {shortened(value)}.") from fault
+        what = f"numbers of shape {shape_text}" if shape else "a number"
+        raise ValueError(f"{name} must be {what}; got {shortened(value)}.") from fault
     expected = tuple(n for n in shape if n is not ...)
     trailing = array.shape[len(array.shape) - len(expected) :] if ... in shape else array.shape
     if len(trailing) != len(expected) or any(

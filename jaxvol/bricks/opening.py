@@ -22,6 +22,8 @@ Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs"
 """Files, of which a Zarr array or group has at least one."""
 
+NEEDED = "source must be an array, a Volume, a VoxelSource, or the path of a file or folder"
+
 OF_RAW, OF_ZARR = ("shape", "dtype"), ("axes", "index", "missing")
 
 
@@ -82,7 +84,7 @@ def levels_of(
     path = _folder_of(thing) if type(thing).__module__.partition(".")[0] == "zarr" else thing
     if isinstance(path, str | os.PathLike):
         if not str(path):
-            raise ValueError("source must be an array, a volume, or the path of a file or folder; got ''.")
+            raise ValueError(f"{NEEDED}; got ''.")
         return _of_path(Path(path), options, place)
     _refuse(described(thing), options, ())
     if isinstance(thing, VoxelSource | Volume):
@@ -92,6 +94,8 @@ def levels_of(
                 f"spacing and origin are those of {described(thing)}; got {place} as well. Leave them out."
             )
         return (source,)
+    if isinstance(thing, type) or not (hasattr(thing, "shape") or isinstance(thing, Sequence)):
+        raise ValueError(f"{NEEDED}; got {described(thing)}.")
     if is_named(thing):
         thing, told = along_xyz(thing)
         place = {name: triple(name, told.get(name)) if at is None else at for name, at in place.items()}

@@ -19,7 +19,7 @@ from ..rendering import Rendering
 from ..transfer import Transfer
 from ..transforms import AlphaCorrection, SpaceLeaping
 from ..volume import Volume
-from .opening import Openable, levels_of
+from .opening import OF_RAW, OF_ZARR, Openable, levels_of
 from .render import bricks_of, budget, render_bricks
 from .sources import VoxelSource
 from .split import TooLittleMemory, check_smallest
@@ -126,7 +126,7 @@ def plan(
     origin: Arrayable | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
     cache: Any = "beside",
-    source: dict[str, Any] | None = None,
+    source: dict[str, Any] | Any | None = None,
     **options: Any,
 ) -> Plan | BudgetPlan:
     """Finds the cheapest way to render a scene within a tolerance, and within a budget of memory.
@@ -163,6 +163,10 @@ def plan(
         raise ValueError("volume must lie along the axes of the world to be planned with memory.")
     begun, room = time.perf_counter(), budget(memory)
     place = {name: value for name, value in (("spacing", spacing), ("origin", origin)) if value is not None}
+    if not isinstance(source, dict | None) or {*(source or ())} - {*OF_RAW, *OF_ZARR}:
+        raise ValueError(
+            f"source must be a dictionary of options, of {', '.join((*OF_RAW, *OF_ZARR))}; got {source!r}."
+        )
     opened, *_ = levels_of(volume, **place, **(source or {}))
     # before anything takes time
     check_cache(cache)

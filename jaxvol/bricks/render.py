@@ -355,6 +355,11 @@ def _(perturbed: Any, scene: Scene, job: _Job) -> tuple[Rendering, Rendering]:
 
 @_differentiable.def_bwd
 def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _Job) -> Any:
+    if is_traced(cotangent):
+        raise ValueError(
+            "the gradient by bricks reads its source while it is computed, and so not inside jax.jit, "
+            "jax.vmap or jax.jacrev: call what jax.vjp returns outside of them, once for each cotangent."
+        )
     options, whole = job.options(job.outputs), of_all_outputs(rendering, cotangent)
     stream = job.stream(scene, scene, options)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0

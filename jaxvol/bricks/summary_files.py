@@ -80,7 +80,14 @@ def check_cache(cache: Any) -> None:
         return
     if not isinstance(cache, str | os.PathLike):
         raise ValueError(f'cache must be "beside", a folder, or None; got {described(cache)}.')
-    if cache != "beside" and not (folder := Path(cache)).absolute().parent.is_dir():
+    if cache == "beside":
+        return
+    if not str(cache):
+        raise ValueError("cache must be \"beside\", a folder, or None; got ''.")
+    folder = Path(cache)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f'cache must be "beside", a folder, or None; {folder} is a file.')
+    if not folder.absolute().parent.is_dir():
         raise ValueError(
             f"cache: there is no folder {folder.absolute().parent} in which {folder.name} could be made. "
             "Check the spelling, or make it."

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,5 +108,9 @@ def test_a_cache_that_is_none_is_named_before_anything_is_planned(scene, monkeyp
 def test_what_is_no_volume_is_named(scene):
     with pytest.raises(ValueError, match=r"no file no_such\.raw"):
         planned(scene, 10**9, "no_such.raw")
+    wrong: Any
+    for wrong in (3, {"depth": 8}):
+        with pytest.raises(ValueError, match="source must be a dictionary of options, of shape, dtype"):
+            jv.plan(np.zeros((8, 8, 8)), scene[2], scene[3], TOLERANCE, memory=10**6, source=wrong)
     with pytest.raises(ValueError, match=r"memory must be an integer of at least 1; got 1\.5"):
         planned(scene, 1.5)

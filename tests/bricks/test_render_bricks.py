@@ -407,7 +407,10 @@ LABELLED = jv.LabelTransferFunction({1: TRANSFER})
         ({"method": "fast"}, "method must be one of overlap, reload, naive; got 'fast'"),
         ({"outputs": "depth"}, "outputs must be one of all, rgba"),
         ({"source": "no_such.raw"}, "no_such.raw"),
-        ({"source": None}, "must be"),
+        ({"source": None}, "source must be an array, a Volume, .* got None"),
+        ({"source": {}}, "source must be an array, a Volume, "),
+        ({"cache": ""}, "cache must be .* got ''"),
+        ({"cache": __file__}, "cache must be .* is a file"),
         ({"transfer": 3}, "transfer must be a transfer function"),
         ({"transfer": LABELLED}, "bricks have no labels"),
         ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
@@ -462,6 +465,10 @@ def test_under_jit_it_says_what_to_do():
         jax.jit(image)(TRANSFER.extinction)
     with pytest.raises(ValueError, match=r"not inside jax\.jit, jax\.vmap"):
         jax.vmap(image)(TRANSFER.extinction[None])
+    found, pull = jax.vjp(image, TRANSFER.extinction)
+    for pulled in (lambda: jax.jit(pull)(found), lambda: jax.vmap(pull)(found[None])):
+        with pytest.raises(ValueError, match="the gradient by bricks reads its source"):
+            pulled()
 
 
 def test_forward_mode_and_second_order_say_what_to_do():

@@ -309,7 +309,7 @@ def test_what_cannot_be_read_in_parts_is_refused_with_what_to_do(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             source_of(tmp_path / name, **({"shape": (2, 2, 2), "dtype": "uint8"} if "raw" in name else {}))
-    with pytest.raises(ValueError, match="source must be an array, a volume, or the path"):
+    with pytest.raises(ValueError, match="source must be an array, a Volume, a VoxelSource, or the path"):
         source_of("")
     with pytest.raises(ValueError, match="a Volume with labels"):
         source_of(jv.Volume(np.zeros(SHAPE), labels=np.zeros(SHAPE, np.uint8)))

@@ -398,11 +398,14 @@ def test_where_files_lie(tmp_path, reads):
     assert summary_files_in(tmp_path) == []
 
 
-def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path):
+def test_a_folder_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
+    def refused(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("jaxvol.bricks.summary_files.whole_file", refused)
     source = data_file(tmp_path, voxels("uint8", SHAPE))
-    (tmp_path / "file").write_text("")
-    with pytest.warns(UserWarning, match=r"cannot be written .* Pass cache="):
-        found = summary_of(source, cache=tmp_path / "file")
+    with pytest.warns(UserWarning, match=r"cannot be written \(Permission denied\).* Pass cache="):
+        found = summary_of(source)
     assert_same(found, scan(source))
 
 
