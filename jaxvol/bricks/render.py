@@ -84,9 +84,9 @@ def render_bricks(
     three real volumes, from outside, far away and inside: 7e-6, 0 and 8e-8; by `Maximum`, under a transfer
     function that rises within an eightieth of the values, 3e-5). `samples` may be others, since what is empty
     is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray whose last
-    samples would lie in empty bricks is not exhausted here. `error`, under `AdaptiveSampling`, is another estimate of
-    the same error, above or below that of `render` (of ultrasound, at a tolerance of 0.003: from 0.004 above
-    to 0.018 below, where the largest was 0.03; under that steep transfer function by up to 0.18).
+    samples would lie in empty bricks is not exhausted here. `error`, under `AdaptiveSampling`, is another
+    estimate of the same error, above or below that of `render` (of ultrasound, at a tolerance of 0.003: from
+    0.004 above to 0.018 below, where the largest was 0.03; under that steep transfer function by up to 0.18).
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
