@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-Point: TypeAlias = Sequence[float | int]
+Point: TypeAlias = Sequence[float | int] | Float[np.ndarray, "3"]
 Block: TypeAlias = Float[np.ndarray, "_ _ _"]
 Distance: TypeAlias = Callable[[Block, Block, Block], Block]
 
