@@ -310,9 +310,16 @@ MUTATIONS = [
     Mutation(
         "bricks: rays are looked for at whole steps from their entry only",
         "bricks/ranges.py",
-        "offsets = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]",
-        "offsets = [0 * at.offset]",
+        "fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]",
+        "fronts = [0 * at.offset]",
         ("bricks/test_render_bricks.py::test_bricks_of_a_curved_grid_are_read_once_each",),
+    ),
+    Mutation(
+        "bricks: where a ray comes back between two samples is not looked at",
+        "bricks/ranges.py",
+        "returns = [_End.of(rays, back) for _, back in rays.gaps]",
+        "returns = [_End.of(rays, left) for left, _ in rays.gaps]",
+        ("bricks/test_render_bricks.py::test_a_stretch_behind_a_gap_that_is_shorter_than_a_step_is_seen",),
     ),
     Mutation(
         "bricks: empty ones have no gradient where rays do not leap",
