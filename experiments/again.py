@@ -1,6 +1,6 @@
 """Records results again, one after the other, each by the command of its record and in a process of its own.
 
-`python -m experiments.again` records all, which takes a day on two cores; `--only speed shading` some;
+`python -m experiments.again` records all, which takes many hours; `--only speed shading` some;
 `--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine that
 does nothing else: most results are times. A result replaces the old one when it is there as a whole, so that
 Ctrl-C loses one of them. All records are of one engine if files are not changed meanwhile.
