@@ -141,7 +141,7 @@ def test_a_flag_may_be_numpys(name):
 
 def test_a_very_long_number_is_shortened():
     for digits in (400, 5000):
-        with pytest.raises(ValueError, match="ambient must be numbers") as fault:
+        with pytest.raises(ValueError, match="ambient must be a number") as fault:
             Phong(HeadLight(), 10**digits)
         assert len(str(fault.value)) < 200
 

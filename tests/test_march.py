@@ -223,7 +223,7 @@ BAD = {
     "step 0": (lambda: jv.March(0), "step must be greater than 0; got 0"),
     "negative step": (lambda: jv.March(-0.1), "step must be greater than 0; got -0.1"),
     "NaN step": (lambda: jv.March(np.nan), "step must be finite; got nan"),
-    "text": (lambda: jv.March("half"), "step must be numbers"),
+    "text": (lambda: jv.March("half"), "step must be a number"),
     "two steps": (lambda: jv.March([0.1, 0.2]), "step must have shape"),
     "a transform twice": (
         lambda: jv.March(0.1, (jv.AlphaCorrection(), jv.EarlyTermination(0.1), jv.AlphaCorrection())),
@@ -256,7 +256,7 @@ BAD = {
         ]
     },
     "beyond float32": (lambda: jv.March(1e300), r"step must be finite in float32; got 1e\+300"),
-    "complex": (lambda: jv.March(1j), "step must be numbers"),
+    "complex": (lambda: jv.March(1j), "step must be a number"),
     "opacity left 0": (
         lambda: jv.EarlyTermination(0),
         "opacity_left must be greater than 0 and less than 1; got 0",
