@@ -224,8 +224,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
     errors = np.array([[abs(row["errors"][name]) for name in NAMES] for row in rows.values()])
     for kind, mark in ((True, "o"), (False, "^")):
         some = 100 * errors[together == kind]
+        if not len(some):
+            continue
         label = f"{len(some)} starts with {'all numbers' if kind else 'one number'} 20 % off"
-        across = at + np.linspace(-0.15, 0.15, max(len(some), 1))[:, None] + (0.03 if kind else 0)
+        across = at + np.linspace(-0.15, 0.15, len(some))[:, None] + (0.03 if kind else 0)
         axes[0].plot(across.ravel(), some.ravel(), mark, markersize=4, label=label)
     likely = [100 * np.median([row["standard errors"][name] for row in rows.values()]) for name in NAMES]
     axes[0].plot(at, likely, "k_", markersize=26, label="standard error by the covariance (median)")
