@@ -52,7 +52,9 @@ def test_info_tells_what_the_manifest_says(name, capsys):
     assert main(["info", *words]) == 0
     told = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert told["shape"].startswith(f"{' x '.join(map(str, entry['dims_xyz']))} voxels (x, y, z)")
-    spacing = np.array(told["spacing"].split(), float)
+    numbers, assumed, _ = told["spacing"].partition(" (assumed")
+    assert bool(assumed) == (entry["spacing_xyz"] is None)
+    spacing = np.array(numbers.split(), float)
     np.testing.assert_allclose(spacing, entry["spacing_xyz"] or (1, 1, 1), rtol=1e-4)
     slope, shift = entry.get("scl_slope_inter", (1, 0))
     low, high = (slope * entry[end] + shift for end in ("min", "max"))
