@@ -1,4 +1,4 @@
-"""Records results again, one after the other, each by the command of its record and in a process of its own.
+"""Records results again, one after the other, each in full and in a process of its own.
 
 `python -m experiments.again` records all, which takes many hours; `--only speed shading` some;
 `--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine that
@@ -55,7 +55,7 @@ def told(name: str, folder: Path) -> str:
 @command(
     __doc__,
     record.RESULTS,
-    only=common.some_of(dict.fromkeys(NAMES), "NAME"),
+    only=common.some_of(NAMES, "NAME"),
     list={"action": "store_true", "help": "print how long each took, and measure nothing"},
 )
 def main(chosen: Namespace) -> None:

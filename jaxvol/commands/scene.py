@@ -66,7 +66,7 @@ def scene_of(options: argparse.Namespace) -> Scene:
         if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
             volume, transfer = shown
         else:
-            part = None if source is None else middle_of(source)
+            part = middle_of(source) if source is not None and is_automatic(options) else None
             transfer = transfer_of(options, volume, part) if given is None else given
         points = visible_points(volume, transfer) if is_automatic(options) else None
     return Scene(
