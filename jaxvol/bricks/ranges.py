@@ -137,6 +137,7 @@ def of_curved(
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
     returns = [_End.of(rays, back) for _, back in rays.gaps]
+    returned_to = [grid.brick_of(end.coordinate) for end in returns]
 
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
         depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
@@ -149,8 +150,8 @@ def of_curved(
         # A ray that comes back into the volume may leave it before the next of these points: where it comes
         # back counts, too.
         more = [
-            jnp.where(end.within(index, offset, march.step), grid.brick_of(end.coordinate), grid.number)
-            for end in returns
+            jnp.where(end.within(index, offset, march.step), brick, grid.number)
+            for end, brick in zip(returns, returned_to, strict=True)
             for offset in fronts
         ]
         return jnp.concatenate([found, jnp.stack(more)]) if more else found
