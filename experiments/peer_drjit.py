@@ -1,4 +1,4 @@
-"""Marches a scene in Dr.Jit: the same rays and the same samples, compiled by LLVM.
+"""Marches a scene in Dr.Jit: the same rays and the same samples, compiled by LLVM, or for JAX's GPU by CUDA.
 
 This is the best that a compiler does without skipping: every sample between a ray's entry and its exit or
 early termination is visited. The gradient is the replay adjoint of Mitsuba's own integrators (Vicini,
@@ -11,6 +11,7 @@ Importing this file raises ImportError, with the reason, where Dr.Jit cannot run
 from importlib import import_module
 from typing import Any, Literal, TypeAlias
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -24,11 +25,15 @@ try:
     mi: Any = import_module("mitsuba")
 except ImportError as fault:
     raise ImportError("mitsuba is not installed: pip install jaxvol[peers]") from fault
-if not dr.has_backend(dr.JitBackend.LLVM):
+ON_GPU = jax.default_backend() == "gpu"
+if ON_GPU and not dr.has_backend(dr.JitBackend.CUDA):
+    raise ImportError("Dr.Jit finds no CUDA")
+if not ON_GPU and not dr.has_backend(dr.JitBackend.LLVM):
     raise ImportError(
         "Dr.Jit finds no LLVM: apt-get install libllvm19, and name its .so in DRJIT_LIBLLVM_PATH"
     )
-mi.set_variant("llvm_ad_rgb")
+VARIANT = "cuda_ad_rgb" if ON_GPU else "llvm_ad_rgb"
+mi.set_variant(VARIANT)
 
 Drjit: TypeAlias = Any
 """One of Dr.Jit's arrays: a lane for each ray."""

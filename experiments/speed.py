@@ -2,14 +2,16 @@
 
 Five scenes at steps of one voxel, two image sizes. Ours skips empty space and ends rays early; "plain" does
 neither. VTK's fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All
-use as many threads as there are cores, and their frames are drawn in turn: a ratio is the median over rounds
-of a program's time over ours. Beside each time stands the RMSE of its image, over white, against one
-converged image of ours; VTK's image is compared with that image as VTK's display would show it.
+use as many threads as there are cores; where JAX has a GPU, ours and Dr.Jit's use that. Frames are drawn in
+turn: a ratio is the median over rounds of a program's time over ours. Beside each time stands the RMSE of its
+image, over white, against one converged image of ours; VTK's image is compared with that image as VTK's
+display would show it.
 
-Also measured: the part of a frame that computes the occupancy; the time from the start of a fresh process to
-its first image (`fresh.py`); and, with --gradients, the time of an image with the gradient of every entry of
-a transfer function (256 for 8-bit data), and with that of every voxel as float32, relative to the image alone
-and to Dr.Jit's replay adjoint, with the relative difference of the two gradients.
+Also measured: the part of a frame that computes the occupancy; the time of our frame as a program under
+`jax.jit`, without what Python does before it; the time from the start of a fresh process to its first image
+(`fresh.py`); and, with --gradients, the time of an image with the gradient of every entry of a transfer
+function (256 for 8-bit data), and with that of every voxel as float32, relative to the image alone and to
+Dr.Jit's replay adjoint, with the relative difference of the two gradients.
 
 Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
 JAXVOL_DATA names; without one, only the head phantom is measured.
@@ -65,7 +67,7 @@ def peers() -> dict[str, str]:
     reason = peer_vtk.missing()
     return {
         VTK: f"not here: {reason}" if reason else version("vtk"),
-        DRJIT: f"mitsuba {version('mitsuba')}, drjit {version('drjit')}"
+        DRJIT: f"mitsuba {version('mitsuba')}, drjit {version('drjit')}, {peer_drjit.VARIANT}"
         if peer_drjit
         else f"not here: {NO_DRJIT}",
     }
@@ -86,11 +88,22 @@ def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, d
         programs[DRJIT] = marcher.draw
         rgba = marcher.rgba()
         errors[DRJIT] = rmse(rgba[..., :3] + 1 - rgba[..., 3:], truth)
-    programs["occupancy"] = occupancy(scene)
+    programs |= {"occupancy": occupancy(scene), "under jit": jitted(scene)}
     seconds = timing.interleaved(programs, repetitions)
     rows = {name: common.row(seconds[name], seconds[OURS], error) for name, error in errors.items()}
-    rows[OURS]["occupancy"] = timing.ratio(seconds["occupancy"], seconds[OURS])
+    for part in ("occupancy", "under jit"):
+        rows[OURS][part] = timing.ratio(seconds[part], seconds[OURS])
     return rows
+
+
+def jitted(scene: Scene) -> Any:
+    """Our image as a program of the user's, of which Python calls nothing but the program."""
+
+    @jax.jit
+    def image(transfer: jv.TransferFunction, camera: jv.Camera) -> jax.Array:
+        return common.image(scene._replace(transfer=transfer, camera=camera), fast(scene)).rgba
+
+    return lambda: image(scene.transfer, scene.camera)
 
 
 def occupancy(scene: Scene) -> Any:
@@ -129,13 +142,12 @@ def gradients(scene: Scene, of: Literal["transfer", "voxels"], repetitions: int)
             here = scene._replace(transfer=changed)
         return jnp.mean(common.image(here, march).rgba ** 2)
 
-    def entries(march: jv.March) -> np.ndarray:
-        found = jax.grad(loss)(leaf, march)
+    def entries(found: Any) -> np.ndarray:
         return np.asarray(found) if of == "voxels" else np.column_stack(found)
 
     # compiled as one program, like the image
     both_of = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
-    ours = entries(march)
+    ours = entries(both_of(leaf)[1])
     programs: dict[str, Any] = {
         "image": lambda: common.image(scene, march),
         "image and gradient": lambda: both_of(leaf),
@@ -150,7 +162,7 @@ def gradients(scene: Scene, of: Literal["transfer", "voxels"], repetitions: int)
         seen = np.ones(ours.shape, bool)
         if of == "transfer":
             seen[:, 3] = np.asarray(transfer.extinction > 0)
-        plain = entries(jv.March(march.step, (jv.EarlyTermination(LEFT),)))
+        plain = entries(jax.grad(loss)(leaf, jv.March(march.step, (jv.EarlyTermination(LEFT),))))
         size = np.linalg.norm(theirs)
         found["size"] = float(size)
         found["difference"] = float(np.linalg.norm((ours - theirs)[seen]) / np.linalg.norm(theirs[seen]))
@@ -216,7 +228,8 @@ def print_rows(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:
             f" [{ratio['low']:.3f}, {ratio['high']:.3f}]  RMSE {row['rmse']:.5f}",
             flush=True,
         )
-    print(f"{name:16} {size:4}  occupancy: {rows[OURS]['occupancy']['median']:.1%} of our frame", flush=True)
+    shares = (f"{part}: {rows[OURS][part]['median']:.1%} of our frame" for part in ("occupancy", "under jit"))
+    print(f"{name:16} {size:4}  {', '.join(shares)}", flush=True)
 
 
 @common.experiment(
@@ -227,22 +240,25 @@ def print_rows(name: str, size: int, rows: dict[str, dict[str, Any]]) -> None:
     sizes={"nargs": "+", "type": int, "default": SIZES},
     only=common.some_of(SCENES, "VOLUME"),
     gradients={"action": "store_true", "help": "measure gradients, too, at the first size"},
+    resolution={"type": int, "default": RESOLUTION, "help": "voxels along an axis of the head phantom"},
+    steps={"type": int, "default": 1, "help": "steps to a voxel"},
+    processes={"type": int, "default": 5, "help": "fresh processes, each of which draws a first image"},
 )
 def main(chosen: Namespace) -> common.Answer:
     folder, names = common.available(chosen, PHANTOM)
-    resolution = RESOLUTION
     if chosen.quick:
-        chosen.sizes, chosen.repetitions, resolution = (32, 48), 2, 32
+        chosen.sizes, chosen.repetitions, chosen.resolution, chosen.processes = (32, 48), 2, 32, 1
 
     there = peers()
     print(there, flush=True)
     volumes: dict[str, dict[str, Any]] = {}
     slopes: dict[str, Any] = {}
     for name in names:
-        more = {"resolution": resolution} if name == PHANTOM else {}
+        more = {"resolution": chosen.resolution} if name == PHANTOM else {}
         volumes[name] = {}
         for size in chosen.sizes:
             scene = SCENES[name](folder, size, **more)
+            scene = scene._replace(step=scene.step / chosen.steps)
             rows = volumes[name][str(size)] = images(scene, there, chosen.repetitions)
             print_rows(name, size, rows)
             if chosen.gradients and size == chosen.sizes[0]:
@@ -250,13 +266,16 @@ def main(chosen: Namespace) -> common.Answer:
                 print(f"{name:16} {size:4}  {slopes[name]}", flush=True)
     result = {
         "sizes": chosen.sizes,
+        "steps to a voxel": chosen.steps,
         "repetitions": chosen.repetitions,
         "opacity left": LEFT,
         "threads": THREADS,
         "goal": GOAL,
         "peers": there,
         "geometric means": means(volumes, chosen.sizes),
-        "first image": fresh.measure(chosen.sizes[0], resolution, LEFT, 1 if chosen.quick else 5),
+        "first image": fresh.measure(chosen.sizes[0], chosen.resolution, LEFT, chosen.processes)
+        if chosen.processes
+        else None,
         "volumes": volumes,
         "gradients": slopes,
     }

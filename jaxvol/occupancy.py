@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 from ._util.axes import XYZ, inverse
 from ._util.frame import Frame
 from ._util.memo import memoized
-from ._util.platform import while_loop
+from ._util.platform import on_gpu, while_loop
 from ._util.sharding import varying
 from ._util.vec3 import Vec3
 from ._util.xla import gather
@@ -131,7 +131,10 @@ class Sums(eqx.Module):
     @classmethod
     def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
-        for _ in range(3):
+        for axis in range(3):
+            if on_gpu():  # a loop launches a kernel for each layer
+                table = jnp.cumsum(table, axis=axis, dtype=jnp.int32)
+                continue
             # sums along the first axis, and moves it to the end; XLA's own cumulative sums are slow on CPU
             _, sums = jax.lax.scan(_add, varying(jnp.zeros_like(table[0]), table), table)
             table = jnp.moveaxis(sums, 0, 2)

@@ -27,6 +27,7 @@ from ._util.piecewise_linear import (
     variation_between,
 )
 from ._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
+from ._util.row_sums import row_sums
 from ._util.vec3 import Scalar, Vec3
 from ._util.xla import gather
 from .occupancy import Blocks
@@ -339,10 +340,10 @@ class TransferFunction(Transfer):
         means = partial(mean_by_rows, same=i == j)
         _, pull = jax.vjp(means, a, b, front[0], back[0])
         of_a, of_b, of_front, of_back = pull((color, extinction))
-        sums = jnp.zeros(rows.shape, extinction.dtype)
-        for index, part in ((i, of_a), (j, of_b)):
-            sums = sums.at[index].add(jnp.stack(part, axis=-1), mode="promise_in_bounds")
-        (transfer,) = pull_rows(sums)
+        fronts, backs = (
+            row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
+        )
+        (transfer,) = pull_rows(fronts + backs)
         return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
 
     def span_rows(self) -> Float[Array, "spans 26"]:
@@ -367,7 +368,7 @@ class TransferFunction(Transfer):
         part = past * inverse
         parts = jnp.stack([*color, extinction], axis=-1)
         shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
-        sums = jnp.zeros((rows.shape[0], 8), shared.dtype).at[interval].add(shared, mode="promise_in_bounds")
+        sums = row_sums(len(rows), interval, shared)
         at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))
         leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
         none = jax.tree.map(jnp.zeros_like, eqx.filter(self, eqx.is_inexact_array))

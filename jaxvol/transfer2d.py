@@ -29,6 +29,7 @@ from ._util.checks import (
     unit_interval,
 )
 from ._util.piecewise_linear import ROUNDING, table_row
+from ._util.row_sums import row_sums
 from ._util.vec3 import Scalar, Vec3, length
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction, extinction_of
@@ -214,9 +215,7 @@ class TransferFunction2D(Transfer):
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
         _, pull = jax.vjp(interpolate_corners, table_row(jax.lax.stop_gradient(rows), cell), along, across)
         of_row, of_along, of_across = pull((*color, extinction))
-        sums = jnp.zeros(rows.shape, extinction.dtype)
-        sums = sums.at[cell].add(jnp.stack(of_row, axis=-1), mode="promise_in_bounds")
-        (transfer,) = pull_rows(sums)
+        (transfer,) = pull_rows(row_sums(len(rows), cell, jnp.stack(of_row, axis=-1)))
         i, j = jnp.divmod(cell, self.magnitudes.shape[0] - 1)
         of_value = of_along * slope_between_lines(self.values, value, i)
         return transfer, (of_value, of_across * slope_between_lines(self.magnitudes, magnitude, j))

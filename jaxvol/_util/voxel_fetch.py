@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .axes import XYZ, Axes, inverse, permuted
+from .platform import on_gpu
+from .row_sums import without_zeros
 from .vec3 import Scalar, Vec3
 from .xla import gather
 
@@ -283,8 +285,10 @@ def scatter_add(
         for x, y in itertools.product((0, 1), repeat=2):
             # both voxels of a pair along z at once: XLA adds one update after the other
             pair = jnp.stack(cube[x][y], axis=-1).reshape(-1, 2).astype(voxels.dtype)
-            index = (base + (x * ny + y) * nz).reshape(-1, 1)
-            voxels = jax.lax.scatter_add(voxels, index, pair, _PAIRS, mode="promise_in_bounds")
+            index, mode = (base + (x * ny + y) * nz).reshape(-1), "promise_in_bounds"
+            if on_gpu():
+                index, mode = without_zeros(index, pair, voxels.size), "drop"
+            voxels = jax.lax.scatter_add(voxels, index[:, None], pair, _PAIRS, mode=mode)
     return voxels
 
 

@@ -62,20 +62,16 @@ class Tiling(NamedTuple):
         return (GPU if on_gpu() else Tiling())._replace(devices=devices)
 
 
-GPU = Tiling(batch=2**13, turns=16, tile=2**14, searched=2**16, chunk=0)
+GPU = Tiling(cells=16, batch=2**12, turns=8, tile=2**14, searched=2**16, chunk=0)
 """For GPUs, where the host waits for the device at each branch, and at each turn of a loop of unknown length
 (see `platform`). So one loop of unknown length is left, each turn of which makes up one batch of the groups
-that are alive, and marches it by `turns` segments; and a batch of 131 072 rays has a million samples in
+that are alive, and marches it by `turns` segments; and a batch of 65 536 rays has a million samples in
 flight. A tile is an image of up to 1024 × 1024 pixels.
 
-The engine and the bonsai, 512 × 512 pixels, steps of one voxel, with leaps and early termination: the host
-waits 3 times for an image, and 6 times with its gradient (`tests/engine/test_gpu_tiling.py` counts). In
-batches of 2¹² groups it would wait 5 times for the bonsai, and in batches of 2¹⁴ twice, for twice as many
-samples. Loops of unknown length remain in `AdaptiveSampling`, once a frame, and in shading with many terms
+Chosen on an H200: the head phantom of 512³ voxels, 1024 × 1024 pixels, steps of half a voxel, with leaps and
+early termination. A turn of 8 cells takes as long as one of 16, for most of it is spent between its six
+kernels; batches of 2¹³ groups take a quarter longer, as they are filled to 23 % by samples that are taken,
+rather than to 40 %. The host waits 8 times for this image (`tests/engine/test_gpu_tiling.py` counts). Loops
+of unknown length remain in `AdaptiveSampling`, once a frame, and in shading with many terms
 (`ScattererTemplates`), in each segment.
-
-Beside the image, a tile takes 110 bytes a ray, and the batch 200 bytes each of its rays; a gradient by
-transfer function and camera 260 MB for 512 × 512 pixels, 500 MB for 1024 × 1024 (of programs compiled for
-CPU). It was run on CPUs only: no time on a GPU has been measured, and none of these numbers was chosen by
-one.
 """

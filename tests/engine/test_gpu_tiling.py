@@ -22,8 +22,9 @@ from ..round_trips import counted
 from ..scenes import slow
 
 
-SMALL = GPU._replace(batch=24, turns=3, tile=16)
-"""For images of few groups: two tiles, batches that are refilled, rays that end within their turns."""
+SMALL = GPU._replace(batch=24, turns=3, tile=16, cells=Tiling().cells)
+"""For images of few groups: two tiles, batches that are refilled, rays that end within their turns. As many
+cells as on a CPU, so that as many samples lie between two leaps."""
 
 PARTS = [
     (60, (0.9, 0.6, 0.3), 0.0),
