@@ -3,15 +3,20 @@
 `python -m experiments.again` records all, which takes many hours; `--only speed shading` some;
 `--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine that
 does nothing else: most results are times. A result replaces the old one when it is there as a whole, so that
-Ctrl-C loses one of them. All records are of one engine if files are not changed meanwhile.
+Ctrl-C loses one of them. All records are of one engine if its files are not changed meanwhile: `--list` names
+those for which they were. What was recorded on a GPU is left alone where there is none.
 """
 
+import os
+import shlex
 import shutil
 import subprocess
 import sys
 from argparse import Namespace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import jax
 
 from . import common, record
 from .command import command
@@ -26,8 +31,16 @@ ARGUMENTS = {
     "scan_conversion": "scan_conversion --size 256 --repetitions 3",
     "shading": "shading --repetitions 25",
     "speed": "speed --gradients --sizes 512 --repetitions 7",
+    "speed_gpu": "speed --gradients --sizes 1024 --resolution 512 --steps 2 --processes 2 --only"
+    " 'head phantom' engine bonsai aneurism",
 }
 """What records are made by, where it is not the experiment of their name without options."""
+
+ON_GPU = ("speed_gpu",)
+"""Those that are of a GPU."""
+
+NO_ENGINE = ("cli.py", "commands", "datasets", "figures.py", "formats", "programs.py", "viewer")
+"""Parts of the package on which no result depends, but for those of its viewer, which are times of a page."""
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 
@@ -36,7 +49,7 @@ def recorded(name: str, folder: Path) -> None:
     """Measures a result and puts its files into the folder: the record, charts and pages of its name.
 
     **Raises** `subprocess.CalledProcessError` if the experiment fails; the folder is then as it was."""
-    experiment, *options = ARGUMENTS.get(name, name).split()
+    experiment, *options = shlex.split(ARGUMENTS.get(name, name))
     with TemporaryDirectory() as new:
         module = f"experiments.{experiment}"
         subprocess.run([sys.executable, "-m", module, *options, "--output", new], check=True)
@@ -49,7 +62,15 @@ def told(name: str, folder: Path) -> str:
     found = record.read(folder / f"{name}.json")
     seconds = found.get("seconds")
     took = "" if seconds is None else f"{seconds / 60:.1f} min"
-    return f"{name:20} {took:>10}  {found['commit'] or ''}"
+    changed = "  (the engine was changed since)" if engine_changed_since(found["commit"]) else ""
+    return f"{name:20} {took:>10}  {found['commit'] or ''}{changed}"
+
+
+def engine_changed_since(commit: str | None) -> bool:
+    """Whether files on which results depend differ from those of a commit, or it is not known here."""
+    others = [f":(top,exclude)jaxvol/{part}" for part in NO_ENGINE]
+    compared = ["git", "diff", "--quiet", (commit or "").rstrip("+"), "--", ":(top)jaxvol", *others]
+    return subprocess.run(compared, cwd=Path(__file__).parent, capture_output=True).returncode != 0
 
 
 @command(
@@ -59,8 +80,14 @@ def told(name: str, folder: Path) -> str:
     list={"action": "store_true", "help": "print how long each took, and measure nothing"},
 )
 def main(chosen: Namespace) -> None:
+    # this process must leave the memory of a GPU to those that it starts
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    here = chosen.list or jax.default_backend()
     for name in chosen.only:
         if not chosen.list:
+            if (here == "gpu") != (name in ON_GPU):
+                print(f"{name:20} left alone: it is not recorded on a {here}", flush=True)
+                continue
             recorded(name, chosen.output)
         print(told(name, chosen.output), flush=True)
 

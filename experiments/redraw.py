@@ -71,6 +71,7 @@ DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "scan_conversion": scan_conversion.draw,
     "shading": lambda result, path: shading.draw(result["scenes"], path),
     "speed": speed.draw,
+    "speed_gpu": speed.draw,
     "stability": stability.draw_chart,
     "viewer_latency": viewer_latency.draw,
 }

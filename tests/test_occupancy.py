@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.ndimage import distance_transform_cdt, map_coordinates
 
 import jaxvol as jv
+from jaxvol._util import platform
 from jaxvol._util.memo import memoized
 from jaxvol._util.piecewise_linear import positive_between
 from jaxvol.occupancy import BLOCK, Blocks, Occupancy, Sums
@@ -190,8 +191,10 @@ def test_hidden_labels_are_not_seen():
 # ---- boxes and distances ----
 
 
+@pytest.mark.parametrize("name", ["cpu", "gpu"])
 @pytest.mark.parametrize("density", [0.0, 0.003, 0.1, 1.0])
-def test_box_queries_agree_with_direct_inspection(density):
+def test_box_queries_agree_with_direct_inspection(density, name, monkeypatch):
+    monkeypatch.setattr(platform, "platform", lambda: name)
     rng = np.random.default_rng(3)
     occupied = rng.random((7, 5, 11)) < density
     ends = np.sort(rng.integers(0, occupied.shape, (2, 500, 3)), axis=0)

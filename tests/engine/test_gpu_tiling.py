@@ -1,7 +1,4 @@
-"""The tiling for GPUs, run on any device: it shows in no image and no gradient, and the host rarely waits.
-
-Times on a GPU have not been measured. What is counted here needs none.
-"""
+"""The tiling for GPUs, run on any device: it shows in no image and no gradient, and the host rarely waits."""
 
 from typing import Any
 
@@ -161,7 +158,6 @@ def test_rays_that_are_out_of_samples_rest_in_surplus_turns():
 
 
 def test_a_gpu_gets_its_tiling_and_all_others_that_of_the_cpu(monkeypatch):
-    assert Tiling.of_backend() == Tiling()
     for name, expected in (("cpu", Tiling()), ("tpu", Tiling()), ("gpu", GPU), ("cuda", GPU), ("rocm", GPU)):
         monkeypatch.setattr(platform, "platform", lambda name=name: name)
         assert Tiling.of_backend() == expected
