@@ -113,7 +113,10 @@ def _cond(params: Any, given: list[Any], count: RoundTrips) -> tuple[list[Any], 
 
 
 def _scan(params: Any, given: list[Any], count: RoundTrips) -> tuple[list[Any], RoundTrips]:
-    fixed, carried = params["num_consts"], params["num_carry"]
+    if "ft_in" in params:  # from jax 0.11 on
+        fixed, carried, _ = (len(part) for part in params["ft_in"].unpack())
+    else:
+        fixed, carried = params["num_consts"], params["num_carry"]
     constants, carry, every = given[:fixed], given[fixed : fixed + carried], given[fixed + carried :]
 
     def one(state: Any, each: Any) -> tuple[Any, Any]:

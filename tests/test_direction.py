@@ -99,7 +99,7 @@ def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):
     )
     assert np.asarray(expected.rgba)[..., 3].max() > 0.5
     assert (np.asarray(expected.rgba)[..., 3] == 0).any() or inside
-    np.testing.assert_allclose(rendering.rgba, expected.rgba, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(rendering.rgba, expected.rgba, rtol=0, atol=4e-5)  # rounded in another order
     seen = np.asarray(expected.rgba)[..., 3] > 0.5
     np.testing.assert_allclose(np.asarray(rendering.depth)[seen], np.asarray(expected.depth)[seen], rtol=1e-4)
 
