@@ -153,7 +153,8 @@ def test_render_composites_as_asked_for(name, volume_file, tmp_path):
     output = tmp_path / "x.npy"
     own = ["--isovalue", "120"] if name == "isosurface" else []
     look = ["--cmap", "gray", "--clim", "-100", "255", "--unit-distance", "20"]  # shows 0, too
-    assert render_file(volume_file, *look, "--compositing", name, *own, "-o", output, "--transparent") == 0
+    look += ["--compositing", name, *own, "-o", output]
+    assert render_file(volume_file, *look, "--transparent") == 0
     volume = jv.load(volume_file)
     transfer, camera = (
         jv.colormap("gray", (-100, 255), unit_distance=20),
@@ -165,6 +166,9 @@ def test_render_composites_as_asked_for(name, volume_file, tmp_path):
     expected = jv.render(volume, transfer, camera, march, compositing=mode, lighting=lighting)
     assert np.std(expected.rgba[..., 3]) > 1e-3
     np.testing.assert_allclose(np.load(output), expected.rgba, atol=2e-5)
+    assert render_file(volume_file, *look) == 0
+    behind = (1, 1, 1) if own else (0, 0, 0)  # values of a ray are light on dark
+    np.testing.assert_allclose(np.load(output), expected.image(behind), atol=2e-5)
 
 
 def test_an_isosurface_that_no_ray_meets_says_why(volume_file, tmp_path, capsys):

@@ -15,6 +15,7 @@ from .data import volume_of
 from .frames import FAST
 from .options import add_clim, add_output, scene_options
 from .progress import working
+from .scene import background_of
 
 
 def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
@@ -71,7 +72,7 @@ def _fit(options: argparse.Namespace) -> None:
         warnings.filterwarnings("ignore", message=UNDETERMINED)  # told below, of points
         result = fit(
             ImageResidual(
-                lambda transfer, camera: (volume, transfer, camera, march), views, options.background
+                lambda transfer, camera: (volume, transfer, camera, march), views, background_of(options)
             ),
             start,
             solver=options.solver,

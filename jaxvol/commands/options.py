@@ -54,7 +54,11 @@ def scene_options() -> argparse.ArgumentParser:
         help="distance between samples, world length (default: half a voxel for fit; as planned for render)",
     )
     scene.add_argument(
-        "--background", type=float, nargs=3, default=(1, 1, 1), metavar=("R", "G", "B"), help="linear RGB"
+        "--background",
+        type=float,
+        nargs=3,
+        metavar=("R", "G", "B"),
+        help="linear RGB (default: white; black behind maximum, minimum and average)",
     )
     return scene
 

@@ -81,6 +81,17 @@ def is_automatic(options: argparse.Namespace) -> bool:
     return getattr(options, "compositing", "over") == "over" and not said
 
 
+def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
+    """Linear RGB behind what is shown. On white, values of a ray, which are the lighter the greater they are,
+    could not be told from nothing."""
+    if options.background is not None:
+        red, green, blue = options.background
+        return red, green, blue
+    projects = getattr(options, "compositing", "over") in ("maximum", "minimum", "average")
+    level = 0.0 if projects else 1.0
+    return level, level, level
+
+
 def _mode(options: argparse.Namespace) -> Compositing[Any]:
     """The compositing mode that the options name."""
     shows_surface, value = options.compositing == "isosurface", options.isovalue

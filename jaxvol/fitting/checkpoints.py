@@ -7,6 +7,7 @@ written beside the old one and moved into its place in one operation; the old on
 
 import hashlib
 import io
+import itertools
 import json
 import os
 import warnings
@@ -69,8 +70,8 @@ def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]]
         for key, expected in about.items():
             if not _agree(saved.get(key), expected):
                 raise ValueError(
-                    f"checkpoint {candidate} belongs to another fit: its {key} is {saved.get(key)}, "
-                    f"that of this fit is {expected}. Choose another file, or delete this one."
+                    f"checkpoint {candidate} belongs to another fit: its {key} "
+                    f"{_differing(saved.get(key), expected)}. Choose another file, or delete this one."
                 )
         return eqx.tree_deserialise_leaves(leaves, like), saved
     return None
@@ -96,6 +97,15 @@ def _read(path: Path) -> tuple[dict[str, Any] | None, io.BytesIO]:
 def _checksum_line(content: io.BytesIO) -> bytes:
     """First line of a file with this content."""
     return b"jaxvol checkpoint, SHA-256 " + hashlib.sha256(content.getbuffer()).hexdigest().encode() + b"\n"
+
+
+def _differing(saved: Any, expected: Any) -> str:
+    """What differs, of lists the first entries that do."""
+    if not (isinstance(saved, list) and isinstance(expected, list)):
+        return f"is {saved}, that of this fit is {expected}"
+    pairs = itertools.zip_longest(saved, expected, fillvalue="nothing")
+    there, here = next((there, here) for there, here in pairs if not _agree(there, here))
+    return f"is of {there}, where that of this fit is of {here}"
 
 
 def _agree(saved: Any, expected: Any) -> bool:

@@ -539,6 +539,18 @@ def test_a_checkpoint_of_another_fit_is_refused(what, tmp_path):
         jv.fit(residual, start, solver=solver, checkpoint=tmp_path / "a")
 
 
+def test_of_a_checkpoint_of_other_parameters_the_first_that_differs_is_told(tmp_path):
+    def of(number):
+        start = {"offset": jnp.zeros(number), "scale": jnp.ones(())}
+        jv.fit(lambda p: p["offset"] * p["scale"] - 1, start, checkpoint=tmp_path / "a")
+
+    of(3)
+    with pytest.raises(
+        ValueError, match=r"its state is of float32\[3\], where that of this fit is of float32\[2\]\. Choose"
+    ):
+        of(2)
+
+
 KILLED = """
 import time
 import sys
