@@ -18,7 +18,7 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
-from jaxvol.automatic import transfer_by_copy
+from jaxvol.automatic import front_of, transfer_by_copy, upright
 from jaxvol.automatic.sampling import SAMPLED
 from jaxvol.bricks import source_of
 from jaxvol.cli import main
@@ -169,6 +169,22 @@ def test_render_composites_as_asked_for(name, volume_file, tmp_path):
     assert render_file(volume_file, *look) == 0
     behind = (1, 1, 1) if own else (0, 0, 0)  # values of a ray are light on dark
     np.testing.assert_allclose(np.load(output), expected.image(behind), atol=2e-5)
+
+
+def test_what_one_face_cuts_stands_on_it_also_in_colours_of_ones_own(tmp_path):
+    file, output = tmp_path / "block.npy", tmp_path / "x.npy"
+    data = np.zeros((12, 12, 12), np.uint8)
+    data[5:, 4:9, 3:8] = 200
+    np.save(file, data)
+    up = upright(jv.load(file))
+    assert up is not None
+    np.testing.assert_array_equal(up, (-1, 0, 0))
+    images = []
+    for view in ([], ["--view-up", *up, "--direction", *front_of(up)], ["--view-up", 0, 0, 1]):
+        assert render_file(file, "--cmap", "gray", "--transparent", "-o", output, *view) == 0
+        images.append(np.load(output))
+    np.testing.assert_array_equal(images[0], images[1])
+    assert np.abs(images[0] - images[2]).max() > 0.1
 
 
 def test_an_isosurface_that_no_ray_meets_says_why(volume_file, tmp_path, capsys):

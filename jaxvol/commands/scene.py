@@ -167,7 +167,7 @@ def _view(options: argparse.Namespace, volume: Volume, points: Float[np.ndarray,
     if options.camera and options.direction:
         raise ValueError("--camera sets the position; leave out --direction.")
     up, side = options.view_up, options.direction
-    free = points is not None and up is side is options.camera is None
+    free = up is side is options.camera is None
     if free and not says_where_it_lies(options.file) and (found := upright(volume)) is not None:
         up, side = found, front_of(found)
     view: dict[str, Any] = {
