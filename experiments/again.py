@@ -39,7 +39,10 @@ ARGUMENTS = {
 ON_GPU = ("speed_gpu",)
 """Those that are of a GPU."""
 
-NO_ENGINE = ("cli.py", "commands", "datasets", "figures.py", "formats", "programs.py", "viewer")
+NO_ENGINE = (
+    *("cli.py", "commands", "datasets", "figures.py", "fitting/checkpoints.py", "formats", "programs.py"),
+    "viewer",
+)
 """Parts of the package on which no result depends, but for those of its viewer, which are times of a page."""
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
