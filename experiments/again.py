@@ -45,6 +45,9 @@ NO_ENGINE = (
 )
 """Parts of the package on which no result depends, but for those of its viewer, which are times of a page."""
 
+BY_BRICKS = "bricks", "out_of_core", "pareto", "stability"
+"""Those for which volumes are rendered by bricks."""
+
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 
 
@@ -65,13 +68,14 @@ def told(name: str, folder: Path) -> str:
     found = record.read(folder / f"{name}.json")
     seconds = found.get("seconds")
     took = "" if seconds is None else f"{seconds / 60:.1f} min"
-    changed = "  (the engine was changed since)" if engine_changed_since(found["commit"]) else ""
+    changed = "  (the engine was changed since)" if engine_changed_since(found["commit"], name) else ""
     return f"{name:20} {took:>10}  {found['commit'] or ''}{changed}"
 
 
-def engine_changed_since(commit: str | None) -> bool:
-    """Whether files on which results depend differ from those of a commit, or it is not known here."""
-    others = [f":(top,exclude)jaxvol/{part}" for part in NO_ENGINE]
+def engine_changed_since(commit: str | None, name: str) -> bool:
+    """Whether files on which this result depends differ from those of a commit, or it is not known here."""
+    parts = NO_ENGINE if name in BY_BRICKS else (*NO_ENGINE, "bricks")
+    others = [f":(top,exclude)jaxvol/{part}" for part in parts]
     compared = ["git", "diff", "--quiet", (commit or "").rstrip("+"), "--", ":(top)jaxvol", *others]
     return subprocess.run(compared, cwd=Path(__file__).parent, capture_output=True).returncode != 0
 

@@ -240,8 +240,10 @@ class Stream:
             reached = jnp.zeros(rays.length.shape, jnp.int32)
             others = nowhere.copy()
             others[brick] = False
-            own, load = jnp.asarray(~others), None
-            turn = Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(others), own, jnp.asarray(others))
+            own, load = ~others, None
+            own[-1] = True  # a ray goes on through a gap, in which there is no brick
+            outside = jnp.asarray(others)
+            turn = Turn(jnp.asarray(brick, jnp.int32), outside, jnp.asarray(own), outside)
             while self.visible[brick]:
                 found = _cells_of_curved(
                     self.mesh, self.grid, 0, self.scene.march, rays, living[0], reached, turn

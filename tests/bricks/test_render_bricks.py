@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.bricks import BrickGrid, VoxelSource, source_of, summary_files
+from jaxvol.bricks import BrickGrid, VoxelSource, source_of, stream, summary_files
 from jaxvol.bricks.sources import ArraySource
 from jaxvol.bricks.stream import Stream
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
@@ -209,9 +209,17 @@ def test_no_more_is_read_at_a_time_than_the_largest_brick_takes(monkeypatch):
     assert np.all(np.array(bricks.stored) <= np.max(needed, axis=0))
 
 
-def test_the_naive_order_is_visibly_wrong():
+def test_the_naive_order_is_visibly_wrong(monkeypatch):
+    turns, cells_of = [], stream._cells_of_curved
+
+    def counted(*given):
+        turns.append(given)
+        return cells_of(*given)
+
+    monkeypatch.setattr(stream, "_cells_of_curved", counted)
     found = of_fog("naive", (1, 1, 4))
     assert found.bricks.loads == 4
+    assert len(turns) <= 16  # stretches of rays, not single cells: at most three of a brick, and none
     wrong = np.abs(np.asarray(found.rgba - whole_fog().rgba))[..., :3].max(-1)
     assert wrong.max() > 0.1
     assert np.mean(wrong > 0.02) > 0.01
