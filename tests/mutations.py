@@ -1416,6 +1416,41 @@ MUTATIONS = [
         "jnp.arange(chosen.size, dtype=jnp.int32), 0)",
         ("_util/test_compaction.py::test_all_at_once_each_chosen_one_is_put_where_it_was_and_no_other",),
     ),
+    Mutation(
+        "gpu: zeros are added, all to the same place",
+        "_util/row_sums.py",
+        "jnp.any(rows != 0, axis=-1)",
+        "jnp.any(rows == rows, axis=-1)",
+        ("_util/test_row_sums.py::test_zeros_are_left_out_and_the_rows_of_one_index_are_dealt_to_copies",),
+    ),
+    Mutation(
+        "gpu: the rows of copies of a table overlap",
+        "_util/row_sums.py",
+        "number * copy + index",
+        "copy + index",
+        ("_util/test_row_sums.py::test_sums_are_those_of_float64",),
+    ),
+    Mutation(
+        "gpu: voxels to which something is added are left out",
+        "_util/voxel_fetch.py",
+        'without_zeros(index, pair, voxels.size), "drop"',
+        'without_zeros(index, pair[:, :1], voxels.size), "drop"',
+        ("_util/test_voxel_fetch.py::test_cubes_are_added_to_the_voxels_that_they_were_fetched_from",),
+    ),
+    Mutation(
+        "gpu: sums of occupied cells miss an axis",
+        "occupancy.py",
+        "table = jnp.cumsum(table, axis=axis, dtype=jnp.int32)",
+        "table = jnp.cumsum(table, axis=min(axis, 1), dtype=jnp.int32)",
+        ("test_occupancy.py::test_box_queries_agree_with_direct_inspection",),
+    ),
+    Mutation(
+        "bricks: in naive order, rays stop after each cell",
+        "bricks/stream.py",
+        "own[-1] = True",
+        "own[-1] = False",
+        ("bricks/test_render_bricks.py::test_the_naive_order_is_visibly_wrong",),
+    ),
     # direction
     Mutation(
         "direction: rays are not turned into the cells of what is visible",
