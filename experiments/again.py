@@ -3,8 +3,8 @@
 `python -m experiments.again` records all, which takes many hours; `--only speed shading` some;
 `--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine that
 does nothing else: most results are times. A result replaces the old one when it is there as a whole, so that
-Ctrl-C loses one of them. All records are of one engine if its files are not changed meanwhile: `--list` names
-those for which they were. What was recorded on a GPU is left alone where there is none.
+Ctrl-C loses one of them. All records are of one engine if its code is not changed meanwhile: `--list` names
+those for which it was (`changes.py`). What was recorded on a GPU is left alone where there is none.
 """
 
 import os
@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 import jax
 
 from . import common, record
+from .changes import changed_since
 from .command import command
 
 
@@ -38,15 +39,6 @@ ARGUMENTS = {
 
 ON_GPU = ("speed_gpu",)
 """Those that are of a GPU."""
-
-NO_ENGINE = (
-    *("cli.py", "commands", "datasets", "figures.py", "fitting/checkpoints.py", "formats", "programs.py"),
-    "viewer",
-)
-"""Parts of the package on which no result depends, but for those of its viewer, which are times of a page."""
-
-BY_BRICKS = "bricks", "out_of_core", "pareto", "stability"
-"""Those for which volumes are rendered by bricks."""
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 
@@ -68,16 +60,8 @@ def told(name: str, folder: Path) -> str:
     found = record.read(folder / f"{name}.json")
     seconds = found.get("seconds")
     took = "" if seconds is None else f"{seconds / 60:.1f} min"
-    changed = "  (the engine was changed since)" if engine_changed_since(found["commit"], name) else ""
+    changed = "  (code was changed since)" if changed_since(found["commit"], name) else ""
     return f"{name:20} {took:>10}  {found['commit'] or ''}{changed}"
-
-
-def engine_changed_since(commit: str | None, name: str) -> bool:
-    """Whether files on which this result depends differ from those of a commit, or it is not known here."""
-    parts = NO_ENGINE if name in BY_BRICKS else (*NO_ENGINE, "bricks")
-    others = [f":(top,exclude)jaxvol/{part}" for part in parts]
-    compared = ["git", "diff", "--quiet", (commit or "").rstrip("+"), "--", ":(top)jaxvol", *others]
-    return subprocess.run(compared, cwd=Path(__file__).parent, capture_output=True).returncode != 0
 
 
 @command(
@@ -87,16 +71,18 @@ def engine_changed_since(commit: str | None, name: str) -> bool:
     list={"action": "store_true", "help": "print how long each took, and measure nothing"},
 )
 def main(chosen: Namespace) -> None:
+    if chosen.list:
+        print("\n".join(told(name, chosen.output) for name in chosen.only))
+        return
     # this process must leave the memory of a GPU to those that it starts
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    here = chosen.list or jax.default_backend()
+    platform = jax.default_backend()
     for name in chosen.only:
-        if not chosen.list:
-            if (here == "gpu") != (name in ON_GPU):
-                print(f"{name:20} left alone: it is not recorded on a {here}", flush=True)
-                continue
+        if (platform == "gpu") == (name in ON_GPU):
             recorded(name, chosen.output)
-        print(told(name, chosen.output), flush=True)
+            print(told(name, chosen.output), flush=True)
+        else:
+            print(f"{name:20} left alone: it is not recorded on a {platform}", flush=True)
 
 
 if __name__ == "__main__":

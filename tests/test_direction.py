@@ -99,7 +99,9 @@ def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):
     )
     assert np.asarray(expected.rgba)[..., 3].max() > 0.5
     assert (np.asarray(expected.rgba)[..., 3] == 0).any() or inside
-    np.testing.assert_allclose(rendering.rgba, expected.rgba, rtol=0, atol=4e-5)  # rounded in another order
+    different = np.abs(np.asarray(rendering.rgba) - np.asarray(expected.rgba))
+    assert np.mean(different > 2e-5) < 2e-3  # positions are rounded otherwise: one in 1280 by jax 0.11
+    assert different.max() < 4e-5
     seen = np.asarray(expected.rgba)[..., 3] > 0.5
     np.testing.assert_allclose(np.asarray(rendering.depth)[seen], np.asarray(expected.depth)[seen], rtol=1e-4)
 

@@ -24,6 +24,7 @@ from experiments import (
     speed,
     tomography,
 )
+from experiments.changes import changed_since
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.scenes import PHANTOM
 from jaxvol import cli, figures
@@ -187,6 +188,36 @@ def test_every_record_can_be_made_again(capsys):
     assert set(again.NAMES) == {*EXPERIMENTS, *again.ARGUMENTS}
     again.main(["--list"])
     assert len(capsys.readouterr().out.splitlines()) == len(again.NAMES)
+
+
+def test_a_record_is_old_once_code_on_which_it_depends_is_changed(tmp_path):
+    def git(*words):
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        ran = subprocess.run(["git", "-C", str(tmp_path), *who, *words], check=True, capture_output=True)
+        return ran.stdout.decode().strip()
+
+    files = {"engine.py": '"""Of what."""\n\nA = 1  # why\n', "bricks/a.py": "B = 1\n", "cli.py": "C = 1\n"}
+    for file, text in files.items():
+        (tmp_path / "jaxvol" / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "jaxvol" / file).write_text(text)
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    commit = git("rev-parse", "--short", "HEAD")
+
+    def old():
+        return [name for name in ("bricks", "speed") if changed_since(f"{commit}+", name, tmp_path)]
+
+    assert old() == []
+    (tmp_path / "jaxvol" / "engine.py").write_text('"""Of something else."""\n\nA = 1\n\n"""One."""\n')
+    (tmp_path / "jaxvol" / "cli.py").write_text("C = 2\n")
+    assert old() == []
+    (tmp_path / "jaxvol" / "bricks" / "a.py").write_text("B = 2\n")
+    assert old() == ["bricks"]
+    (tmp_path / "jaxvol" / "engine.py").unlink()
+    assert old() == ["bricks", "speed"]
+    assert changed_since(None, "speed", tmp_path)
+    assert changed_since("0123456", "speed", tmp_path)
 
 
 @pytest.mark.slow

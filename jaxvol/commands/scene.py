@@ -24,7 +24,7 @@ from ..formats import says_where_it_lies
 from ..isosurface import Isosurface
 from ..lighting import Lighting, Phong
 from ..march import Transform
-from ..modes import compositing_of
+from ..modes import MODES, compositing_of
 from ..presets import SHADED, colormap, preset
 from ..projections import Average
 from ..transfer import Transfer
@@ -82,12 +82,12 @@ def is_automatic(options: argparse.Namespace) -> bool:
 
 
 def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
-    """Linear RGB behind what is shown. On white, values of a ray, which are the lighter the greater they are,
-    could not be told from nothing."""
+    """Linear RGB behind what is shown. The greater the values of a projection, the lighter it is: on white, the
+    greatest could not be seen."""
     if options.background is not None:
         red, green, blue = options.background
         return red, green, blue
-    projects = getattr(options, "compositing", "over") in ("maximum", "minimum", "average")
+    projects = getattr(options, "compositing", "over") in MODES.keys() - {"over"}
     level = 0.0 if projects else 1.0
     return level, level, level
 
