@@ -82,8 +82,8 @@ def is_automatic(options: argparse.Namespace) -> bool:
 
 
 def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
-    """Linear RGB behind what is shown. The greater the values of a projection, the lighter it is: on white, the
-    greatest could not be seen."""
+    """Linear RGB behind what is shown. The greater the values of a projection, the lighter it is: on white,
+    the greatest could not be seen."""
     if options.background is not None:
         red, green, blue = options.background
         return red, green, blue
