@@ -492,6 +492,10 @@ BAD = {
     "no file": (["nowhere.raw"], "error: there is no file"),
     "preset": (["nowhere.raw", "--preset", "moon"], "preset must be one of"),
     "cmap": (["nowhere.raw", "--cmap", "moon"], "cmap must be"),
+    "background": (
+        ["nowhere.raw", "--background", "200", "0", "nan"],
+        "--background must be three numbers from 0 to 1 (linear RGB); got 200 0 nan.",
+    ),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
     "size": (["FILE", "--size", "0", "5"], "size must be"),
     "camera": (["FILE", "--camera", "1", "1", "1", "1", "1", "1"], "position must differ from focal_point"),
@@ -639,6 +643,11 @@ def test_a_transfer_function_is_read_as_it_was_written(tmp_path):
             ["fit", "x.raw", "--images", "a.png", "--cameras", "c.json", "--solver", "newton"],
             "fit: error: argument --solver: invalid choice: 'newton'",
         ),
+        (
+            ["render", "x.raw", "--sise", "9", "9"],
+            "jaxvol render: error: unrecognized arguments: --sise 9 9. Did you mean --size? (jaxvol render -",
+        ),
+        (["info", "x.raw", "y.raw"], "jaxvol info: error: unrecognized arguments: y.raw (jaxvol info --help"),
         (["datasets", "fetch"], "datasets fetch: error: the following arguments are required: NAME"),
         (["paint"], "jaxvol: error: argument COMMAND: invalid choice: 'paint' (choose from"),
     ],

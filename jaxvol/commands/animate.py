@@ -19,7 +19,7 @@ from .options import add_output, scene_options, view_options
 from .orbit import angles_of, axis_of, turned, views_of
 from .progress import working
 from .recorded import checksum, settings_of, text_of, transfer_from_file
-from .scene import Scene, background_of, scene_of
+from .scene import Scene, scene_of
 
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -78,10 +78,10 @@ def _images(options: argparse.Namespace, scene: Scene, count: int, folder: Path 
     """The frames, one after the other; written into the folder if one is given."""
     frames = frames_of(options, scene, views_of(options, scene.camera, options.degrees))
     digest = checksum(options.file) if folder else ""
-    axis, background = axis_of(options, scene.camera), background_of(options)
+    axis = axis_of(options, scene.camera)
     with working(f"rendering {options.output}, frames") as told:
         for number, angle in enumerate(angles_of(options.degrees, count)):
-            image = frames.render(turned(scene.camera, angle, axis)).image(background)
+            image = frames.render(turned(scene.camera, angle, axis)).image(scene.background)
             if folder is not None:
                 turn = {"turn": angle, "orbit": options.degrees}
                 held = transfer_from_file(options, scene.transfer)

@@ -61,6 +61,7 @@ def _fit(options: argparse.Namespace) -> None:
     # what is wrong with these is told before the volume is read
     views = read_views(options.images, options.cameras)
     start = read_transfer(options.start) if options.start else None
+    background = background_of(options)
     with working(f"reading {options.file}"):
         volume = volume_of(options)
     # half a voxel
@@ -71,9 +72,7 @@ def _fit(options: argparse.Namespace) -> None:
     with working("fitting, steps") as told, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=UNDETERMINED)  # told below, of points
         result = fit(
-            ImageResidual(
-                lambda transfer, camera: (volume, transfer, camera, march), views, background_of(options)
-            ),
+            ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
             start,
             solver=options.solver,
             max_steps=options.max_steps,

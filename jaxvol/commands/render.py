@@ -18,7 +18,7 @@ from .options import add_output, scene_options, view_options
 from .orbit import axis_of, turned, views_of
 from .progress import working
 from .recorded import settings_of, text_of, transfer_from_file
-from .scene import background_of, scene_of
+from .scene import scene_of
 
 
 def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "") -> None:
@@ -73,7 +73,7 @@ def _render(options: argparse.Namespace) -> None:
     if options.output.suffix.lower() == ".png":
         held = transfer_from_file(options, scene.transfer)
         told = text_of("render", settings_of(options), options.file, transfer=held)
-    image = rendering.rgba if options.transparent else rendering.image(background_of(options))
+    image = rendering.rgba if options.transparent else rendering.image(scene.background)
     save_image(options.output, image, text=told)
     if options.depth:
         print(f"{save_image(options.depth, rendering.depth)}: distances, world length")

@@ -47,6 +47,7 @@ class Scene(NamedTuple):
     camera: Camera
     compositing: Compositing[Any]
     lighting: Lighting | None
+    background: tuple[float, float, float]
     clip: tuple[Transform, ...]
     source: VoxelSource | None
 
@@ -54,6 +55,7 @@ class Scene(NamedTuple):
 def scene_of(options: argparse.Namespace) -> Scene:
     """The scene that the options describe."""
     mode = _mode(options)
+    background = background_of(options)
     clip = _clip(options)
     given = transfer_given(options)
     source = None
@@ -69,9 +71,8 @@ def scene_of(options: argparse.Namespace) -> Scene:
             part = middle_of(source) if source is not None and is_automatic(options) else None
             transfer = transfer_of(options, volume, part) if given is None else given
         points = visible_points(volume, transfer) if is_automatic(options) else None
-    return Scene(
-        volume, transfer, _view(options, volume, points), mode, _lighting(options, mode), clip, source
-    )
+    camera = _view(options, volume, points)
+    return Scene(volume, transfer, camera, mode, _lighting(options, mode), background, clip, source)
 
 
 def is_automatic(options: argparse.Namespace) -> bool:
@@ -83,9 +84,16 @@ def is_automatic(options: argparse.Namespace) -> bool:
 
 def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
     """Linear RGB behind what is shown. The greater the values of a projection, the lighter it is: on white,
-    the greatest could not be seen."""
+    the greatest could not be seen.
+
+    **Raises:** `ValueError` for numbers that no image file can hold."""
     if options.background is not None:
         red, green, blue = options.background
+        if not all(0 <= each <= 1 for each in options.background):
+            raise ValueError(
+                "--background must be three numbers from 0 to 1 (linear RGB); "
+                f"got {red:g} {green:g} {blue:g}."
+            )
         return red, green, blue
     projects = getattr(options, "compositing", "over") in MODES.keys() - {"over"}
     level = 0.0 if projects else 1.0

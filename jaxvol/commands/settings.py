@@ -44,7 +44,11 @@ def parsed(
             _relax(action)
             # argparse would convert what says SUPPRESS for a positional argument
             action.default = argparse.SUPPRESS if action.option_strings else None
-    given = {name: value for name, value in vars(loose.parse_args(words)).items() if value is not None}
+    found, unknown = loose.parse_known_args(words)
+    given = {name: value for name, value in vars(found).items() if value is not None}
+    if unknown:
+        command = _chosen(loose, given)
+        command.error(_told_unknown(command, unknown))
     settings: dict[str, Any] = {}
     parser = make()
     command = _chosen(parser, given)
@@ -63,6 +67,13 @@ def parsed(
             _relax(action)
     command.set_defaults(**settings)
     return parser.parse_args(words)
+
+
+def _told_unknown(command: argparse.ArgumentParser, unknown: Sequence[str]) -> str:
+    flags = [flag for action in command._actions for flag in action.option_strings]
+    near = [flag for word in unknown for flag in get_close_matches(word.partition("=")[0], flags, 1)]
+    hint = f". Did you mean {near[0]}?" if near else ""
+    return f"unrecognized arguments: {' '.join(unknown)}{hint}"
 
 
 def _without_rivals(settings: dict[str, Any], stronger: dict[str, Any]) -> dict[str, Any]:
