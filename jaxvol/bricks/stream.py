@@ -46,6 +46,10 @@ BEAMS = 32
 """Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
 rays."""
 
+KEPT = 64 * 2**20
+"""Bytes that are read before what was freed meanwhile goes back to the system. That takes some 8 ms, as long
+as to read so many; and pages that went back are slow when they are needed again."""
+
 
 class Load(NamedTuple):
     """A brick that is being read, and the cells for which."""
@@ -160,12 +164,14 @@ class Stream:
         march: Callable[[Volume, CellRange, State], State],
     ) -> State:
         """The state after `march(part, cells, state)` of all bricks."""
-        living = [where(state)]
+        living, returned = [where(state)], self.bytes_read
         turns = self._turns(rays, living)
         load = next(turns, None)
         while load is not None:
             jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
-            give_back()  # decoders keep what they freed, as much as a brick
+            if self.bytes_read - returned >= KEPT:
+                give_back()
+                returned = self.bytes_read
             part, cells = self._part(load), load.cells
             load = None  # and with it the voxels as they were read
             following = next(turns, None)
@@ -279,7 +285,10 @@ class Stream:
 
     def around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
         low, high = (np.asarray(end) for end in self.grid.cells(brick))
-        margin = np.asarray(self.margin.of_box(self.space, self.grid.shape, low, high))
+        cells = self.margin.cells  # where rays are straight, of any box
+        if not self.straight:
+            cells = self.margin.of_box(self.space, self.grid.shape, low, high)
+        margin = np.asarray(cells)
         return low - margin, high + margin
 
     def _box(self, found: Found) -> tuple[np.ndarray, np.ndarray]:
