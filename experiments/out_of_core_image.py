@@ -5,7 +5,6 @@ then the volume is read into memory, and rendered as a whole. Called by `experim
 """
 
 import json
-import resource
 import sys
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 import jaxvol as jv
 
+from .peak_memory import peak
 from .scenes import seen_head
 
 
@@ -23,11 +23,6 @@ THIN = 0.02
 """Factor to the extinction in the scene of which all is seen."""
 REPETITIONS = 2
 """Images that are timed of each scene, once programs are compiled and ranges of values known."""
-
-
-def peak() -> float:
-    """The greatest resident memory of this process so far, MiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def read() -> float:

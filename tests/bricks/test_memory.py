@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments.peak_memory import STATUS
 from jaxvol.bricks.files import FileSource
 
 from .test_render_bricks import TRANSFER, balls, outside
@@ -23,29 +24,31 @@ BUDGET = 24
 BESIDE = 48
 """MiB that an image of 32 x 32 pixels may take beside its voxels, once its programs are compiled."""
 
+LINUX = pytest.mark.skipif(not STATUS.exists(), reason="needs Linux's /proc")
+
+PEAK = """
+    from experiments.peak_memory import peak
+    print(peak())
+"""
+
 IMAGES = """
     import sys
-    from pathlib import Path
     import jax, jaxvol as jv
+    from experiments.peak_memory import forget_peak, held, peak
     from jaxvol.bricks.files import FileSource
     path, n, budget = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     transfer = jv.TransferFunction([0, 255], [[1, 1, 1]] * 2, [1e-3, 1e-3])
     camera = jv.Camera((3 * n, -2 * n, n), (n / 2, n / 2, n / 2), (0, 0, 1), 30.0, size=(32, 32))
 
-    def peak():
-        clear = Path("/proc/self/clear_refs")
-        clear.write_text("5")  # the peak so far is forgotten
-        before = memory("VmRSS")
+    def measure():
+        forget_peak()
+        before = held()
         march, raw = jv.March(1.0, (jv.SpaceLeaping(),)), {"shape": (n, n, n), "dtype": "uint8"}
         image = jv.render_bricks(path, transfer, camera, march, memory=budget, cache=None, **raw)
-        print(image.bricks.loads, image.bricks.needed, (memory("VmHWM") - before) / 1024)
+        print(image.bricks.loads, image.bricks.needed, peak() - before)
 
-    def memory(name):
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith(name))
-
-    peak()  # compiles
-    peak()
+    measure()  # compiles
+    measure()
     some = FileSource._stored
 
     def all_of_it(source, low, high, axes):
@@ -53,7 +56,7 @@ IMAGES = """
         return whole[tuple(map(slice, low, high))].transpose(axes)
 
     FileSource._stored = all_of_it
-    peak()
+    measure()
 """
 
 
@@ -61,8 +64,16 @@ def program(text: str, *arguments: object) -> list[str]:
     return [sys.executable, "-c", textwrap.dedent(text), *map(str, arguments)]
 
 
+@LINUX
+def test_a_peak_is_that_of_the_process_alone():
+    """And not of what started it, which may have held more than any bound asks for."""
+    here = b"." * 2**28
+    run = subprocess.run(program(PEAK), capture_output=True, text=True, check=True)
+    assert 1 < float(run.stdout) < 64 < len(here) / 2**20
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="needs Linux's /proc")
+@LINUX
 def test_memory_stays_within_the_budget_and_30_percent(tmp_path):
     """In a process of its own. That reading everything would be seen is tested beside it."""
     path = tmp_path / "data.raw"

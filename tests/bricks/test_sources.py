@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments.peak_memory import STATUS
 from jaxvol.bricks import files, sources
 from jaxvol.bricks.files import FileSource
 from jaxvol.bricks.opening import levels_of, source_of
@@ -410,11 +411,13 @@ def test_voxels_that_are_converted_take_little_more_than_what_they_become(kind, 
     np.testing.assert_array_equal(source.read(low, high, (1, 2, 0)), data[3:, 2:, 1:].transpose(1, 2, 0))
 
 
+@pytest.mark.skipif(not STATUS.exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize("kind", ["raw", "memmap"])
 def test_memory_is_bounded_by_the_box_whatever_is_read(kind, tmp_path):
     """In a process of its own: all of a sparse file of 500 MiB is read, in boxes of 1 MiB."""
     program = f"""
-        import resource, numpy as np
+        import numpy as np
+        from experiments.peak_memory import peak
         from jaxvol.bricks.opening import source_of
         path, n = {str(tmp_path / "data.raw")!r}, 800
         with open(path, "wb") as file:
@@ -424,12 +427,12 @@ def test_memory_is_bounded_by_the_box_whatever_is_read(kind, tmp_path):
         else:
             source = source_of(np.memmap(path, np.uint8, "r", shape=(n, n, n)))
         source.read((0, 0, 0), (100, 100, 100))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        before = peak()
         for x in range(0, n, 100):
             for y in range(0, n, 100):
                 for z in range(0, n, 100):
                     source.read((x, y, z), (x + 100, y + 100, z + 100))
-        print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+        print(peak() - before)
     """
     run = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=True

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments.peak_memory import STATUS
 from jaxvol.bricks import streaming, summary as summaries, summary_files
 from jaxvol.bricks.dtypes import range_of
 from jaxvol.bricks.opening import source_of
@@ -441,7 +442,7 @@ def test_an_interrupted_pass_leaves_no_file_and_the_old_one_as_it_was(tmp_path, 
 
 
 PASS = """
-    import resource
+    from experiments.peak_memory import peak
     from jaxvol.bricks.opening import source_of
     from jaxvol.bricks.summary_files import summary_of
     path, n = {path!r}, {n}
@@ -450,12 +451,12 @@ PASS = """
     source = source_of(path, shape=(n, n, n), dtype="uint8")
 
     def told(done, whole):
-        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        peaks.append(peak())
         print(done, flush=True)
 
-    peaks = [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]
+    peaks = [peak()]
     summary_of(source, 32, memory={memory}, progress=told)
-    print("peak", (peaks[-1] - peaks[0]) / 1024)
+    print("peak", peaks[-1] - peaks[0])
 """
 
 
@@ -464,6 +465,7 @@ def program(path, n, memory):
     return [sys.executable, "-c", textwrap.dedent(text)]
 
 
+@pytest.mark.skipif(not STATUS.exists(), reason="needs Linux's /proc")
 def test_a_pass_that_is_killed_damages_nothing(tmp_path):
     path = tmp_path / "data.raw"
     process = subprocess.Popen(program(path, 320, 2**21), stdout=subprocess.PIPE)
@@ -476,6 +478,7 @@ def test_a_pass_that_is_killed_damages_nothing(tmp_path):
     assert summary_of(source, 32).range_of((0, 0, 0), (320, 320, 320)) == (0, 0)
 
 
+@pytest.mark.skipif(not STATUS.exists(), reason="needs Linux's /proc")
 def test_memory_of_a_pass_is_bounded(tmp_path):
     """In a process of its own, over a sparse file of 250 MiB: 16 MiB are allowed; compiling takes more."""
     run = subprocess.run(
