@@ -13,6 +13,7 @@ import pytest
 
 import jaxvol as jv
 from experiments.peak_memory import STATUS
+from jaxvol.bricks import stream
 from jaxvol.bricks.files import FileSource
 
 from .test_render_bricks import TRANSFER, balls, outside
@@ -70,6 +71,18 @@ def test_a_peak_is_that_of_the_process_alone():
     here = b"." * 2**28
     run = subprocess.run(program(PEAK), capture_output=True, text=True, check=True)
     assert 1 < float(run.stdout) < 64 < len(here) / 2**20
+
+
+def test_what_was_freed_goes_back_once_much_was_read(file, monkeypatch):
+    """After each of many small bricks it would take longer than their images."""
+    returns = []
+    monkeypatch.setattr(stream, "give_back", lambda: returns.append(None))
+    bricks = rendered(file).bricks
+    assert bricks.loads > 2
+    assert returns == []
+    monkeypatch.setattr(stream, "KEPT", 2 * bricks.bytes_read // bricks.loads)
+    rendered(file)
+    assert len(returns) == bricks.loads // 2
 
 
 @pytest.mark.slow
