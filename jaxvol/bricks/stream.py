@@ -47,8 +47,8 @@ BEAMS = 32
 rays."""
 
 KEPT = 64 * 2**20
-"""Bytes that are read before what was freed meanwhile, by decoders as much as a brick, goes back to the system.
-That takes some 8 ms, and after each of many small bricks took longer than their image."""
+"""Bytes that are read before what was freed meanwhile, by decoders as much as a brick, goes back to the
+system. That takes some 8 ms: after each of many small bricks, longer than marching through them."""
 
 
 class Load(NamedTuple):
