@@ -238,7 +238,7 @@ MUTATIONS = [
         ("bricks/test_split.py::test_voxels_outside_of_the_ranges_found_before_are_refused[250]",),
     ),
     Mutation(
-        "bricks: freed memory goes back after each of them, which takes longer than a small one",
+        "bricks: freed memory goes back after each of them, which takes as long as a small one",
         "bricks/stream.py",
         "if self.bytes_read - returned >= KEPT:",
         "if True:",

@@ -48,7 +48,7 @@ rays."""
 
 KEPT = 64 * 2**20
 """Bytes that are read before what was freed meanwhile, by decoders as much as a brick, goes back to the
-system. That takes some 8 ms: after each of many small bricks, longer than marching through them."""
+system. That takes some 8 ms: of a small brick, nearly as long as marching through it."""
 
 
 class Load(NamedTuple):

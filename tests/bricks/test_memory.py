@@ -74,7 +74,7 @@ def test_a_peak_is_that_of_the_process_alone():
 
 
 def test_what_was_freed_goes_back_once_much_was_read(file, monkeypatch):
-    """After each of many small bricks it would take longer than their images."""
+    """After each of many small bricks it would take as long as marching through them."""
     returns = []
     monkeypatch.setattr(stream, "give_back", lambda: returns.append(None))
     bricks = rendered(file).bricks
