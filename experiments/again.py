@@ -9,7 +9,6 @@ those for which it was (`changes.py`). What was recorded on a GPU is left alone 
 
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 from argparse import Namespace
@@ -48,11 +47,11 @@ def recorded(name: str, folder: Path) -> None:
 
     **Raises** `subprocess.CalledProcessError` if the experiment fails; the folder is then as it was."""
     experiment, *options = shlex.split(ARGUMENTS.get(name, name))
-    with TemporaryDirectory() as new:
+    with TemporaryDirectory(dir=folder) as new:  # so that files are moved at once
         module = f"experiments.{experiment}"
         subprocess.run([sys.executable, "-m", module, *options, "--output", new], check=True)
         for file in sorted(each for each in Path(new).iterdir() if each.is_file()):
-            shutil.move(file, folder / file.name.replace(experiment, name, 1))
+            os.replace(file, folder / file.name.replace(experiment, name, 1))
 
 
 def told(name: str, folder: Path) -> str:

@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 
 import jaxvol as jv
+from jaxvol._util.whole_files import whole_file
 from jaxvol.metrics import rmse
 
 from . import marches, record, timing
@@ -131,5 +132,6 @@ def _labelled(leads: tuple[int, ...], value: float, _: Any) -> str:
 
 def save(figure: Any, path: Path) -> None:
     """Write a chart. Equal results give equal files."""
-    figure.savefig(path, dpi=90, metadata={"Software": None})
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=90, metadata={"Software": None})
     plt.close(figure)

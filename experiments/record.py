@@ -12,6 +12,8 @@ from typing import Any
 
 import jax
 
+from jaxvol._util.whole_files import whole_file
+
 
 RESULTS = Path(__file__).parent / "results"
 BEGUN = time.monotonic()
@@ -37,8 +39,8 @@ def write(path: Path, question: str, result: Any, *, seed: int, command: list[st
         "device": _device(),
         "result": result,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    with whole_file(path) as part:
+        part.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return path
 
 

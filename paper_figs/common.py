@@ -17,6 +17,7 @@ from experiments import record
 from experiments.command import QUICK, Main, command
 from experiments.common import plt
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
+from jaxvol._util.whole_files import whole_file
 from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
 
 
@@ -99,7 +100,8 @@ def figure(
 
 def write_table(table: str, path: Path) -> None:
     """Write a Markdown table to a file and to the terminal."""
-    path.write_text(table, encoding="utf-8")
+    with whole_file(path) as part:
+        part.write_text(table, encoding="utf-8")
     print(table)
 
 
@@ -165,6 +167,7 @@ class Page:
         return axes
 
     def save(self, path: Path) -> None:
-        self.figure.savefig(path, dpi=DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
+        with whole_file(path) as part:
+            self.figure.savefig(part, dpi=DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
         plt.close(self.figure)
         print(path)

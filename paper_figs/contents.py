@@ -225,7 +225,7 @@ ENTRIES = (
         "Photographs of a body (Visible Korean), unlit and lit: 42 to 56 frames a second without, 20 to 24 "
         "with templates, about 2.2 times the time of a frame.",
         "Two phantoms. The noise of the middle column comes from one template for each pixel; blending "
-        "removes it. Time, from the record of `experiments/lighting.py`: 2.2 times a Phong-lit frame.",
+        "removes it. Time, from the record of `experiments/lighting.py`: 2.3 times a Phong-lit frame.",
     ),
     Entry(
         "gallery",

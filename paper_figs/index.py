@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 
 from experiments import common, record
+from jaxvol._util.whole_files import whole_file
 
 from .common import OUTPUT
 from .contents import ENTRIES, PAPERS, Entry
@@ -78,7 +79,8 @@ def make(
         with redirect_stdout(sys.stdout if run else io.StringIO()):  # what a script prints is in its file
             _draw(entry, folder, results, run, quick)
     page = folder / "index.html"
-    page.write_text(_page(entries, folder, results, run), encoding="utf-8")
+    with whole_file(page) as part:
+        part.write_text(_page(entries, folder, results, run), encoding="utf-8")
     return page
 
 

@@ -570,6 +570,7 @@ BAD_FIT = {
     "no cameras": ({"--cameras": ["nowhere.json"]}, "nowhere.json"),
     "no picture's file": ({"--images": ["CAMERAS", "CAMERAS"]}, "cannot be read as a picture"),
     "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
+    "too deep": ({"--cameras": ["deep.json"]}, "deep.json is not JSON"),
     "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "one camera for each of 3 images; got 2"),
     "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
     "start": ({"--start": ["CAMERAS"]}, "must be an object with values, colors, extinction"),
@@ -581,6 +582,7 @@ BAD_FIT = {
 @pytest.mark.parametrize("case", BAD_FIT)
 def test_errors_of_fit_are_one_line_and_exit_code_2(case, volume_file, seen, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "deep.json").write_text("[" * 100_000)
     changed, message = BAD_FIT[case]
     options = {"--images": ["0.png", "1.png"], "--cameras": ["cameras.json"], **changed}
     words = [w for name, values in options.items() for w in (name, *values)]

@@ -3,8 +3,11 @@
 import re
 
 import numpy as np
+import pytest
 
+import jaxvol as jv
 from jaxvol.cli import main
+from jaxvol.formats import says_where_it_lies
 
 
 def test_info_tells_shape_place_and_values(tmp_path, capsys):
@@ -42,3 +45,21 @@ def test_info_takes_the_header_of_a_raw_file(tmp_path, capsys):
     (tmp_path / "a.raw.json").write_text('{"spacing": [1, 1, 1]}')
     assert main(["info", str(tmp_path / "a.raw"), *header[:-4]]) == 0
     assert "assumed" not in capsys.readouterr().out
+
+
+def test_info_says_what_is_assumed_of_other_files(tmp_path, capsys):
+    tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed: pip install jaxvol[io]")
+    data = np.arange(6 * 5 * 4, dtype=np.uint8).reshape(6, 5, 4)
+    np.savez(tmp_path / "bare.npz", data=data)
+    np.savez(tmp_path / "told.npz", data=data, spacing=(1, 1, 1))
+    tifffile.imwrite(tmp_path / "bare.tif", data)
+    tifffile.imwrite(tmp_path / "told.tif", data, imagej=True, resolution=(1, 1), metadata={"spacing": 1.0})
+    (tmp_path / "bare").mkdir()
+    for z in range(4):
+        tifffile.imwrite(tmp_path / "bare" / f"{z}.tif", data[:, :, z])
+    for name in ("bare.npz", "told.npz", "bare.tif", "told.tif", "bare"):
+        assert main(["info", str(tmp_path / name)]) == 0
+        assert ("assumed" in capsys.readouterr().out) == name.startswith("bare")
+    jv.save(jv.Volume(data, origin=(1, 2, 3)), tmp_path / "placed.npz")
+    placed = [says_where_it_lies(tmp_path / name) for name in ("bare.npz", "bare.tif", "bare", "placed.npz")]
+    assert placed == [False, False, False, True]

@@ -4,6 +4,7 @@ operation."""
 import itertools
 import os
 import shutil
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,17 +21,24 @@ _NUMBERS = itertools.count()
 def whole_file(path: Path) -> Iterator[Path]:
     """A path beside `path`, of the same ending, to write a file to; its folder is made. At the end of the
     context the file takes the place of `path`; after an error it is removed, with the folders that were made
-    for it, and `path` is as it was."""
+    for it, and `path` is as it was. A link stays one: what it points to is replaced. Into what is no regular
+    file, such as a pipe or `/dev/null`, the content is written at the end."""
+    path = path.resolve()
     with _beside(path) as part:
         yield part
         with _MOVING:
-            os.replace(part, path)
+            if _is_special(path):
+                with part.open("rb") as content, path.open("wb") as target:
+                    shutil.copyfileobj(content, target)
+            else:
+                os.replace(part, path)
 
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """An empty folder beside `path` to write files to. At the end of the context they take their places in
     `path`, which may hold others; after an error all are removed."""
+    path = path.resolve()
     with _beside(path) as part:
         part.mkdir()
         yield part
@@ -47,8 +55,9 @@ def whole_folder(path: Path) -> Iterator[Path]:
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     # not by tempfile, whose files nobody else may read; several processes may write the same file
-    part = path.with_name(f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{path.suffix}")
-    missing = list(itertools.takewhile(lambda folder: not folder.exists(), path.absolute().parents))
+    folder = Path(tempfile.gettempdir()) if _is_special(path) else path.parent
+    part = folder / f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{path.suffix}"
+    missing = list(itertools.takewhile(lambda above: not above.exists(), path.parents))
     _UNDERWAY[part] = missing
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -56,6 +65,10 @@ def _beside(path: Path) -> Iterator[Path]:
     finally:
         _remove(part, missing)
         del _UNDERWAY[part]
+
+
+def _is_special(path: Path) -> bool:
+    return path.exists() and not (path.is_file() or path.is_dir())
 
 
 def remove_unfinished() -> None:

@@ -28,7 +28,7 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     others of it. The lowest is what is around.
 
     **Returns:** a volume in the same place, whose values are smooth, 255 inside of all labels, and whose
-    labels reach one voxel beyond; and a transfer function that shows what is inside, each label in its own
+    labels reach two voxels beyond; and a transfer function that shows what is inside, each label in its own
     colour."""
     from scipy.ndimage import gaussian_filter, maximum_filter
 

@@ -14,15 +14,19 @@ from jaxtyping import UInt8
 from .._util.checks import integer, output_file
 from .._util.whole_files import whole_file, whole_folder
 from ..display import displayed, save_image
+from .checksum import checksum
 from .frames import frames_of
 from .options import add_output, scene_options, view_options
 from .orbit import angles_of, axis_of, turned, views_of
 from .progress import working
-from .recorded import checksum, settings_of, text_of, transfer_from_file
+from .recorded import settings_of, text_of, transfer_from_file
 from .scene import Scene, scene_of
 
 
 Picture = UInt8[np.ndarray, "height width 3"]
+
+GIF_FPS = 50
+"""Frames a second of a GIF, at most: browsers show those of less than 2/100 s for 10/100 s."""
 
 OWN = frozenset({"frames", "degrees", "fps"})
 """Options that the command render has not."""
@@ -57,6 +61,10 @@ def _animate(options: argparse.Namespace) -> None:
         raise ValueError(f"--output: must end in .gif or .mp4, or be a folder; got {options.output}.")
     if not kind and options.output.is_file():
         raise ValueError(f"--output: {options.output} is a file, and no folder for frames.")
+    if kind == ".gif" and options.fps > GIF_FPS:
+        raise ValueError(
+            f"--fps: a .gif has {GIF_FPS} frames a second at most; got {options.fps:g}. Write an .mp4."
+        )
     if kind == ".mp4":
         _check_mp4(options.size)
     scene = scene_of(options)
@@ -64,7 +72,7 @@ def _animate(options: argparse.Namespace) -> None:
     with whole_folder(options.output) if not kind else whole_file(options.output) as part:
         images = _images(options, scene, count, part if not kind else None)
         if kind == ".gif":
-            _write_gif(part, images, options.fps)
+            _write_gif(part, images, options.fps, count)
         elif kind == ".mp4":
             _write_mp4(part, images, options.fps)
         else:
@@ -92,13 +100,15 @@ def _images(options: argparse.Namespace, scene: Scene, count: int, folder: Path 
             told(number + 1, count)
 
 
-def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
+def _write_gif(path: Path, images: Iterator[Picture], fps: float, count: int) -> None:
     """Each frame with 256 colours of its own; it is shown again and again."""
     from PIL import Image
 
+    # frames last whole hundredths of a second: their ends are rounded, so that the whole lasts as it should
+    ends = np.round(np.arange(count + 1) * 100 / fps)
+    milliseconds = (10 * np.diff(ends)).astype(int).tolist()
     pictures = (Image.fromarray(image).quantize(256) for image in images)
     first = next(pictures)
-    milliseconds = round(1000 / fps)
     first.save(path, save_all=True, append_images=pictures, duration=milliseconds, loop=0, disposal=1)
 
 

@@ -40,8 +40,6 @@ def _fetch(options: argparse.Namespace) -> None:
     print(path)  # alone on stdout, for "$(jaxvol datasets fetch engine)"
     dataset = datasets.info(options.name)
     print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}", file=sys.stderr)
-    if not path.name.startswith(dataset.file):
-        return
     spacing = " ".join(f"{step:g}" for step in dataset.spacing)
     if dataset.spacing != (1, 1, 1):
         print(f"jaxvol render {path} --spacing {spacing}", file=sys.stderr)

@@ -185,7 +185,12 @@ def _camera(view: argparse.ArgumentParser) -> None:
         default=30,
         help="degrees from the lower to the upper edge of the image (default: 30)",
     )
-    group.add_argument("--parallel", action="store_true", help="orthographic camera; use with --direction")
+    group.add_argument(
+        "--parallel",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="orthographic camera; use with --direction",
+    )
     group.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
     group.add_argument(
         "--axis",
@@ -217,6 +222,7 @@ def _clip(view: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--clip-inside-out",
-        action="store_true",
+        action=argparse.BooleanOptionalAction,
+        default=False,
         help="cut away what is inside the box and on that side of all planes, and show the rest",
     )

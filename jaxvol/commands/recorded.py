@@ -2,7 +2,6 @@
 made."""
 
 import argparse
-import hashlib
 import json
 import re
 import warnings
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 from .._util.checks import shortened
 from ..fitting.files import transfer_fields, transfer_of_fields
 from ..transfer import Transfer, TransferFunction
-from .progress import working
+from .checksum import checksum
 
 
 KEYWORD = "jaxvol"
@@ -78,28 +77,6 @@ def transfer_from_file(options: argparse.Namespace, transfer: Transfer) -> Trans
     """The transfer function, if a file or a picture held it and the options do not tell it."""
     held = options.transfer is not None or getattr(options, "kept_transfer", None) is not None
     return transfer if held else None
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file; of a folder, of the names and contents of its files; of a MetaImage header, of that
-    and of its data."""
-    files = [path]
-    if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.is_file())
-    elif path.suffix.lower() == ".mhd":
-        header = path.read_text(encoding="latin-1")
-        data = re.search(r"^ElementDataFile\s*=\s*(\S+)\s*$", header, re.MULTILINE)
-        if data and (path.parent / data[1]).is_file():
-            files.append(path.parent / data[1])
-    found = hashlib.sha256()
-    with working(f"SHA-256 of {path}"):
-        for file in files:
-            if len(files) > 1:
-                found.update(file.name.encode() + b"\0")
-            with file.open("rb") as stream:
-                while chunk := stream.read(2**20):
-                    found.update(chunk)
-    return found.hexdigest()
 
 
 def recorded_in(path: Path) -> Recorded:

@@ -37,7 +37,8 @@ def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "
     )
     parser.add_argument(
         "--transparent",
-        action="store_true",
+        action=argparse.BooleanOptionalAction,
+        default=False,
         help="write opacity instead of a background: .png (straight alpha), .tif or .npy (premultiplied)",
     )
     parser.add_argument(

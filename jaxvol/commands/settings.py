@@ -10,16 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from .._util.checks import shortened
-from .recorded import Recorded, checksum, recorded_in
+from .checksum import checksum
+from .recorded import Recorded, recorded_in
 
 
-RIVALS = (
-    {"preset", "cmap", "transfer", "kept_transfer"},
-    {"camera", "direction"},
-    {"camera", "parallel"},
-    {"step", "tolerance"},
-)
-"""Options of which one replaces the others."""
+OF_COLORS = {"opacity", "clim", "unit_distance"}
+
+REPLACED = {
+    "preset": {"cmap", "transfer", "kept_transfer", "opacity"},
+    "cmap": {"preset", "transfer", "kept_transfer"},
+    "transfer": {"preset", "cmap", "kept_transfer", *OF_COLORS},
+    "kept_transfer": {"preset", "cmap", "transfer", *OF_COLORS},
+    "camera": {"direction", "parallel"},
+    "direction": {"camera"},
+    "parallel": {"camera"},
+    "step": {"tolerance"},
+    "tolerance": {"step"},
+}
+"""Options of weaker places that do not count where this one is given."""
 
 OF_RENDER = frozenset({"turn", "orbit", "transparent"})
 """Options that, of the commands that look at a volume, only render has."""
@@ -77,8 +85,11 @@ def _told_unknown(command: argparse.ArgumentParser, unknown: Sequence[str]) -> s
 
 
 def _without_rivals(settings: dict[str, Any], stronger: dict[str, Any]) -> dict[str, Any]:
-    replaced = {name for group in RIVALS if group & stronger.keys() for name in group - stronger.keys()}
-    return {name: value for name, value in settings.items() if name not in replaced}
+    on = [name for name, value in stronger.items() if value is not False]
+    replaced = set().union(*(REPLACED.get(name, ()) for name in on))
+    if stronger.get("compositing", "isosurface") != "isosurface":
+        replaced.add("isovalue")
+    return {name: value for name, value in settings.items() if name not in replaced - stronger.keys()}
 
 
 def _commands(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
@@ -183,7 +194,7 @@ def _converted(action: argparse.Action, value: Any, where: str) -> Any:
     """The value as the parser would make it."""
     if action.nargs == 0 or isinstance(action, argparse.BooleanOptionalAction):
         return _one(bool, value, where)
-    if isinstance(action.default, list):  # may be given several times
+    if isinstance(action, argparse._AppendAction):  # may be given several times
         if not isinstance(value, list | tuple):
             raise ValueError(f"{where} must be a list of lists; got {shortened(value)}.")
         return [_several(action, each, where) for each in value]
@@ -193,18 +204,22 @@ def _converted(action: argparse.Action, value: Any, where: str) -> Any:
 def _several(action: argparse.Action, value: Any, where: str) -> Any:
     kind = action.type or str
     if action.nargs in (None, "?"):
-        one = _one(kind, value, where)
-        if action.choices is not None and one not in action.choices:
-            raise ValueError(
-                f"{where} must be one of {', '.join(map(str, action.choices))}; got {shortened(value)}."
-            )
-        return one
+        return _allowed(action, _one(kind, value, where), where)
     many = "numbers" if kind in (int, float) else "texts"
     length = action.nargs if isinstance(action.nargs, int) else None
     if not isinstance(value, list | tuple) or (len(value) == 0 if length is None else len(value) != length):
         wanted = f"{length} {many}" if length else f"one or several {many}"
         raise ValueError(f"{where} must be a list of {wanted}; got {shortened(value)}.")
-    return [_one(kind, each, where) for each in value]
+    return [_allowed(action, _one(kind, each, where), where) for each in value]
+
+
+def _allowed(action: argparse.Action, one: Any, where: str) -> Any:
+    """A value that is one of the option's choices, if it has such."""
+    if action.choices is not None and one not in action.choices:
+        raise ValueError(
+            f"{where} must be one of {', '.join(map(str, action.choices))}; got {shortened(one)}."
+        )
+    return one
 
 
 def _one(kind: Any, value: Any, where: str) -> Any:

@@ -39,8 +39,8 @@ def fetch(
       `<mirror>/engine/engine_256x256x128_uint8.raw`.
     - `progress`: show a progress bar of what is downloaded.
 
-    **Returns:** the path of a file that `jv.load` and `jv.render_bricks` read. Of a file in `$JAXVOL_DATA`,
-    only the size is checked, and not its content.
+    **Returns:** the path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of a
+    file in `$JAXVOL_DATA`, only the size is checked, and not its content.
 
     **Raises:** `ValueError` for a name that is not in the list, a file of another size, or a download with
     another SHA-512; `OSError` where the server cannot be reached, has no such file, or does not send all of

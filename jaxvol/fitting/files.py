@@ -101,7 +101,7 @@ def _json(path: File) -> Any:
         raise ValueError(f"{path} cannot be read ({fault.strerror}).") from fault
     except UnicodeDecodeError as fault:
         raise ValueError(f"{path} is not JSON: it is no text. Are files given in another order?") from fault
-    except json.JSONDecodeError as fault:
+    except (json.JSONDecodeError, RecursionError) as fault:
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 

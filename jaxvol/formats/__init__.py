@@ -10,6 +10,7 @@ memory is allocated for it.
 """
 
 import os
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,17 +18,17 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described
-from .._util.files import Header
+from .._util.files import Header, decoding
 from .._util.npy import read_npy, read_npz
 from ..transforms import ToroidalMap
 from ..volume import Volume
-from .dicom import dicom_files, read_dicom, read_dicom_folder
+from .dicom import dicom_files, is_dicom, read_dicom, read_dicom_folder, series_files
 from .kretz import read_kretz, refuse_kretz
-from .medical import read_medical
-from .metaimage import read_metaimage
-from .raw import raw_header, read_raw
+from .medical import nrrd_data, read_medical
+from .metaimage import metaimage_data, read_metaimage
+from .raw import raw_header, raw_json, read_raw
 from .save import save as save
-from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files
+from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files, tiff_spacing
 
 
 Reader: TypeAlias = Callable[[Path, Header], dict[str, Any]]
@@ -64,7 +65,7 @@ def load(
     | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
     | `.mha`, `.mhd` | its own |
     | `.nii`, `.nii.gz`, `.nrrd` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
-    | a folder of DICOM slices, or `.dcm`, one file of a series in a folder | their own; read by SimpleITK |
+    | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
 
@@ -115,6 +116,8 @@ def _reader(path: Path) -> Reader:
     ending = max((e for e in READERS if path.name.lower().endswith(e)), key=len, default=None)
     if ending is not None:
         return READERS[ending]
+    if path.is_file() and is_dicom(path):  # on discs their names often have no ending
+        return read_dicom
     if not path.is_dir():
         raise ValueError(
             f"path: {path} has an unknown ending; expected a file ending in {', '.join(sorted(READERS))}."
@@ -148,19 +151,40 @@ def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
     if whole.dtype.kind == "f":
         if not np.array_equal(whole, np.rint(whole)):
             raise ValueError(f"labels: {labels} must hold integers; got {whole.dtype} with fractions.")
-        whole = whole.astype(np.int32)
+        with np.errstate(invalid="ignore"):  # `Volume` checks the range
+            whole = whole.astype(np.int64)
     return Volume(
         *(volume.data, volume.spacing, volume.origin, whole), direction=volume.direction, field=volume.field
     )
 
 
-PLACELESS: tuple[str, ...] = (".raw", ".raw.gz", ".npy", *TIFF)
-"""Endings of files that do not say where in the world their axes point."""
+def files_of(path: Path) -> list[Path]:
+    """The files that `load` reads for a volume: of a folder, its slices; beside a header, what it names; of
+    one DICOM file, those of its series. None where there is no volume.
+
+    **Raises:** `ValueError` for a file whose header cannot be read."""
+    if path.is_dir():
+        return dicom_files(path) or tiff_files(path)
+    if not path.is_file():  # a device may have no end
+        return []
+    name = path.name.lower()
+    if name.endswith((".raw", ".raw.gz")):
+        beside = raw_json(path)
+        return [path] if beside is None else [path, beside]
+    if name.endswith((".mhd", ".nrrd")):
+        data = metaimage_data(path) if name.endswith(".mhd") else nrrd_data(path)
+        return [path, data] if data != path and data.is_file() else [path]
+    return series_files(path) if is_dicom(path) else [path]
 
 
 def says_where_it_lies(path: Path) -> bool:
-    """Whether a file says where in the world the axes of its volume point."""
-    return not path.name.lower().endswith(PLACELESS)
+    """Whether a file says where in the world its volume lies, and how its axes are turned."""
+    name = path.name.lower()
+    if name.endswith(".npz"):
+        return "origin" in _npz_names(path)
+    if path.is_dir():
+        return bool(dicom_files(path)) or not tiff_files(path)
+    return not name.endswith((".raw", ".raw.gz", ".npy", *TIFF))
 
 
 def says_its_spacing(path: Path, header: Header) -> bool:
@@ -168,7 +192,16 @@ def says_its_spacing(path: Path, header: Header) -> bool:
     name = path.name.lower()
     if name.endswith((".raw", ".raw.gz")):
         return "spacing" in raw_header(path, header, 31)[2]
-    return not name.endswith(".npy")
+    if name.endswith(".npz"):
+        return "spacing" in _npz_names(path)
+    if name.endswith(TIFF):
+        return bool(tiff_spacing(path))
+    return not name.endswith(".npy") and (not path.is_dir() or says_where_it_lies(path))
+
+
+def _npz_names(path: Path) -> list[str]:
+    with decoding(path), zipfile.ZipFile(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:

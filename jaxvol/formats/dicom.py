@@ -1,6 +1,7 @@
 """Reads folders of DICOM slices with SimpleITK: one series, sorted by where its slices lie."""
 
 import math
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 
 from .._util.files import MOST_VOXELS, Header, decoding
 from .medical import simple_itk
-from .orientation import toward_axes
+from .orientation import orthonormal, toward_axes
 
 
 READABLE = {
@@ -47,8 +48,18 @@ PLACE = 0.01
 MOST_COMPRESSED = 2000
 """Bytes of pixels per byte of a compressed file, at most. A header that says more is not believed."""
 
+STORAGE = "1.2.840.10008.5.1.4.1.1."
+NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "481.5"))
+"""Kinds of files that often lie beside a series: presentation states, reports, documents, contours, plans."""
+
 META_BYTES = 2**16
-"""Where the transfer syntax must be found: files begin with some hundred bytes of meta information."""
+"""Where kind and transfer syntax must be found: files begin with some hundred bytes of meta information."""
+
+KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
+"""Elements of the meta information."""
+
+SERIES = re.compile(rb"\x20\x00\x0e\x00.{4}([0-9.]{1,64})", re.DOTALL)
+"""The element of a file, of one in it, or of one that it refers to, that tells the series."""
 
 
 class Slice(NamedTuple):
@@ -71,9 +82,9 @@ def is_dicom(path: Path) -> bool:
 
 
 def dicom_files(folder: Path) -> list[Path]:
-    """The DICOM files in a folder, but not those in folders in it, nor an index of files."""
+    """The DICOM images in a folder, but not those in folders in it, nor an index of files, nor reports."""
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR")
-    return [file for file in files if is_dicom(file)]
+    return [file for file in files if is_dicom(file) and not (_meta(file, KIND) or "").startswith(NO_IMAGES)]
 
 
 def read_dicom_folder(folder: Path, header: Header) -> dict[str, Any]:
@@ -84,7 +95,13 @@ def read_dicom_folder(folder: Path, header: Header) -> dict[str, Any]:
     a way that SimpleITK does not read.
     """
     header.refuse(folder)
-    slices = [_slice(path) for path in dicom_files(folder)]
+    try:
+        slices = [_slice(path) for path in dicom_files(folder)]
+    except ValueError as fault:
+        raise ValueError(
+            f"{fault} If this file is of another series, give the path of one file of the series that you "
+            "want."
+        ) from fault
     if len({each.series for each in slices}) > 1:
         kinds = Counter(each.what for each in slices)
         told = "; ".join(f"{what}: {count} files" for what, count in kinds.items())
@@ -96,20 +113,39 @@ def read_dicom_folder(folder: Path, header: Header) -> dict[str, Any]:
 
 
 def read_dicom(path: Path, header: Header) -> dict[str, Any]:
-    """Reader for one file of a series: reads the whole series, from the file's folder."""
+    """Reader for one file of a series: reads the whole series, from the file's folder. Files of others in it
+    may be unreadable."""
     header.refuse(path)
     if path.is_dir():
         return read_dicom_folder(path, header)
     if not is_dicom(path):
         raise ValueError(f'path: {path} is no DICOM file: it does not have "DICM" at byte 128.')
-    wanted = _slice(path)
-    found = [_slice(file) for file in dicom_files(path.parent)]
-    return _volume(path, [each for each in found if each.series == wanted.series])
+    return _volume(path, _series_of(path))
+
+
+def series_files(path: Path) -> list[Path]:
+    """The files of the series to which this one belongs, in its folder. **Raises:** as `read_dicom`."""
+    return [each.path for each in _series_of(path)]
+
+
+def _series_of(path: Path) -> list[Slice]:
+    wanted = _slice(path).series
+    found = []
+    for file in dicom_files(path.parent):
+        try:
+            found.append(_slice(file))
+        except ValueError:
+            told = {match[1].decode() for match in SERIES.finditer(file.read_bytes())}
+            if not told or wanted in told:  # it may be a slice of the series
+                raise
+    return [each for each in found if each.series == wanted]
 
 
 def _slice(path: Path) -> Slice:
     simple_itk(path)
-    syntax = _transfer_syntax(path)
+    syntax = _meta(path, SYNTAX)
+    if syntax is None:
+        raise ValueError(f"path: {path} is corrupt: it does not say how it is encoded (element 0002,0010).")
     if syntax not in READABLE:
         raise ValueError(
             f"path: {path} is stored as {OTHERS.get(syntax, 'unknown')} (transfer syntax {syntax}), which "
@@ -149,14 +185,10 @@ def _volume(path: Path, slices: list[Slice]) -> dict[str, Any]:
         raise ValueError(
             f"path: {path} must hold at least 2 slices of a series; got {first.path.name} alone."
         )
-    axes = np.stack([first.across, first.down])
-    if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-3):
-        raise ValueError(
-            f"path: {path}: directions of rows and columns must be orthogonal and of length 1; "
-            f"{first.path.name} has {_plain(first.across)} and {_plain(first.down)}."
-        )
-    normal = np.cross(first.across, first.down)
-    normal /= np.linalg.norm(normal)
+    direction = orthonormal(
+        f"path: {path}: rows and columns of {first.path.name}", np.stack([first.across, first.down], axis=1)
+    )
+    normal = direction[:, 2]
     slices = sorted(slices, key=lambda each: float(each.position @ normal))
     step = _check_places(path, slices, normal)
     width, height = first.size
@@ -165,7 +197,6 @@ def _volume(path: Path, slices: list[Slice]) -> dict[str, Any]:
             f"path: {path} must have fewer than 2**31 voxels; got {width} x {height} x {len(slices)}."
         )
     data = _pixels(slices)
-    direction = np.stack([first.across, first.down, normal], axis=1)
     return toward_axes(data, (*first.spacing, step), slices[0].position.tolist(), direction)
 
 
@@ -265,14 +296,14 @@ def _numbers(path: Path, reader: Any, tag: str, count: int) -> np.ndarray:
     return numbers
 
 
-def _transfer_syntax(path: Path) -> str:
-    """How the data are encoded, from the meta information with which the file begins."""
+def _meta(path: Path, element: bytes) -> str | None:
+    """A UID from the meta information with which a file begins; None if it is not there."""
     with path.open("rb") as stream:
         content = stream.read(META_BYTES)
-    at = content.find(b"\x02\x00\x10\x00UI", 132)
+    at = content.find(element, 132)
     length = int.from_bytes(content[at + 6 : at + 8], "little")
     if at < 0 or length > 64:
-        raise ValueError(f"path: {path} is corrupt: it does not say how it is encoded (element 0002,0010).")
+        return None
     return content[at + 8 : at + 8 + length].rstrip(b"\0 ").decode("latin-1")
 
 

@@ -85,20 +85,11 @@ def _check_nifti(path: Path, reader: Any, n_bytes: int) -> None:
 
 def _check_nrrd(path: Path, voxels: int, itemsize: int) -> None:
     """**Raises** `ValueError` if less follows the header of an NRRD file than it says."""
-    fields: dict[str, str] = {}
-    with path.open("rb") as stream:
-        while (line := stream.readline(LONGEST_LINE).strip()) and len(fields) < MOST_FIELDS:
-            key, _, value = line.decode("latin-1").partition(":")
-            fields[key.strip().lower().replace(" ", "")] = value.strip()
-        named = fields.get("datafile")
-        if named is None:
-            begin, source = stream.tell(), path
-        else:
-            begin, source = 0, path.parent / named
-            if not source.is_file():
-                raise ValueError(
-                    f"path: {path} must hold its voxels, or name one file of them; got {named!r}."
-                )
+    fields, begin, source = _nrrd_header(path)
+    if not source.is_file():
+        raise ValueError(
+            f"path: {path} must hold its voxels, or name one file of them; got {fields['datafile']!r}."
+        )
     expected, encoding = voxels * itemsize, fields.get("encoding", "").lower()
     with source.open("rb") as stream:
         stream.seek(begin)
@@ -115,6 +106,22 @@ def _check_nrrd(path: Path, voxels: int, itemsize: int) -> None:
                 "as one of these."
             )
     check_size(path, min(held, expected), expected)
+
+
+def nrrd_data(path: Path) -> Path:
+    """The file that holds the voxels of an NRRD file: itself, or another, which may be missing."""
+    return _nrrd_header(path)[2]
+
+
+def _nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
+    """The fields of an NRRD header; where the voxels begin, and in which file."""
+    fields: dict[str, str] = {}
+    with path.open("rb") as stream:
+        while (line := stream.readline(LONGEST_LINE).strip()) and len(fields) < MOST_FIELDS:
+            key, _, value = line.decode("latin-1").partition(":")
+            fields[key.strip().lower().replace(" ", "")] = value.strip()
+        named = fields.get("datafile")
+        return (fields, stream.tell(), path) if named is None else (fields, 0, path.parent / named)
 
 
 def _voxel_type(reader: Any) -> np.dtype:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._util.files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, read_all
-from .orientation import toward_axes
+from .orientation import orthonormal, toward_axes
 
 
 TYPES = {
@@ -48,15 +48,23 @@ def read_metaimage(path: Path, header: Header) -> dict[str, Any]:
         path, fields, ("TransformMatrix", "Rotation", "Orientation"), 9, np.eye(3).ravel().tolist()
     )
     # the axes of the data follow each other; here they are columns
-    direction = np.reshape(turn, (3, 3)).T
-    if not np.allclose(direction.T @ direction, np.eye(3), atol=1e-3):
-        raise ValueError(
-            f"path: {path}: TransformMatrix must be three orthogonal directions of length 1; got {turn}."
-        )
+    direction = orthonormal(f"path: {path}: TransformMatrix", np.reshape(turn, (3, 3)).T)
     data = _voxels(path, fields, begin, shape)
     if data.dtype == np.float64:
         data = data.astype(np.float32)
     return toward_axes(data, spacing, origin, direction)
+
+
+def metaimage_data(path: Path) -> Path:
+    """The file that holds the voxels of a MetaImage: itself, or another, which may be missing.
+
+    **Raises:** `ValueError` if it has no header."""
+    return _source(path, _fields(path)[0])
+
+
+def _source(path: Path, fields: dict[str, str]) -> Path:
+    named = fields["ElementDataFile"]
+    return path if named.upper() == "LOCAL" else path.parent / named
 
 
 def _fields(path: Path) -> tuple[dict[str, str], int]:
@@ -117,19 +125,18 @@ def _voxels(path: Path, fields: dict[str, str], begin: int, shape: tuple[int, in
         raise ValueError(f"path: {path}: ElementType must be one of {', '.join(TYPES)}; got {kind[:40]!r}.")
     dtype = np.dtype(TYPES[kind]).newbyteorder(">" if _flag(fields, "ByteOrderMSB") else "<")
     expected = math.prod(shape) * dtype.itemsize
-    named = fields["ElementDataFile"]
-    source = path if named.upper() == "LOCAL" else path.parent / named
-    if not named or not source.is_file():
+    source = _source(path, fields)
+    if not source.is_file():
         raise ValueError(
             f"path: {path} cannot be read: it must hold its voxels, or name one file of them; got "
-            f"{named[:80]!r}."
+            f"{fields['ElementDataFile'][:80]!r}."
         )
-    skipped = fields.get("HeaderSize", "0")
+    text = fields.get("BinaryData", "True").lower().startswith("f")
+    if source != path:
+        begin = _skipped(path, fields, None if text or _flag(fields, "CompressedData") else source, expected)
     with source.open("rb") as stream, decoding(path):
-        if source != path:
-            begin = int(skipped) if skipped.isdigit() else 0
         stream.seek(begin)
-        if fields.get("BinaryData", "True").lower().startswith("f"):
+        if text:
             return _from_text(path, stream.read(), shape, dtype)
         if _flag(fields, "CompressedData"):
             content = zlib.decompressobj(wbits=47).decompress(stream.read(), expected + 1)  # zlib's or gzip's
@@ -139,6 +146,19 @@ def _voxels(path: Path, fields: dict[str, str], begin: int, shape: tuple[int, in
             check_size(path, min(held, expected), expected)  # other data may follow
             content = read_all(path, _Part(stream, expected), expected)
     return as_array(content, shape, dtype, "F")
+
+
+def _skipped(path: Path, fields: dict[str, str], source: Path | None, expected: int) -> int:
+    """Bytes before the voxels in a file of their own. HeaderSize = -1 says that they are at its end; where
+    that begins is known of raw ones (`source`)."""
+    told = fields.get("HeaderSize", "0")
+    if told == "-1" and source is not None:
+        return max(file_size(source) - expected, 0)
+    if not (told.isascii() and told.isdigit() and len(told) < 20):
+        raise ValueError(
+            f"path: {path}: HeaderSize must be a number of bytes, or -1 before raw voxels; got {told[:40]!r}."
+        )
+    return int(told)
 
 
 class _Part:
@@ -157,13 +177,23 @@ class _Part:
 
 
 def _from_text(path: Path, content: bytes, shape: tuple[int, int, int], dtype: np.dtype) -> np.ndarray:
-    numbers = content.split()
-    check_size(path, len(numbers) * dtype.itemsize, math.prod(shape) * dtype.itemsize)
+    expected = math.prod(shape)
+    numbers = content.split(None, expected)  # what is left is one piece
+    check_size(path, len(numbers) * dtype.itemsize, expected * dtype.itemsize)
     try:
         array = np.array([float(number) for number in numbers])
     except ValueError as fault:
         raise ValueError(f"path: {path} must hold numbers in text, as its header says; {fault}.") from fault
-    return np.ascontiguousarray(array.astype(dtype.newbyteorder("=")).reshape(shape, order="F"))
+    own = dtype.newbyteorder("=")
+    if own.kind in "iu":
+        limits = np.iinfo(own)
+        wrong = ~((array >= limits.min) & (array <= limits.max) & (array == np.rint(array)))
+        if wrong.any():
+            raise ValueError(
+                f"path: {path} must hold integers from {limits.min} to {limits.max}, as its ElementType "
+                f"says; got {array[wrong][0]:g}."
+            )
+    return np.ascontiguousarray(array.astype(own).reshape(shape, order="F"))
 
 
 def _flag(fields: dict[str, str], key: str) -> bool:

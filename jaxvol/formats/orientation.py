@@ -11,8 +11,26 @@ ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
 
-ORTHOGONAL = 1e-3
-"""Greatest cosine between the directions of two axes that counts as a right angle."""
+ROUNDED = 1e-3
+"""Greatest cosine between the directions of two axes that counts as a right angle, and greatest difference of
+a squared length from 1: files hold directions of a few decimal places."""
+
+
+def orthonormal(what: str, direction: Any) -> np.ndarray:
+    """The directions of axes (rows, columns) of a file, rounded there: the nearest that have length 1 and are
+    orthogonal to each other. A third column is made where there are two.
+
+    **Raises:** `ValueError`, which begins with `what`, if they are farther from that than by rounding."""
+    columns = np.asarray(direction, float)
+    lengths = columns.T @ columns
+    if not np.allclose(lengths, np.eye(len(lengths)), rtol=0, atol=ROUNDED):
+        raise ValueError(
+            f"{what} must be orthogonal directions of length 1; got {np.round(columns.T, 4).tolist()}."
+        )
+    if len(lengths) == 2:
+        columns = np.column_stack([columns, np.cross(*columns.T)])
+    left, _, right = np.linalg.svd(columns)
+    return left @ right
 
 
 def toward_axes(

@@ -58,18 +58,24 @@ def _name_header(path: Path) -> dict[str, Any]:
     return {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
 
 
-def _json_header(path: Path) -> dict[str, Any]:
+def raw_json(path: Path) -> Path | None:
+    """The JSON file beside a raw file, if there is one."""
     stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    candidates = [file for name in (path.name, stem) if (file := path.with_name(f"{name}.json")).is_file()]
-    if not candidates:
+    candidates = (path.with_name(f"{name}.json") for name in (path.name, stem))
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _json_header(path: Path) -> dict[str, Any]:
+    beside = raw_json(path)
+    if beside is None:
         return {}
     try:
-        fields = json.loads(candidates[0].read_text(encoding="utf-8"))
+        fields = json.loads(beside.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as fault:
-        raise ValueError(f"path: the header {candidates[0]} is not JSON ({fault}).") from fault
+        raise ValueError(f"path: the header {beside} is not JSON ({fault}).") from fault
     if not isinstance(fields, dict):
         raise ValueError(
-            f"path: the header {candidates[0]} must be a JSON object with the keys {', '.join(JSON_KEYS)}; "
+            f"path: the header {beside} must be a JSON object with the keys {', '.join(JSON_KEYS)}; "
             f"got {type(fields).__name__}."
         )
     return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}

@@ -12,6 +12,7 @@ from .._util.checks import described, is_traced, output_file
 from .._util.files import reason
 from .._util.whole_files import whole_file
 from ..volume import Volume
+from .metaimage import metaimage_data
 
 
 def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
@@ -27,7 +28,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     formats are read along the patient's axes: a volume whose axes are turned by more than 45 degrees comes
     back with axes exchanged or reversed, and every voxel where it was in the world.
 
-    A file that is there is replaced, at once when the new one is whole.
+    A file that is there is replaced, at once when the new one is whole. `.mhd` are two files: the voxels go
+    into one that ends in `.raw`, which is replaced first, and only if it belongs to the `.mhd` that is there.
 
     **Arguments:**
 
@@ -38,7 +40,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     **Returns:** the path.
 
     **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
-    of voxels that the format cannot hold, and a file that cannot be written. `ImportError` if the format
+    of voxels that the format cannot hold, a file that cannot be written, and a `.raw` file beside an `.mhd`
+    that is not the `.mhd`'s own. `ImportError` if the format
     needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
@@ -61,11 +64,27 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
         raise ValueError(f"path must end in {', '.join(sorted(WRITERS))}; got {path}.")
     write = WRITERS[ending]
     output_file("path", path)
+    if ending == ".mhd":
+        _check_beside(path)
     with whole_file(path) as part, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         write(volume, Path(folder) / path.name)
         for file in Path(folder).iterdir():  # the header takes its place last: it names the other file of two
             os.replace(file, part if file.name == path.name else path.parent / file.name)
     return path
+
+
+def _check_beside(path: Path) -> None:
+    """**Raises** `ValueError` if voxels of something else lie where those of an `.mhd` are written."""
+    voxels = path.with_suffix(".raw")
+    try:
+        own = not voxels.exists() or (path.is_file() and metaimage_data(path).resolve() == voxels.resolve())
+    except ValueError:  # what is replaced is no MetaImage
+        own = False
+    if not own:
+        raise ValueError(
+            f"path: the voxels of {path.name} would replace {voxels}, which does not belong to it. Save it "
+            "under another name, or as .mha, which is one file."
+        )
 
 
 def _write_npz(volume: Volume, path: Path) -> None:

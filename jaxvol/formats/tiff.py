@@ -30,7 +30,7 @@ LENGTHS = {
 
 
 def read_tiff(path: Path, header: Header) -> dict[str, Any]:
-    """Reader for a file of several pages. Spacing is what ImageJ wrote, if it did."""
+    """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
     header.refuse(path)
     pages, spacing = _pages(path)
     if len(pages) < 2:
@@ -40,6 +40,12 @@ def read_tiff(path: Path, header: Header) -> dict[str, Any]:
         )
     # [z][y][x], as pages, rows and columns come
     return {"data": np.stack(pages).transpose(2, 1, 0)} | spacing
+
+
+def tiff_spacing(path: Path) -> dict[str, Any]:
+    """The spacing that a file tells, as `read_tiff` has it; its images are not read."""
+    with _tifffile(path).TiffFile(path) as file:
+        return _spacing(file, file.pages[0].aspage())
 
 
 def tiff_files(folder: Path) -> list[Path]:
@@ -96,12 +102,17 @@ def _check_numbers(folder: Path, files: list[Path]) -> None:
         )
 
 
-def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
-    """The images in a file, which are of one size and type, and their spacing where it is known."""
+def _tifffile(path: Path) -> Any:
     try:
         import tifffile  # pyright: ignore[reportMissingImports]
     except ImportError as fault:
         raise ImportError(f"reading {path} needs tifffile: pip install jaxvol[io]") from fault
+    return tifffile
+
+
+def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """The images in a file, which are of one size and type, and their spacing where it is known."""
+    tifffile = _tifffile(path)
     n_bytes = file_size(path)
     try:
         with tifffile.TiffFile(path) as file:
@@ -113,6 +124,7 @@ def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
                 shape = (len(pages), *pages[0].shape)
             first = pages[0].aspage()
             _check_last(path, file)
+            _check_ome(path, file)
             if len(shape) not in (2, 3) or first.samplesperpixel != 1:
                 raise ValueError(
                     f"path: {path} must hold images of one value per pixel, in one stack; got shape {shape}, "
@@ -165,15 +177,49 @@ def _check_backed(path: Path, n_bytes: int, shape: tuple[int, ...], page: Any) -
         )
 
 
+def _check_ome(path: Path, file: Any) -> None:
+    """**Raises** `ValueError` if OME says that not all images of a file are slices of one volume."""
+    images = _ome_images(file)
+    for pixels in (image["Pixels"] for image in images):
+        counts = [int(pixels[f"Size{axis}"]) for axis in "CT"]
+        if len(images) > 1 or math.prod(counts) > 1:
+            raise ValueError(
+                f"path: {path} must hold one volume of one channel; by OME it holds {len(images)}, the first "
+                f"of {counts[0]} channels at {counts[1]} times. Save one of them alone."
+            )
+
+
+def _ome_images(file: Any) -> list[Any]:
+    """What OME tells of each volume in a file."""
+    if not file.is_ome:
+        return []
+    found = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"].get("Image", [])
+    return found if isinstance(found, list) else [found]
+
+
 def _spacing(file: Any, page: Any) -> dict[str, Any]:
-    """Spacing (x, y, z) as ImageJ wrote it, in mm, or in its own unit if that is none of length."""
-    found = file.imagej_metadata or {}
-    if "spacing" not in found:
-        return {}
+    """Spacing (x, y, z) as OME or ImageJ wrote it, in mm, or in its own unit if that is none of length."""
     try:
-        (nx, dx), (ny, dy) = (page.tags[name].value for name in ("XResolution", "YResolution"))
-        unit = LENGTHS.get(str(found.get("unit", "")).replace("\\u00B5", "µ").lower(), 1.0)
-        steps = [dx / nx * unit, dy / ny * unit, float(found["spacing"]) * unit]
-    except (KeyError, ZeroDivisionError, TypeError, ValueError):
+        steps = _ome_spacing(file) if file.is_ome else _imagej_spacing(file, page)
+    except (KeyError, IndexError, ZeroDivisionError, TypeError, ValueError):
         return {}
     return {"spacing": steps} if all(0 < step < math.inf for step in steps) else {}
+
+
+def _ome_spacing(file: Any) -> list[float]:
+    pixels = _ome_images(file)[0]["Pixels"]
+    return [
+        float(pixels[f"PhysicalSize{axis}"]) * _unit(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
+        for axis in "XYZ"
+    ]
+
+
+def _imagej_spacing(file: Any, page: Any) -> list[float]:
+    found = file.imagej_metadata or {}
+    (nx, dx), (ny, dy) = (page.tags[name].value for name in ("XResolution", "YResolution"))
+    unit = _unit(found.get("unit", ""))
+    return [dx / nx * unit, dy / ny * unit, float(found["spacing"]) * unit]
+
+
+def _unit(name: Any) -> float:
+    return LENGTHS.get(str(name).replace("\\u00B5", "µ").lower(), 1.0)

@@ -12,6 +12,7 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.cli import main
+from jaxvol.commands.animate import _write_gif
 from jaxvol.commands.orbit import angles_of, turned
 
 
@@ -94,6 +95,18 @@ def test_a_gif_holds_all_frames(volume_file, tmp_path, monkeypatch):
     assert [path.name for path in output.parent.iterdir()] == ["a.gif"]
 
 
+def test_a_gif_lasts_as_long_as_it_should(tmp_path):
+    images = [np.full((8, 8, 3), 20 * number, np.uint8) for number in range(12)]
+    _write_gif(tmp_path / "a.gif", iter(images), 12, 12)  # 8 and 1/3 hundredths of a second each
+    with Image.open(tmp_path / "a.gif") as picture:
+        lasting = []
+        for number in range(12):
+            picture.seek(number)
+            lasting.append(picture.info["duration"])
+    assert sum(lasting) == 1000
+    assert set(lasting) == {80, 90}
+
+
 COMPILED: list[str] = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda event, *_, **__: COMPILED.append(event) if "backend_compile" in event else None
@@ -121,6 +134,7 @@ BAD = {
     "ending": (["-o", "a.avi"], "--output: must end in .gif or .mp4, or be a folder; got a.avi"),
     "frames": (["--frames", "0"], "--frames must be an integer of at least 1"),
     "fps": (["--fps", "0"], "--fps must be above 0"),
+    "fps of a gif": (["--fps", "60"], "--fps: a .gif has 50 frames a second at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
     "step and tolerance": (["--tolerance", "0.1"], "--tolerance finds a step"),
 }

@@ -13,7 +13,8 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.cli import _parser, main
-from jaxvol.commands.recorded import KEYWORD, MOST, checksum
+from jaxvol.commands.checksum import checksum
+from jaxvol.commands.recorded import KEYWORD, MOST
 from jaxvol.commands.settings import parsed
 
 
@@ -105,26 +106,71 @@ def test_other_commands_take_its_settings_too(picture):
     assert (found.preset, found.frames) == ("engine", 3)
 
 
-def test_the_checksum_of_a_folder_tells_names_and_contents(tmp_path):
-    folder = tmp_path / "series"
-    folder.mkdir()
-    found = set()
-    for name, content in (("a", b"1"), ("b", b"1"), ("b", b"2")):
-        for old in folder.iterdir():
-            old.unlink()
-        (folder / "z").write_bytes(b"")
-        (folder / name).write_bytes(content)
-        found.add(checksum(folder))
-    assert len(found) == 3
+def checksums(path, file, *contents):
+    """Of a volume, with each of these contents in one of its files."""
+    found = []
+    for content in contents:
+        file.write_bytes(content)
+        found.append(checksum(path))
+    return found
 
 
-def test_the_checksum_of_a_metaimage_tells_its_data(tmp_path):
-    (tmp_path / "a.mhd").write_text("NDims = 3\nElementDataFile = a.raw\n")
-    found = set()
-    for content in (b"1", b"2"):
-        (tmp_path / "a.raw").write_bytes(content)
-        found.add(checksum(tmp_path / "a.mhd"))
-    assert len(found) == 2
+def test_the_checksum_of_a_folder_tells_its_slices_and_nothing_else(tmp_path):
+    first, other = tmp_path / "a.dcm", tmp_path / "b.dcm"
+    other.write_bytes(bytes(128) + b"DICM" + b"0")
+    one, two = checksums(tmp_path, first, bytes(128) + b"DICM1", bytes(128) + b"DICM2")
+    assert one != two
+    (tmp_path / "picture.png").write_bytes(b"drawn meanwhile")
+    assert checksum(tmp_path) == two
+    first.rename(tmp_path / "c.dcm")
+    assert checksum(tmp_path) != two
+
+
+def test_the_checksum_of_a_header_tells_the_voxels_that_it_names(tmp_path):
+    path, voxels = tmp_path / "a.mhd", tmp_path / "my scan.raw"
+    path.write_text("NDims = 3\nElementDataFile = my scan.raw\n")
+    assert len(set(checksums(path, voxels, b"1", b"2"))) == 2
+    path = tmp_path / "a.nrrd"
+    path.write_text("NRRD0004\ndata file: my scan.raw\n\n")
+    assert len(set(checksums(path, voxels, b"1", b"2"))) == 2
+    path = tmp_path / "a.raw"
+    path.write_bytes(b"1")
+    assert (
+        len({checksum(path), *checksums(path, tmp_path / "a.raw.json", b"{}", b'{"spacing": [1, 1, 2]}')})
+        == 3
+    )
+
+
+def test_the_checksum_of_one_slice_is_that_of_its_series(tmp_path):
+    pytest.importorskip("SimpleITK", reason="SimpleITK is not installed: pip install jaxvol[io]")
+    from ..formats.test_dicom import write_series
+
+    paths = write_series(tmp_path / "a")
+    one = checksum(paths[0])
+    assert checksum(paths[1]) == one
+    content = paths[1].read_bytes()
+    paths[1].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert checksum(paths[0]) != one
+
+
+def test_the_checksum_of_zarr_tells_all_its_files(tmp_path):
+    (tmp_path / "0").mkdir()
+    (tmp_path / "1").mkdir()
+    (tmp_path / "zarr.json").write_text("{}")
+    (tmp_path / "0" / "c").write_bytes(b"1")
+    one, two = checksums(tmp_path, tmp_path / "1" / "c", b"2", b"3")
+    assert one != two
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "/", "empty"])
+def test_what_is_no_volume_is_not_read(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "text").write_text("no volume")
+    said = {"jaxvol": "1", "command": "render", "settings": {}, "file": {"name": name, "sha256": "0" * 64}}
+    png(tmp_path / "a.png", json.dumps(said))
+    assert main(["render", "--like", "a.png", "-o", "b.png"]) == 2
+    assert f"{name} is no volume" in capsys.readouterr().err
 
 
 def png(path, text, keyword=KEYWORD):

@@ -92,6 +92,40 @@ def test_the_viewer_takes_its_options_from_a_file(config):
         options("view", "--config", config("size = [1, 2]"))
 
 
+def test_what_another_option_makes_void_does_not_count(config):
+    path = config('file = "a.raw"\npreset = "engine"\nclim = [1, 2]\nunit-distance = 3')
+    found = options("render", "--config", path, "--transfer", "t.json")
+    assert (found.preset, found.clim, found.unit_distance) == (None, None, None)
+    found = options("render", "--config", path, "--cmap", "hot")
+    assert (found.preset, found.clim, found.unit_distance) == (None, [1, 2], 3)
+    path = config('file = "a.raw"\ncmap = "gray"\nopacity = "sigmoid"')
+    found = options("render", "--config", path, "--preset", "engine")
+    assert (found.cmap, found.opacity) == (None, None)
+    path = config('file = "a.raw"\ncompositing = "isosurface"\nisovalue = 5')
+    assert options("render", "--config", path, "--compositing", "maximum").isovalue is None
+    assert options("render", "--config", path, "--compositing", "isosurface").isovalue == 5
+    assert options("render", "--config", path, "--size", 9, 9).isovalue == 5
+
+
+def test_flags_of_a_file_can_be_turned_off(config):
+    path = config('file = "a.raw"\nparallel = true\ntransparent = true\nclip-inside-out = true')
+    names = ("parallel", "transparent", "clip_inside_out")
+    assert all(getattr(options("render", "--config", path), name) for name in names)
+    off = [f"--no-{name.replace('_', '-')}" for name in names]
+    assert not any(getattr(options("render", "--config", path, *off), name) for name in names)
+
+
+def test_parts_of_the_demo_may_stand_in_a_file(config, capsys):
+    assert options("demo", "--config", config('only = ["head", "fit"]')).only == ["head", "fit"]
+    for wrong, message in (
+        ('["heads"]', "only must be one of"),
+        ('[["head"]]', "only must be a text"),
+        ('"head"', "only must be a list of one or several texts"),
+    ):
+        assert main(["demo", "--config", str(config(f"only = {wrong}"))]) == 2
+        assert message in capsys.readouterr().err
+
+
 BAD = {
     "unknown": ("sise = [1, 2]", "settings.toml: jaxvol render has no option 'sise'. Did you mean size?"),
     "of another command": ('solver = "adam"', "jaxvol render has no option 'solver'"),

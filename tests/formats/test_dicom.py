@@ -251,7 +251,8 @@ def test_what_simpleitk_decompresses_is_read(tmp_path):
             folder.mkdir(exist_ok=True)
             write_slice(folder / f"{z}.dcm", slices[:, :, z], place, np.eye(3), tags, name)
     for name, kind in (("JPEG", "JPEG lossless"), ("JPEG2000", "JPEG 2000")):
-        assert dicom.READABLE[dicom._transfer_syntax(tmp_path / name / "0.dcm")].startswith(kind)
+        syntax = dicom._meta(tmp_path / name / "0.dcm", dicom.SYNTAX)
+        assert dicom.READABLE[str(syntax)].startswith(kind)
         np.testing.assert_array_equal(jv.load(tmp_path / name).data, slices)
 
 
@@ -259,3 +260,43 @@ def test_a_file_that_is_no_dicom_is_refused(tmp_path):
     (tmp_path / "a.dcm").write_bytes(b"no" * 100)
     with pytest.raises(ValueError, match="is no DICOM file"):
         jv.load(tmp_path / "a.dcm")
+
+
+def test_a_slice_is_known_by_its_content_where_its_name_has_no_ending(tmp_path):
+    paths = write_series(tmp_path / "a")
+    for path in paths:
+        path.rename(path.with_suffix(""))
+    np.testing.assert_array_equal(jv.load(paths[1].with_suffix("")).data, VALUES)
+    (tmp_path / "b").write_bytes(bytes(500))
+    with pytest.raises(ValueError, match="has an unknown ending"):
+        jv.load(tmp_path / "b")
+
+
+def test_reports_beside_a_series_are_left_alone(tmp_path):
+    paths = write_series(tmp_path / "a")
+    content = paths[0].read_bytes()
+    at = content.index(dicom.KIND)
+    length = int.from_bytes(content[at + 6 : at + 8], "little")
+    report = (dicom.STORAGE + "88.22\0").encode()
+    changed = content[: at + 6] + len(report).to_bytes(2, "little") + report + content[at + 8 + length :]
+    (tmp_path / "a" / "report.dcm").write_bytes(changed)
+    np.testing.assert_array_equal(jv.load(tmp_path / "a").data, VALUES)
+
+
+def test_an_unreadable_file_of_another_series_does_not_refuse_the_one_that_is_wanted(tmp_path):
+    paths = write_series(tmp_path / "a")
+    other = write_slice(
+        tmp_path / "a" / "other.dcm", DATA[:, :, 0], ORIGIN, np.eye(3), {"0020|000e": "1.2.3.45"}
+    )
+    other.write_bytes(other.read_bytes()[:-40])
+    np.testing.assert_array_equal(jv.load(paths[0]).data, VALUES)
+    with pytest.raises(ValueError, match=r"other\.dcm .*give the path of one file of the series"):
+        jv.load(tmp_path / "a")
+    paths[-1].write_bytes(paths[-1].read_bytes()[:-40])  # one of its own slices
+    with pytest.raises(ValueError, match=rf"{paths[-1].name} cannot be read"):
+        jv.load(paths[0])
+
+
+def test_rounded_directions_of_an_oblique_series_are_taken_as_meant(tmp_path):
+    write_series(tmp_path / "a", np.round(turned(0, 45, 0), 3))
+    np.testing.assert_allclose(jv.load(tmp_path / "a").direction, turned(0, 45, 0), atol=1e-6)

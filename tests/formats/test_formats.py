@@ -467,6 +467,64 @@ def test_a_metaimage_is_inflated_to_its_end_whatever_its_header_says_of_it(sitk,
     assert same(load(tmp_path / "a.mhd"), ramp("int16"), (1, 2, 3))
 
 
+def write_mhd(path, content, *lines, size="4 3 2", data="voxels.bin"):
+    (path.parent / data).write_bytes(content)
+    header = [
+        "NDims = 3",
+        f"DimSize = {size}",
+        "ElementType = MET_UCHAR",
+        *lines,
+        f"ElementDataFile = {data}",
+    ]
+    path.write_text("\n".join(header) + "\n")
+    return path
+
+
+def test_a_metaimages_voxels_may_be_the_end_of_another_file(sitk, tmp_path):
+    values = np.arange(24, dtype=np.uint8)
+    path = write_mhd(tmp_path / "a.mhd", b"\xff" * 10 + values.tobytes(), "HeaderSize = -1")
+    assert same(load(path), values.reshape(4, 3, 2, order="F"))
+    np.testing.assert_array_equal(sitk.GetArrayFromImage(sitk.ReadImage(str(path))).T, load(path).data)
+    path = write_mhd(tmp_path / "b.mhd", b"\xff" * 10 + values.tobytes(), "HeaderSize = 10")
+    assert same(load(path), values.reshape(4, 3, 2, order="F"))
+    for told, message in (("-2", "HeaderSize must be"), ("ten", "HeaderSize must be"), ("11", "cut short")):
+        path = write_mhd(tmp_path / "c.mhd", b"\xff" * 10 + values.tobytes(), f"HeaderSize = {told}")
+        with pytest.raises(ValueError, match=message):
+            load(path)
+    path = write_mhd(tmp_path / "d.mhd", b"\xff" * 10, "HeaderSize = -1")
+    with pytest.raises(ValueError, match="cut short"):
+        load(path)
+
+
+def test_numbers_in_a_metaimages_text_fit_its_type(tmp_path):
+    text = " ".join(map(str, range(24)))
+    assert same(
+        load(write_mhd(tmp_path / "a.mhd", text.encode(), "BinaryData = False")),
+        np.arange(24, dtype=np.uint8).reshape(4, 3, 2, order="F"),
+    )
+    for wrong in ("300", "-1", "7.5", "nan"):
+        path = write_mhd(tmp_path / "a.mhd", text.replace("23", wrong).encode(), "BinaryData = False")
+        with pytest.raises(ValueError, match=rf"must hold integers from 0 to 255.*; got {wrong}"):
+            load(path)
+    for count in (23, 25, 10**6):
+        path = write_mhd(tmp_path / "a.mhd", b"1 " * count, "BinaryData = False")
+        with pytest.raises(ValueError, match=r"cut short|oversized"):
+            load(path)
+
+
+@pytest.mark.parametrize("digits", [3, 4])
+def test_directions_that_a_file_has_rounded_are_taken_as_meant(tmp_path, digits):
+    half = 0.5**0.5
+    meant = np.array([[half, 0, half], [0, 1, 0], [-half, 0, half]])
+    turn = np.round(meant, digits)
+    text = " ".join(f"{number:g}" for number in turn.T.ravel())
+    path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text}")
+    np.testing.assert_allclose(load(path).direction, meant, atol=1e-6)
+    path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text.replace('0.7', '0.8')}")
+    with pytest.raises(ValueError, match="TransformMatrix must be orthogonal directions of length 1"):
+        load(path)
+
+
 def test_what_is_no_image_is_refused_without_text_of_itk(sitk, tmp_path, capfd):
     for ending in ITK_ENDINGS:
         with pytest.raises(ValueError, match=f"a{ending} cannot be read") as fault:

@@ -34,6 +34,20 @@ def test_imagej_tells_spacing(tmp_path):
     np.testing.assert_allclose(volume.spacing, (0.25e-3, 0.5e-3, 2.5e-3), rtol=1e-5)
 
 
+def test_ome_tells_spacing(tmp_path):
+    sizes = {"PhysicalSizeX": 0.25, "PhysicalSizeY": 0.5, "PhysicalSizeZ": 2.5}
+    tifffile.imwrite(tmp_path / "a.ome.tif", DATA.T, metadata={"axes": "ZYX", **sizes})
+    volume = jv.load(tmp_path / "a.ome.tif")
+    np.testing.assert_array_equal(volume.data, DATA)
+    np.testing.assert_allclose(volume.spacing, (0.25e-3, 0.5e-3, 2.5e-3), rtol=1e-5)  # µm, if not said
+    units = {f"PhysicalSize{axis}Unit": "mm" for axis in "XYZ"}
+    tifffile.imwrite(tmp_path / "a.ome.tif", DATA.T, metadata={"axes": "ZYX", **sizes, **units})
+    np.testing.assert_allclose(jv.load(tmp_path / "a.ome.tif").spacing, (0.25, 0.5, 2.5), rtol=1e-5)
+    tifffile.imwrite(tmp_path / "a.ome.tif", np.stack([DATA.T] * 2), metadata={"axes": "CZYX"})
+    with pytest.raises(ValueError, match=r"must hold one volume of one channel; .* of 2 chan"):
+        jv.load(tmp_path / "a.ome.tif")
+
+
 def write_folder(folder, numbers=(8, 9, 10, 11, 12), data=DATA):
     folder.mkdir()
     for z, number in enumerate(numbers):
