@@ -17,7 +17,7 @@ from .drawing import Content
 from .model import Frame, Model
 from .orbit import Orbit
 from .page_look import add_look, answer
-from .state import State
+from .state import LONGEST, SHORTEST, State
 
 
 HOST = "127.0.0.1"
@@ -139,10 +139,13 @@ class _Panel:
         self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
 
     def _march(self, state: State) -> None:
-        step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
+        choices = self.model.content.choices
+        step = self.gui.add_slider("step (voxels)", SHORTEST, float(LONGEST), SHORTEST, state.step)
         answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
-        for name in self.model.content.choices.names:
+        for name in choices.names:
             self._switch(name, name in state.on)
+        if choices.lighting is None:
+            return
         light = self.gui.add_checkbox("light", state.lit)
         answer(light, lambda: self.model.change(lit=bool(light.value)))
 

@@ -2,6 +2,8 @@
 
 import socket
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,19 +15,21 @@ viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[vie
 client = pytest.importorskip("websockets.sync.client")
 exceptions = pytest.importorskip("websockets.exceptions")
 
+VOLUME = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
+GRAY = jv.colormap("gray", (0, 26), n_colors=4)
+VISER = [f"viser-v{viser.__version__}"]
+
 
 @pytest.fixture(scope="module")
 def page():
-    volume = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
-    served = jv.serve(volume, jv.colormap("gray", (0, 26), n_colors=4), port=18080)
+    served = jv.serve(VOLUME, GRAY, port=18080)
     yield served
     served.close()
 
 
 def received(page, origin: str) -> int:
     """Messages that a client from a page of this origin receives within a second; -1: it was sent away."""
-    protocol = f"viser-v{viser.__version__}"
-    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=[protocol]) as connection:
+    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=VISER) as connection:
         count, end = 0, time.monotonic() + 1
         try:
             while (left := end - time.monotonic()) > 0:
@@ -77,7 +81,40 @@ def test_the_camera_of_a_page_is_that_of_the_volume(page):
     assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
 
 
+def controls(page) -> dict[str, Any]:
+    """Those of a page that is opened, by their labels."""
+    from jaxvol.viewer.page import _Panel
+
+    gui = page._server.gui
+    client: Any = SimpleNamespace(gui=gui)
+    _Panel(client, page._content, page._state).model.close()
+    return {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
+
+
+def test_the_controls_show_how_it_begins():
+    served = jv.serve(VOLUME, GRAY, march=jv.March(16.0), compositing="average", port=18090)
+    try:
+        shown = controls(served)
+    finally:
+        served.close()
+    assert shown["step (voxels)"].value == shown["step (voxels)"].max == 16
+    assert "SpaceLeaping" in {name.replace("\u200b", "") for name in shown}
+    assert "light" not in shown
+
+
+def test_a_step_alone_is_shown_as_a_window_of_0():
+    step = jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2])
+    served = jv.serve(VOLUME, step, port=18090)
+    try:
+        shown = controls(served)
+    finally:
+        served.close()
+    assert (shown["window"].value, shown["level"].value) == (0, 9)
+    assert shown["level"].max - shown["level"].min > 20
+    assert "light" in shown
+
+
 @pytest.mark.parametrize("port", [99999, 0, -5, "x"])
 def test_a_port_that_is_none_is_named(port):
     with pytest.raises(ValueError, match="port must be an integer from 1 to 65535; got"):
-        jv.serve(jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3)), port=port)
+        jv.serve(VOLUME, port=port)
