@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import viser
+from websockets.exceptions import ConnectionClosed
 
 from .drawing import Content
 from .model import Frame, Model
@@ -83,12 +84,16 @@ class Page:
         self._server.stop()
 
     async def _only_own_pages(self, connection: Any) -> None:
-        """Any page that a browser shows may connect to a port of this machine; viser takes them all."""
+        """Any page that a browser shows may connect to a port of this machine; viser takes them all. It reads
+        messages only after this call, so that those of others are read here, and dropped."""
         socket = self._server._websock_server._live_connections[connection.client_id]
         request = socket.request
         origin = urlsplit(request.headers.get("Origin", "") if request else "")
         if origin.hostname not in OWN_NAMES or origin.port != self.port:
             await socket.close(1008, "this viewer is shown by its own pages only")
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    await socket.recv(decode=False)
 
     def _shown(self, point: np.ndarray) -> np.ndarray:
         """A world point in viser's scene."""

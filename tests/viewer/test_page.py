@@ -1,6 +1,7 @@
 """Who may connect to the page of `jaxvol view`, and what can a client make it do?"""
 
 import socket
+import threading
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,9 @@ import jaxvol as jv
 viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
 client = pytest.importorskip("websockets.sync.client")
 exceptions = pytest.importorskip("websockets.exceptions")
+frames = pytest.importorskip("websockets.frames")
+protocol = pytest.importorskip("websockets.client")
+uri = pytest.importorskip("websockets.uri")
 
 VOLUME = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
 GRAY = jv.colormap("gray", (0, 26), n_colors=4)
@@ -48,6 +52,40 @@ def test_only_its_own_pages_may_connect(page):
     assert received(page, f"http://127.0.0.1:{page.port}") > 0
     for origin in ("https://example.org", f"http://example.org:{page.port}", "http://localhost:1", "null"):
         assert received(page, origin) == -1
+
+
+def handled(page, origin: str) -> int:
+    """Messages that viser handles of a client from a page of this origin, which sends one along with its
+    request for a connection."""
+    server, message = page._server._websock_server, viser._messages.ShareUrlDisconnect
+    messages, ended = [], threading.Event()
+
+    def note(_: int, message: object) -> None:
+        messages.append(message)
+
+    server.register_handler(message, note)
+    server.on_client_disconnect(lambda _: ended.set())
+    asked = protocol.ClientProtocol(
+        uri.parse_uri(page.url.replace("http", "ws")), origin=origin, subprotocols=VISER
+    )
+    asked.send_request(asked.connect())
+    packed = viser.infra._messages.msgspec.msgpack.encode({"type": message.__name__})
+    frame = frames.Frame(frames.Opcode.BINARY, packed).serialize(mask=True)
+    end = frames.Frame(frames.Opcode.CLOSE, frames.Close(1000, "").serialize()).serialize(mask=True)
+    with socket.create_connection(("127.0.0.1", page.port), timeout=20) as connection:
+        connection.sendall(b"".join(asked.data_to_send()) + frame)
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101")
+        connection.sendall(end)
+        while connection.recv(1 << 16):
+            pass
+    assert ended.wait(20)
+    server.unregister_handler(message, note)
+    return len(messages)
+
+
+def test_what_others_send_is_not_handled(page):
+    assert handled(page, page.url) == 1
+    assert handled(page, "https://example.org") == 0
 
 
 def test_it_is_bound_to_this_machine_alone(page):
