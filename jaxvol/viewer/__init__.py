@@ -56,9 +56,11 @@ def view(
       default for voxels that seem to be labels, each in its own colour.
     - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
       it. Its size does not count.
-    - `march`: whose transforms are on at first, and whose step is that of the fine image. By default steps of
-      half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection` and `EarlyTermination`.
-    - `lighting`: the light that can be turned on, by default `Phong`. `lit`: whether it is on at first.
+    - `march`: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
+      voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection`
+      and `EarlyTermination`.
+    - `lighting`: the light that can be turned on, by default `Phong`; none where an average is composited,
+      which lies nowhere. `lit`: whether it is on at first.
     - `compositing`: as for `render`.
     - `background`: linear RGB.
     - `size`: (width, height) of the image in the notebook's pixels.
@@ -66,8 +68,9 @@ def view(
     **Returns:** a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a
     widget `v` renders what it shows.
 
-    **Raises:** `ValueError` as `render` does, for another kind of transfer function, and for an orthographic
-    camera; `ImportError` if rendercanvas or ipywidgets are missing.
+    **Raises:** `ValueError` as `render` does, for another kind of transfer function, an orthographic camera,
+    a step below 1/16 of a voxel or above 16 voxels, and a background that is not linear RGB; `ImportError` if
+    rendercanvas or ipywidgets are missing.
     """
     try:
         from .notebook import NotebookView

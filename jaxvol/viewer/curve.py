@@ -92,10 +92,14 @@ class Curve(Ranged):
     def split(self, index: int) -> "Curve":
         """With one more point half-way between this one and the next, which does not change the function.
 
-        **Raises:** `ValueError` where there is no next point, or as many as there may be."""
+        **Raises:** `ValueError` where there is no next point, or as many as there may be, and in a step."""
         self._check(index)
         if index + 1 == len(self) or len(self) >= MOST:
             raise ValueError(f"there is no room for another of {MOST} points behind point {index}.")
+        if self.values[index] == self.values[index + 1]:
+            raise ValueError(
+                f"there is no room for another point in a step: two are at {self.values[index]:g} already."
+            )
         middle = [
             (np.asarray(of[index]) + np.asarray(of[index + 1])) / 2
             for of in (self.values, self.colors, self.extinctions)
@@ -127,7 +131,7 @@ class Curve(Ranged):
     def padded(self) -> TransferFunction:
         """By `MOST` points where there are fewer: beyond the last one it is constant."""
         missing = max(MOST - len(self), 0)
-        step = max(self.window, 1e-3 * abs(self.values[-1]))
+        step = max(self.window or 1.0, 1e-3 * abs(self.values[-1]))
         beyond = tuple(self.values[-1] + step * (k + 1) for k in range(missing))
         return TransferFunction(
             self.values + beyond,

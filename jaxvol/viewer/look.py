@@ -52,12 +52,16 @@ class Ranged(Look):
         return (self.values[0] + self.values[-1]) / 2
 
     def over(self: R, window: float, level: float) -> R:
-        """The same values, moved and stretched to another range.
+        """The same values, moved and stretched to another range. Two values may have a window of 0, a step; a
+        wider one makes a ramp of it.
 
-        **Raises:** `ValueError` for a window that is not positive, and numbers that are not finite."""
-        if not (math.isfinite(level) and math.isfinite(window) and window > 0):
+        **Raises:** `ValueError` for a window that is not positive, or 0 for more than two values, and numbers
+        that are not finite."""
+        wide_enough = window >= 0 if len(self.values) == 2 else window > 0
+        if not (math.isfinite(level) and math.isfinite(window) and wide_enough):
             raise ValueError(f"window must be above 0, and level a number; got {window} and {level}.")
-        parts = [(v - self.level) / self.window for v in self.values]
+        own = self.window
+        parts = [(v - self.level) / own for v in self.values] if own else [-0.5, 0.5]
         return replace(self, values=tuple(level + window * part for part in parts))
 
 

@@ -74,13 +74,16 @@ class Model:
         self._worker.ask(self.state)
 
     def apply(self, change: Callable[[State], State]) -> str | None:
-        """Change the state by a function of it, and draw it. Bad input changes nothing: what is wrong with it
-        is told, and returned."""
+        """Change the state by a function of it, and draw it. Bad input, such as points that make no transfer
+        function, changes nothing: what is wrong with it is told, and returned."""
         try:
-            self.state = change(self.state)
+            changed = change(self.state)
+            if changed.look is not self.state.look:
+                changed.look.padded()
         except ValueError as fault:
             self._tell(str(fault))
             return str(fault)
+        self.state = changed
         self._worker.ask(self.state)
         return None
 

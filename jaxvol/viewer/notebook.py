@@ -141,7 +141,7 @@ class NotebookView(ipywidgets.HBox):
             _heading("march and light"),
             step,
             *(self._switch(name) for name in choices.names),
-            light,
+            *([] if choices.lighting is None else [light]),
             reset,
         ]
 

@@ -66,8 +66,8 @@ class RangeControls(ipywidgets.VBox):
         self._model, self._quiet = model, False
         look = self._look
         low, high = look.values[0], look.values[-1]
-        wide = max(high - low, 1e-12)
-        self.window = _slider("window", wide, wide / 100, 4 * wide, wide / 100)
+        wide = look.window or model.content.histogram.width
+        self.window = _slider("window", look.window, min(wide / 100, look.window), 4 * wide, wide / 100)
         self.level = _slider("level", look.level, low - wide, high + wide, wide / 100)
         for each in (self.window, self.level):
             each.observe(self._ranged, "value")

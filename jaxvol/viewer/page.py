@@ -12,12 +12,13 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import viser
+from websockets.exceptions import ConnectionClosed
 
 from .drawing import Content
 from .model import Frame, Model
 from .orbit import Orbit
 from .page_look import add_look, answer
-from .state import State
+from .state import LONGEST, SHORTEST, State
 
 
 HOST = "127.0.0.1"
@@ -83,12 +84,16 @@ class Page:
         self._server.stop()
 
     async def _only_own_pages(self, connection: Any) -> None:
-        """Any page that a browser shows may connect to a port of this machine; viser takes them all."""
+        """Any page that a browser shows may connect to a port of this machine; viser takes them all. It reads
+        messages only after this call, so that those of others are read here, and dropped."""
         socket = self._server._websock_server._live_connections[connection.client_id]
         request = socket.request
         origin = urlsplit(request.headers.get("Origin", "") if request else "")
         if origin.hostname not in OWN_NAMES or origin.port != self.port:
             await socket.close(1008, "this viewer is shown by its own pages only")
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    await socket.recv(decode=False)
 
     def _shown(self, point: np.ndarray) -> np.ndarray:
         """A world point in viser's scene."""
@@ -139,10 +144,13 @@ class _Panel:
         self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
 
     def _march(self, state: State) -> None:
-        step = self.gui.add_slider("step (voxels)", 0.0625, 8.0, 0.0625, min(state.step, 8.0))
+        choices = self.model.content.choices
+        step = self.gui.add_slider("step (voxels)", SHORTEST, float(LONGEST), SHORTEST, state.step)
         answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
-        for name in self.model.content.choices.names:
+        for name in choices.names:
             self._switch(name, name in state.on)
+        if choices.lighting is None:
+            return
         light = self.gui.add_checkbox("light", state.lit)
         answer(light, lambda: self.model.change(lit=bool(light.value)))
 

@@ -62,9 +62,10 @@ class _RangeControls:
         self.model = model
         look = self._look
         self.plot = gui.add_html(model.content.histogram.plot(look))
-        wide = max(look.window, 1e-12)
+        wide = look.window or model.content.histogram.width
         low, high = look.values[0] - wide, look.values[-1] + wide
-        self.window = gui.add_slider("window", wide / 100, 4 * wide, wide / 100, wide)
+        least = min(wide / 100, look.window)
+        self.window = gui.add_slider("window", least, 4 * wide, wide / 100, look.window)
         self.level = gui.add_slider("level", low, high, wide / 100, look.level)
         for each in (self.window, self.level):
             answer(each, lambda: self._edit(lambda c: c.over(self.window.value, self.level.value)))

@@ -33,6 +33,11 @@ class Histogram:
     high: float
     heights: tuple[float, ...]
 
+    @property
+    def width(self) -> float:
+        """Of its range of values, above 0."""
+        return self.high - self.low
+
     @classmethod
     def of(cls, volume: Volume) -> "Histogram":
         """Of a volume."""
@@ -66,7 +71,7 @@ class Histogram:
         )
 
     def _across(self, value: float) -> float:
-        return WIDTH * min(max((value - self.low) / (self.high - self.low), 0), 1)
+        return WIDTH * min(max((value - self.low) / self.width, 0), 1)
 
     def _up(self, part: float) -> float:
         """Room is left for a point at the top."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from .._util.checks import described
+from .._util.checks import described, finite_array
 from ..arguments import check_arguments
 from ..automatic import automatic_transfer, framed, labels_shown, visible_points
 from ..camera import Camera
@@ -15,6 +15,7 @@ from ..lighting.shading import Lighting
 from ..march import March, Transform
 from ..modes import Mode, compositing_of
 from ..occupancy import BLOCK
+from ..projections import Average
 from ..space import median_node_distance
 from ..transfer import TransferFunction
 from ..transfer2d import TransferFunction2D
@@ -33,7 +34,7 @@ from .labelled import Labelled
 from .look import Look
 from .orbit import Orbit
 from .plot import Histogram
-from .state import Choices, State
+from .state import LONGEST, SHORTEST, Choices, State
 from .table import Table
 
 
@@ -61,8 +62,9 @@ def begin(
 ) -> tuple[Content, State]:
     """What is looked at, and how at first. Arguments as for `view`.
 
-    **Raises:** `ValueError` as `render` does, for a transfer function of another kind than `SHOWN`, and for
-    an orthographic camera."""
+    **Raises:** `ValueError` as `render` does, for a transfer function of another kind than `SHOWN`, an
+    orthographic camera, a march whose step is shorter than `SHORTEST` or longer than `LONGEST` voxels, and a
+    background that is not linear RGB."""
     if transfer is not None and not isinstance(transfer, SHOWN):
         kinds = " or ".join(kind.__name__ for kind in SHOWN)
         raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
@@ -81,32 +83,33 @@ def begin(
         march=given,
         lighting=lighting,
     )
-    color = tuple(map(float, np.asarray(background, np.float64)))
-    if len(color) != 3 or not np.isfinite(color).all():
-        raise ValueError(f"background must be linear RGB; got {background!r}.")
+    mode = compositing_of(compositing)
+    mode.marched(transfer, given, volume)  # refuses what it cannot show
+    can_be_lit = not isinstance(mode, Average)
+    if lighting is not None and not can_be_lit:
+        raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
+    r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
     own = {type(transform) for transform in given.transforms}
     others = tuple(transform for transform in _offered() if type(transform) not in own)
     on = own if march is not None else set(ON)
     voxel = _voxel(volume, given)
     choices = Choices(
         (*given.transforms, *others),
-        Phong() if lighting is None else lighting,
+        Phong() if lighting is None and can_be_lit else lighting,
         "midpoint" if march is None else given.quadrature,
         voxel,
         given.max_samples,
     )
-    step = STEP if march is None else float(given.step) / voxel
     state = State(
         Orbit.of(seen),
         _look(transfer, voxel),
         (1, 1),
         1.0,
         frozenset(kind.__name__ for kind in on),
-        lit or lighting is not None,
+        lit and can_be_lit,
     )
-    state = state.with_step(step).with_size(*size)
-    look = compositing_of(compositing), (color[0], color[1], color[2])
-    return Content(volume, choices, *look, Histogram.of(volume)), state
+    state = state.with_step(STEP if march is None else _step(march, voxel)).with_size(*size)
+    return Content(volume, choices, mode, (r, g, b), Histogram.of(volume)), state
 
 
 def _offered() -> tuple[Transform, ...]:
@@ -129,6 +132,19 @@ def _look(transfer: TransferFunction | TransferFunction2D | LabelTransferFunctio
     if isinstance(transfer, TransferFunction2D):
         return Table.of(transfer)
     return Curve.of(transfer, voxel)
+
+
+def _step(march: March, voxel: float) -> float:
+    """Voxels between the samples of a march.
+
+    **Raises:** `ValueError` for fewer or more than a viewer's step can be."""
+    step = float(march.step) / voxel
+    if not SHORTEST <= step <= LONGEST:
+        raise ValueError(
+            f"march must have a step from {SHORTEST * voxel:.4g} to {LONGEST * voxel:.4g}, {SHORTEST:g} to "
+            f"{LONGEST:g} voxels, to be shown; got one of {float(march.step):.4g}, {step:.4g} voxels."
+        )
+    return step
 
 
 def _voxel(volume: Volume, march: March) -> float:

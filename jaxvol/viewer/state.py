@@ -54,12 +54,12 @@ class Choices:
     """What a viewer offers.
 
     - `transforms`: those that can be turned on, in the order in which they are applied.
-    - `lighting`: the light that can be turned on.
+    - `lighting`: the light that can be turned on; None where nothing can be lit.
     - `quadrature`: of the march. `voxel`: world length of a step of 1.
     """
 
     transforms: tuple[Transform, ...]
-    lighting: Lighting
+    lighting: Lighting | None
     quadrature: str
     voxel: float
     max_samples: int | None = None

@@ -73,6 +73,22 @@ def test_a_point_that_is_added_changes_nothing():
         CURVE.without(0).without(0).without(0)
 
 
+@pytest.mark.parametrize("value", [0.0, 20.0, -1e6])
+def test_a_step_alone_is_padded_moved_and_made_a_ramp(value):
+    given = jv.TransferFunction([value, value], [(1, 0, 0), (0, 0, 1)], [0, 2])
+    step = Curve.of(given, 1.0)
+    assert step.padded().values.shape == (MOST,)
+    np.testing.assert_array_equal(looked_up(step.padded()), looked_up(given))
+    assert step.over(0, 7).values == (7, 7)
+    assert step.over(4, 7).values == (5, 9)
+    assert step.over(4, 7).over(0, value) == step
+
+
+def test_a_step_has_no_room_for_another_point():
+    with pytest.raises(ValueError, match="no room for another point in a step: two are at 20"):
+        CURVE.split(1)
+
+
 @pytest.mark.parametrize(
     "change",
     [{"color": (0, 2, 0)}, {"opacity": -0.1}, {"opacity": math.nan}, {"value": math.inf}],

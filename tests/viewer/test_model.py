@@ -38,7 +38,7 @@ LABELS = jv.Volume(np.repeat(np.arange(3, dtype=np.uint8), 8)[:, None, None] * n
 """Slabs of the labels 0, 1 and 2."""
 
 
-def begun(march=MARCH, **more):
+def begun(march: jv.March | None = MARCH, **more):
     how = {"lighting": None, "lit": False, "compositing": "over", "background": (0.2, 0.5, 0.8), "size": SIZE}
     return begin(BALL, LOOK, None, march, **{**how, **more})
 
@@ -142,10 +142,11 @@ def test_bad_input_changes_nothing_and_is_told(shown):
         lambda s: s.with_step(0),
         lambda s: s.with_size(0, 100),
         lambda s: replace(s, look=s.look.over(-1, 0)),
+        lambda s: replace(s, look=s.look.over(1e-9, 1e3)),  # float32 has one number there
     ):
         assert shown.model.apply(change) is not None
     assert shown.model.state is state
-    assert len(shown.told) == told + 4
+    assert len(shown.told) == told + 5
 
 
 def test_a_fault_while_drawing_is_told_and_the_viewer_lives_on(shown):
@@ -268,10 +269,50 @@ def test_what_the_viewer_does_not_show_is_refused():
         begin(BALL, MARCH, None, None, **HOW)
     with pytest.raises(ValueError, match="perspective"):
         begin(BALL, LOOK, jv.Camera.looking_at(BALL, parallel=True), None, **HOW)
-    with pytest.raises(ValueError, match="background"):
-        begin(BALL, LOOK, None, None, **{**HOW, "background": (1, 2)})
+    for background in ((1, 2), None, "white", (0, 0, math.inf)):
+        with pytest.raises(ValueError, match="background must"):
+            begin(BALL, LOOK, None, None, **{**HOW, "background": background})
+    with pytest.raises(
+        ValueError, match=r"march must .* from 0\.05 to 12\.8, 0\.0625 to 16 voxels, .* got one"
+    ):
+        begin(BALL, LOOK, None, jv.March(20.0), **HOW)
     with pytest.raises(ValueError, match="camera must be"):
         begin(BALL, LOOK, MARCH, None, **HOW)
+
+
+PHONG = jv.lighting.Phong()
+
+
+@pytest.mark.parametrize("lit", [True, False])
+@pytest.mark.parametrize("given", [None, PHONG], ids=["default", "given"])
+def test_light_is_on_at_first_where_this_is_asked_for(given, lit):
+    content, state = begun(lighting=given, lit=lit)
+    assert state.lit is lit
+    assert isinstance(content.choices.lighting, jv.lighting.Phong)
+    assert (content.choices.light(state) is not None) is lit
+
+
+def test_an_average_lies_nowhere_and_is_not_lit():
+    content, state = begun(lit=True, compositing="average")
+    assert not state.lit
+    assert content.choices.light(replace(state, lit=True)) is None
+    with pytest.raises(ValueError, match="lighting must be None where an average"):
+        begun(lighting=PHONG, compositing="average")
+    with pytest.raises(ValueError, match="depends on the value alone; LabelTransferFunction reads more"):
+        begin(LABELS, None, None, None, **{**HOW, "compositing": "average"})
+
+
+MODES = ["over", "maximum", "minimum", "average", jv.FirstVisible(), jv.Isosurface(90.0)]
+
+
+@pytest.mark.parametrize(
+    "mode", MODES, ids=lambda mode: mode if isinstance(mode, str) else type(mode).__name__
+)
+def test_every_mode_is_shown_as_it_begins(mode):
+    content, state = begun(march=None, lit=True, compositing=mode)
+    drawing = Drawing(content, state)
+    tile = jax.eval_shape(lambda: drawing._rgba(Grid(1, 1, (SIDE, SIDE)), 0, 0))  # nothing is compiled
+    assert tile.shape == (SIDE, SIDE, 4)
 
 
 HOW = {"lighting": None, "lit": True, "compositing": "over", "background": (1, 1, 1), "size": (64, 64)}

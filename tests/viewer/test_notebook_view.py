@@ -2,6 +2,7 @@
 
 import asyncio
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,6 +73,30 @@ def test_the_controls_of_points_window_and_level_agree(shown):
     assert len(shown.model.state.look) == len(shown._look.points.children) == 4
     shown._look.points.children[0].children[4].click()
     assert len(shown.model.state.look) == len(shown._look.points.children) == 3
+
+
+def test_a_step_alone_is_moved_by_its_level_and_stretched_by_its_window():
+    step = jv.TransferFunction([90, 90], [(1, 0, 0), (0, 0, 1)], [0, 2])
+    view: Any = jv.view(BALL, step, march=MARCH, lit=False, size=(64, 48))
+    try:
+        assert (view._look.window.value, view._look.level.value) == (0, 90)
+        view._look.level.value = 110.0
+        assert view.model.state.look.values == pytest.approx((110, 110))
+        view._look.window.value = 20.0
+        assert view.model.state.look.values == pytest.approx((100, 120))
+    finally:
+        view.close()
+
+
+@pytest.mark.parametrize(("compositing", "offered"), [("over", True), ("average", False)])
+def test_light_is_offered_where_something_can_be_lit(compositing, offered):
+    view = jv.view(BALL, LOOK, march=MARCH, lit=False, compositing=compositing, size=(64, 48))
+    try:
+        names = [getattr(widget, "description", "") for widget in view.children[1].children]
+        assert ("light" in names) is offered
+        assert "AlphaCorrection" in names
+    finally:
+        view.close()
 
 
 def test_the_plot_follows_the_points(shown):

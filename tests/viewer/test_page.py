@@ -1,7 +1,10 @@
 """Who may connect to the page of `jaxvol view`, and what can a client make it do?"""
 
 import socket
+import threading
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,20 +15,25 @@ import jaxvol as jv
 viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
 client = pytest.importorskip("websockets.sync.client")
 exceptions = pytest.importorskip("websockets.exceptions")
+frames = pytest.importorskip("websockets.frames")
+protocol = pytest.importorskip("websockets.client")
+uri = pytest.importorskip("websockets.uri")
+
+VOLUME = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
+GRAY = jv.colormap("gray", (0, 26), n_colors=4)
+VISER = [f"viser-v{viser.__version__}"]
 
 
 @pytest.fixture(scope="module")
 def page():
-    volume = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
-    served = jv.serve(volume, jv.colormap("gray", (0, 26), n_colors=4), port=18080)
+    served = jv.serve(VOLUME, GRAY, port=18080)
     yield served
     served.close()
 
 
 def received(page, origin: str) -> int:
     """Messages that a client from a page of this origin receives within a second; -1: it was sent away."""
-    protocol = f"viser-v{viser.__version__}"
-    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=[protocol]) as connection:
+    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=VISER) as connection:
         count, end = 0, time.monotonic() + 1
         try:
             while (left := end - time.monotonic()) > 0:
@@ -44,6 +52,40 @@ def test_only_its_own_pages_may_connect(page):
     assert received(page, f"http://127.0.0.1:{page.port}") > 0
     for origin in ("https://example.org", f"http://example.org:{page.port}", "http://localhost:1", "null"):
         assert received(page, origin) == -1
+
+
+def handled(page, origin: str) -> int:
+    """Messages that viser handles of a client from a page of this origin, which sends one along with its
+    request for a connection."""
+    server, message = page._server._websock_server, viser._messages.ShareUrlDisconnect
+    messages, ended = [], threading.Event()
+
+    def note(_: int, message: object) -> None:
+        messages.append(message)
+
+    server.register_handler(message, note)
+    server.on_client_disconnect(lambda _: ended.set())
+    asked = protocol.ClientProtocol(
+        uri.parse_uri(page.url.replace("http", "ws")), origin=origin, subprotocols=VISER
+    )
+    asked.send_request(asked.connect())
+    packed = viser.infra._messages.msgspec.msgpack.encode({"type": message.__name__})
+    frame = frames.Frame(frames.Opcode.BINARY, packed).serialize(mask=True)
+    end = frames.Frame(frames.Opcode.CLOSE, frames.Close(1000, "").serialize()).serialize(mask=True)
+    with socket.create_connection(("127.0.0.1", page.port), timeout=20) as connection:
+        connection.sendall(b"".join(asked.data_to_send()) + frame)
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101")
+        connection.sendall(end)
+        while connection.recv(1 << 16):
+            pass
+    assert ended.wait(20)
+    server.unregister_handler(message, note)
+    return len(messages)
+
+
+def test_what_others_send_is_not_handled(page):
+    assert handled(page, page.url) == 1
+    assert handled(page, "https://example.org") == 0
 
 
 def test_it_is_bound_to_this_machine_alone(page):
@@ -77,7 +119,40 @@ def test_the_camera_of_a_page_is_that_of_the_volume(page):
     assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
 
 
+def controls(page) -> dict[str, Any]:
+    """Those of a page that is opened, by their labels."""
+    from jaxvol.viewer.page import _Panel
+
+    gui = page._server.gui
+    client: Any = SimpleNamespace(gui=gui)
+    _Panel(client, page._content, page._state).model.close()
+    return {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
+
+
+def test_the_controls_show_how_it_begins():
+    served = jv.serve(VOLUME, GRAY, march=jv.March(16.0), compositing="average", port=18090)
+    try:
+        shown = controls(served)
+    finally:
+        served.close()
+    assert shown["step (voxels)"].value == shown["step (voxels)"].max == 16
+    assert "SpaceLeaping" in {name.replace("\u200b", "") for name in shown}
+    assert "light" not in shown
+
+
+def test_a_step_alone_is_shown_as_a_window_of_0():
+    step = jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2])
+    served = jv.serve(VOLUME, step, port=18090)
+    try:
+        shown = controls(served)
+    finally:
+        served.close()
+    assert (shown["window"].value, shown["level"].value) == (0, 9)
+    assert shown["level"].max - shown["level"].min > 20
+    assert "light" in shown
+
+
 @pytest.mark.parametrize("port", [99999, 0, -5, "x"])
 def test_a_port_that_is_none_is_named(port):
     with pytest.raises(ValueError, match="port must be an integer from 1 to 65535; got"):
-        jv.serve(jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3)), port=port)
+        jv.serve(VOLUME, port=port)
