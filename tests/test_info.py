@@ -52,7 +52,7 @@ def test_info_says_what_is_assumed_of_other_files(tmp_path, capsys):
     data = np.arange(6 * 5 * 4, dtype=np.uint8).reshape(6, 5, 4)
     np.savez(tmp_path / "bare.npz", data=data)
     np.savez(tmp_path / "told.npz", data=data, spacing=(1, 1, 1))
-    tifffile.imwrite(tmp_path / "bare.tif", data)
+    tifffile.imwrite(tmp_path / "bare.tif", data, photometric="minisblack")
     tifffile.imwrite(tmp_path / "told.tif", data, imagej=True, resolution=(1, 1), metadata={"spacing": 1.0})
     (tmp_path / "bare").mkdir()
     for z in range(4):

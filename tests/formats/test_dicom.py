@@ -3,6 +3,8 @@
 The files are written by SimpleITK (GDCM), and changed on purpose.
 """
 
+import locale
+
 import numpy as np
 import pytest
 
@@ -51,7 +53,9 @@ def write_slice(path, values, position, direction, tags=None, compressor=None):
     if compressor:
         writer.UseCompressionOn()
         writer.SetCompressor(compressor)
+    before = locale.setlocale(locale.LC_ALL)
     writer.Execute(image)
+    locale.setlocale(locale.LC_ALL, before)  # which GDCM sets to C, so that others would read text as ASCII
     return path
 
 
