@@ -49,13 +49,13 @@ def test_info_takes_the_header_of_a_raw_file(tmp_path, capsys):
 
 def test_info_says_what_is_assumed_of_other_files(tmp_path, capsys):
     tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed: pip install jaxvol[io]")
-    data = np.arange(6 * 5 * 4, dtype=np.uint8).reshape(6, 5, 4)
+    data = np.arange(6 * 5 * 7, dtype=np.uint8).reshape(6, 5, 7)
     np.savez(tmp_path / "bare.npz", data=data)
     np.savez(tmp_path / "told.npz", data=data, spacing=(1, 1, 1))
     tifffile.imwrite(tmp_path / "bare.tif", data, photometric="minisblack")
     tifffile.imwrite(tmp_path / "told.tif", data, imagej=True, resolution=(1, 1), metadata={"spacing": 1.0})
     (tmp_path / "bare").mkdir()
-    for z in range(4):
+    for z in range(7):
         tifffile.imwrite(tmp_path / "bare" / f"{z}.tif", data[:, :, z])
     for name in ("bare.npz", "told.npz", "bare.tif", "told.tif", "bare"):
         assert main(["info", str(tmp_path / name)]) == 0
