@@ -33,7 +33,7 @@ def view(
     lit: bool = True,
     compositing: Mode | Compositing[Any] | Any = "over",
     background: Any = (1.0, 1.0, 1.0),
-    size: tuple[int, int] = (640, 480),
+    size: tuple[int, int] | Any = (640, 480),
 ) -> "NotebookView":
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 

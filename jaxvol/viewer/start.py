@@ -58,7 +58,7 @@ def begin(
     lit: bool,
     compositing: Mode | Compositing[Any] | Any,
     background: Any,
-    size: tuple[int, int],
+    size: tuple[int, int] | Any,
 ) -> tuple[Content, State]:
     """What is looked at, and how at first. Arguments as for `view`.
 
@@ -70,7 +70,8 @@ def begin(
         raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
     if not isinstance(volume, Volume):
         check_arguments("view(volume, transfer, camera, march)", volume=volume)
-    seen: Any = Camera.looking_at(volume, size=size) if camera is None else camera
+    whole = Camera.looking_at(volume, size=size)  # which checks the size
+    seen: Any = whole if camera is None else camera
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
         seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen

@@ -272,6 +272,10 @@ def test_what_the_viewer_does_not_show_is_refused():
     for background in ((1, 2), None, "white", (0, 0, math.inf)):
         with pytest.raises(ValueError, match="background must"):
             begin(BALL, LOOK, None, None, **{**HOW, "background": background})
+    for size in (None, (3,), (0, 5)):
+        for camera in (None, jv.Camera.looking_at(BALL)):
+            with pytest.raises(ValueError, match="size must"):
+                begin(BALL, LOOK, camera, None, **{**HOW, "size": size})
     with pytest.raises(
         ValueError, match=r"march must .* from 0\.05 to 12\.8, 0\.0625 to 16 voxels, .* got one"
     ):
