@@ -303,4 +303,4 @@ def test_an_unreadable_file_of_another_series_does_not_refuse_the_one_that_is_wa
 
 def test_rounded_directions_of_an_oblique_series_are_taken_as_meant(tmp_path):
     write_series(tmp_path / "a", np.round(turned(0, 45, 0), 3))
-    np.testing.assert_allclose(jv.load(tmp_path / "a").direction, turned(0, 45, 0), atol=1e-6)
+    np.testing.assert_allclose(np.asarray(jv.load(tmp_path / "a").direction), turned(0, 45, 0), atol=1e-6)

@@ -519,7 +519,7 @@ def test_directions_that_a_file_has_rounded_are_taken_as_meant(tmp_path, digits)
     turn = np.round(meant, digits)
     text = " ".join(f"{number:g}" for number in turn.T.ravel())
     path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text}")
-    np.testing.assert_allclose(load(path).direction, meant, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(load(path).direction), meant, atol=1e-6)
     path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text.replace('0.7', '0.8')}")
     with pytest.raises(ValueError, match="TransformMatrix must be orthogonal directions of length 1"):
         load(path)
