@@ -76,6 +76,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = " ".join(str(fault).split()).removeprefix("path: ")  # the argument's name in Python
         print(f"jaxvol {command}: error: {text}", file=sys.stderr)
         return 2
+    except (MemoryError, jax.errors.JaxRuntimeError) as fault:
+        if not isinstance(fault, MemoryError) and "RESOURCE_EXHAUSTED" not in str(fault):
+            raise
+        print(f"jaxvol {command}: error: there is not enough memory ({fault})", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         remove_unfinished()
         checkpoint = getattr(options, "checkpoint", None)

@@ -683,3 +683,30 @@ def test_as_a_program_a_fault_leaves_no_traceback(tmp_path):
     )
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
+
+
+def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = volume_file.read_bytes()
+    (tmp_path / "link.npy").symlink_to(volume_file)
+    name = volume_file.name
+    for words, message in (
+        (["-o", "link.npy"], "--output: link.npy is the volume"),
+        (["-o", "a.png", "--depth", name], f"--depth: {name} is the volume"),
+        (["-o", "a.npy", "--depth", "./a.npy"], "--depth: a.npy is what --output writes"),
+    ):
+        assert main(["render", name, *words]) == 2
+        assert message in capsys.readouterr().err
+    assert volume_file.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["link.npy", name])
+
+
+def test_too_little_memory_is_told_in_one_line(volume_file, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 16 bytes.")
+
+    monkeypatch.setattr("jaxvol.commands.render.frames_of", full)
+    assert main(["render", str(volume_file), "-o", str(tmp_path / "a.png")]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("jaxvol render: error: there is not enough memory (RESOURCE_EXHAUSTED")
+    assert printed.count("\n") == 1

@@ -23,8 +23,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     context the file takes the place of `path`; after an error it is removed, with the folders that were made
     for it, and `path` is as it was. A link stays one: what it points to is replaced. Into what is no regular
     file, such as a pipe or `/dev/null`, the content is written at the end."""
-    path = path.resolve()
-    with _beside(path) as part:
+    ending, path = path.suffix, path.resolve()
+    with _beside(path, ending) as part:
         yield part
         with _MOVING:
             if _is_special(path):
@@ -39,7 +39,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """An empty folder beside `path` to write files to. At the end of the context they take their places in
     `path`, which may hold others; after an error all are removed."""
     path = path.resolve()
-    with _beside(path) as part:
+    with _beside(path, "") as part:
         part.mkdir()
         yield part
         with _MOVING:
@@ -53,10 +53,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
+def _beside(path: Path, ending: str) -> Iterator[Path]:
     # not by tempfile, whose files nobody else may read; several processes may write the same file
     folder = Path(tempfile.gettempdir()) if _is_special(path) else path.parent
-    part = folder / f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{path.suffix}"
+    part = folder / f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{ending}"
     missing = list(itertools.takewhile(lambda above: not above.exists(), path.parents))
     _UNDERWAY[part] = missing
     try:

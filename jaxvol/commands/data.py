@@ -40,6 +40,20 @@ def source_of(options: argparse.Namespace) -> VoxelSource:
     return levels_of(options.file, **{name: value for name, value in given.items() if value is not None})[0]
 
 
+def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
+    """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, or one
+    of the others."""
+    kept = {"the volume": options.file}
+    for name in names:
+        path = getattr(options, name)
+        if path is None:
+            continue
+        for what, other in kept.items():
+            if path.resolve() == other.resolve():
+                raise ValueError(f"--{name}: {path} is {what}, which it would replace. Write another file.")
+        kept[f"what --{name} writes"] = path
+
+
 MIDDLE = 128
 """Voxels along each axis, at most, that are looked at as they are."""
 

@@ -11,7 +11,7 @@ from ..fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, 
 from ..fitting.driver import UNDETERMINED, Solver
 from ..fitting.uncertainty import Uncertainty
 from ..march import March
-from .data import volume_of
+from .data import refuse_to_replace, volume_of
 from .frames import FAST
 from .options import add_clim, add_output, scene_options
 from .progress import working
@@ -57,6 +57,7 @@ def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
+    refuse_to_replace(options, "output", "checkpoint")
     output_file("--output", options.output)
     # what is wrong with these is told before the volume is read
     views = read_views(options.images, options.cameras)

@@ -13,6 +13,7 @@ from ..camera import Camera
 from ..display import image_file, save_image
 from ..rendering import Rendering
 from ..unseen import why_unseen
+from .data import refuse_to_replace
 from .frames import Frames, frames_of
 from .options import add_output, scene_options, view_options
 from .orbit import axis_of, turned, views_of
@@ -61,6 +62,7 @@ def add_render(commands: Any, shared: argparse.ArgumentParser, examples: str = "
 
 def _render(options: argparse.Namespace) -> None:
     begun = time.perf_counter()
+    refuse_to_replace(options, "output", "depth")
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)

@@ -131,7 +131,8 @@ def transfer_given(options: argparse.Namespace) -> Transfer | None:
         for name in ("clim", "opacity", "unit_distance"):
             if getattr(options, name) is not None:
                 raise ValueError(
-                    f"--{name.replace('_', '-')} is for presets and colormaps; --transfer needs none."
+                    f"--{name.replace('_', '-')} is for presets and colormaps; a transfer function from a "
+                    "file or a picture needs none."
                 )
         return read_transfer(options.transfer) if kept is None else kept
     if is_automatic(options):

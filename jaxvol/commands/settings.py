@@ -133,9 +133,11 @@ def _of_picture(command: argparse.ArgumentParser, given: dict[str, Any], path: P
     if found.command != "render":
         said = " ".join(f"--{name} {_written(value)}" for name, value in found.settings.items())
         raise ValueError(
-            f"{path} was made by: jaxvol {shortened(f'{found.command} {said}')[1:-1]}. Run that."
+            f"{path} was not made by jaxvol render, but, as it says, by jaxvol "
+            f"{shortened(f'{found.command} {said}')}."
         )
-    refused = NOT_IN_FILES | {"file", "output", "depth", "like"}
+    # a picture names no file but its volume's, whose checksum it holds
+    refused = NOT_IN_FILES | {action.dest for action in command._actions if action.type is Path}
     known = {action.dest for action in command._actions}
     # what only the command render has, another leaves out
     settings = {n: v for n, v in found.settings.items() if n not in OF_RENDER or n in known}
@@ -187,6 +189,10 @@ def _checked(
             raise ValueError(f"{where}: {program} has no option {shortened(name)}.{hint}")
         action = actions[name]
         found[action.dest] = _converted(action, value, f"{where}: {name}")
+    for group in command._mutually_exclusive_groups:
+        both = [action.dest for action in group._group_actions if action.dest in found]
+        if len(both) > 1:
+            raise ValueError(f"{where}: one of {' and '.join(both)} excludes the other; leave one out.")
     return found
 
 

@@ -38,7 +38,7 @@ READERS: dict[str, Reader] = {
     ".raw.gz": read_raw,
     ".npy": read_npy,
     ".npz": read_npz,
-    **dict.fromkeys((".nii", ".nii.gz", ".nrrd"), read_medical),
+    **dict.fromkeys((".nii", ".nii.gz", ".nrrd", ".nhdr"), read_medical),
     **dict.fromkeys((".mha", ".mhd"), read_metaimage),
     ".dcm": read_dicom,
     **dict.fromkeys(TIFF, read_tiff),
@@ -64,7 +64,7 @@ def load(
     | `.npy` | its own; the array is data[x, y, z] |
     | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
     | `.mha`, `.mhd` | its own |
-    | `.nii`, `.nii.gz`, `.nrrd` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nii`, `.nii.gz`, `.nrrd`, `.nhdr` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
     | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
@@ -171,7 +171,7 @@ def files_of(path: Path) -> list[Path]:
     if name.endswith((".raw", ".raw.gz")):
         beside = raw_json(path)
         return [path] if beside is None else [path, beside]
-    if name.endswith((".mhd", ".nrrd")):
+    if name.endswith((".mhd", ".nrrd", ".nhdr")):
         data = metaimage_data(path) if name.endswith(".mhd") else nrrd_data(path)
         return [path, data] if data != path and data.is_file() else [path]
     return series_files(path) if is_dicom(path) else [path]
@@ -238,6 +238,8 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
 def _existing(path: str | os.PathLike[str] | Any) -> Path:
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
+    if not str(path):
+        raise ValueError("path must be that of a file or folder; got ''.")
     path = Path(path)
     if not path.exists():
         raise ValueError(

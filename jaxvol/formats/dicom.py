@@ -95,6 +95,7 @@ def read_dicom_folder(folder: Path, header: Header) -> dict[str, Any]:
     a way that SimpleITK does not read.
     """
     header.refuse(folder)
+    _check_strays(folder)
     try:
         slices = [_slice(path) for path in dicom_files(folder)]
     except ValueError as fault:
@@ -130,6 +131,7 @@ def series_files(path: Path) -> list[Path]:
 
 def _series_of(path: Path) -> list[Slice]:
     wanted = _slice(path).series
+    _check_strays(path.parent)
     found = []
     for file in dicom_files(path.parent):
         try:
@@ -139,6 +141,16 @@ def _series_of(path: Path) -> list[Slice]:
             if not told or wanted in told:  # it may be a slice of the series
                 raise
     return [each for each in found if each.series == wanted]
+
+
+def _check_strays(folder: Path) -> None:
+    """**Raises** `ValueError` for what is named as a slice and is none, such as an empty file."""
+    for file in folder.glob("[!.]*.[dD][cC][mM]"):
+        if file.is_file() and not is_dicom(file):
+            raise ValueError(
+                f'path: {file} is no DICOM file: it does not have "DICM" at byte 128. If it is no slice, '
+                "remove it."
+            )
 
 
 def _slice(path: Path) -> Slice:
@@ -219,7 +231,7 @@ def _check_places(path: Path, slices: list[Slice], normal: np.ndarray) -> float:
     if wide.size:
         i = int(wide[0])
         raise ValueError(
-            f"path: {path} has unevenly spaced slices, or some are missing: most are {step:g} apart, "
+            f"path: {path} has unevenly spaced slices, or some are missing: the median distance is {step:g}, "
             f"and {names[i]} and {names[i + 1]} are {gaps[i]:g} ({wide.size} such gaps among {len(slices)} "
             "slices)."
         )

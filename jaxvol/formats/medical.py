@@ -32,14 +32,14 @@ def simple_itk(path: Path) -> Any:
 
 
 def read_medical(path: Path, header: Header) -> dict[str, Any]:
-    """Reader for `.nii`, `.nii.gz` and `.nrrd`."""
+    """Reader for `.nii`, `.nii.gz`, `.nrrd` and `.nhdr`."""
     header.refuse(path)
     n_bytes = file_size(path)
     sitk = simple_itk(path)
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     name = path.name.lower()
-    kind = "Nrrd" if name.endswith(".nrrd") else "Nifti"
+    kind = "Nifti" if name.endswith((".nii", ".nii.gz")) else "Nrrd"
     reader.SetImageIO(f"{kind}ImageIO")
     with decoding(path):
         if kind == "Nifti":

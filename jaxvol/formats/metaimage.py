@@ -128,8 +128,8 @@ def _voxels(path: Path, fields: dict[str, str], begin: int, shape: tuple[int, in
     source = _source(path, fields)
     if not source.is_file():
         raise ValueError(
-            f"path: {path} cannot be read: it must hold its voxels, or name one file of them; got "
-            f"{fields['ElementDataFile'][:80]!r}."
+            f"path: {path} cannot be read: it must hold its voxels, or name one file of them that is there; "
+            f"got ElementDataFile = {fields['ElementDataFile'][:80]}."
         )
     text = fields.get("BinaryData", "True").lower().startswith("f")
     if source != path:
@@ -142,7 +142,7 @@ def _voxels(path: Path, fields: dict[str, str], begin: int, shape: tuple[int, in
             content = zlib.decompressobj(wbits=47).decompress(stream.read(), expected + 1)  # zlib's or gzip's
             check_size(path, len(content), expected)
         else:
-            held = source.stat().st_size - begin
+            held = max(source.stat().st_size - begin, 0)
             check_size(path, min(held, expected), expected)  # other data may follow
             content = read_all(path, _Part(stream, expected), expected)
     return as_array(content, shape, dtype, "F")

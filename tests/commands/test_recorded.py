@@ -196,13 +196,18 @@ BAD = {
     "long": (lambda p: png(p, '"' + "x" * MOST + '"'), "PNG"),
     "command": (
         lambda p: png(p, settings(command="demo", settings={"size": [9, 9]})),
-        "was made by: jaxvol demo",
+        "was not made by jaxvol render, but, as it says, by jaxvol 'demo --size 9 9'",
     ),
     "option": (
         lambda p: png(p, settings(settings={"evil": 1})),
         "the settings in it: jaxvol render has no option",
     ),
     "output": (lambda p: png(p, settings(settings={"output": "/etc/passwd"})), "has no option 'output'"),
+    "a file": (lambda p: png(p, settings(settings={"transfer": "/dev/zero"})), "has no option 'transfer'"),
+    "rivals": (
+        lambda p: png(p, settings(settings={"preset": "head", "cmap": "hot"})),
+        "one of preset and cmap excludes the other",
+    ),
     "programs": (lambda p: png(p, settings(settings={"programs": "/"})), "has no option 'programs'"),
     "kind": (lambda p: png(p, settings(settings={"step": "1"})), "step must be a number; got '1'"),
     "huge": (lambda p: png(p, settings(settings={"step": 10**400})), "step must be a number"),

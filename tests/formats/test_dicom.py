@@ -208,7 +208,10 @@ def empty(folder):
 
 
 BAD = {
-    "a slice is missing": (gap, r"unevenly spaced slices, or some are missing: most are 2\.5 apart.* are 5"),
+    "a slice is missing": (
+        gap,
+        r"unevenly spaced slices, or some are missing: the median distance is 2\.5, .* are 5",
+    ),
     "a slice is there twice": (
         copy,
         r"1 slices that lie where another one does: IM\d+.dcm and copy.dcm|copy",
@@ -304,3 +307,13 @@ def test_an_unreadable_file_of_another_series_does_not_refuse_the_one_that_is_wa
 def test_rounded_directions_of_an_oblique_series_are_taken_as_meant(tmp_path):
     write_series(tmp_path / "a", np.round(turned(0, 45, 0), 3))
     np.testing.assert_allclose(np.asarray(jv.load(tmp_path / "a").direction), turned(0, 45, 0), atol=1e-6)
+
+
+def test_what_is_named_as_a_slice_and_is_none_is_not_left_out_unsaid(tmp_path):
+    paths = write_series(tmp_path / "a")
+    (tmp_path / "a" / "._IM000.dcm").write_bytes(b"of a Mac")
+    assert jv.load(tmp_path / "a").shape == SHAPE
+    paths[-1].write_bytes(b"")
+    for path in (tmp_path / "a", paths[0]):
+        with pytest.raises(ValueError, match=rf"{paths[-1].name} is no DICOM file"):
+            jv.load(path)

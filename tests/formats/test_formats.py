@@ -340,7 +340,7 @@ def test_formats_may_be_added(tmp_path, monkeypatch):
 
 # Formats read by SimpleITK
 
-ITK_ENDINGS = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
+ITK_ENDINGS = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr")
 
 
 @pytest.fixture
