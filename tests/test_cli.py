@@ -698,6 +698,10 @@ def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, mo
         assert message in capsys.readouterr().err
     assert volume_file.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["link.npy", name])
+    (tmp_path / "stack").mkdir()
+    (tmp_path / "stack" / "1.tif").write_bytes(b"a slice")
+    assert main(["render", "stack", "-o", "stack/1.tif"]) == 2
+    assert "--output: stack/1.tif is a slice of the volume" in capsys.readouterr().err
 
 
 def test_too_little_memory_is_told_in_one_line(volume_file, tmp_path, monkeypatch, capsys):

@@ -10,7 +10,7 @@ from jaxtyping import Shaped
 from ..automatic.sampling import SAMPLED
 from ..bricks import VoxelSource, levels_of
 from ..bricks.plan import IN_MEMORY, copied
-from ..formats import load
+from ..formats import files_of, load
 from ..volume import Volume
 
 
@@ -41,17 +41,18 @@ def source_of(options: argparse.Namespace) -> VoxelSource:
 
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
-    """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, or one
-    of the others."""
-    kept = {"the volume": options.file}
+    """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, one of
+    its slices, or one of the others."""
+    slices = files_of(options.file) if options.file.is_dir() else []
+    kept = {"the volume": [options.file], "a slice of the volume": slices}
     for name in names:
         path = getattr(options, name)
         if path is None:
             continue
-        for what, other in kept.items():
-            if path.resolve() == other.resolve():
+        for what, others in kept.items():
+            if path.resolve() in [other.resolve() for other in others]:
                 raise ValueError(f"--{name}: {path} is {what}, which it would replace. Write another file.")
-        kept[f"what --{name} writes"] = path
+        kept[f"what --{name} writes"] = [path]
 
 
 MIDDLE = 128
