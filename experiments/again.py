@@ -25,6 +25,8 @@ from .command import command
 ARGUMENTS = {
     "accuracy": "accuracy --repetitions 5",
     "bricks": "bricks --size 40 --repetitions 3",
+    "gradient_agreement_gpu": "gradient_agreement --only 'head phantom' tooth engine --methods none hierarchy"
+    " distance",
     "jitter_accuracy": "jitter_accuracy --repetitions 7",
     "overhead": "overhead --sizes 512",
     "planning_seed_1": "planning --scenes 40 --every 2 --seed 1",
@@ -36,7 +38,7 @@ ARGUMENTS = {
 }
 """What records are made by, where it is not the experiment of their name without options."""
 
-ON_GPU = ("speed_gpu",)
+ON_GPU = ("gradient_agreement_gpu", "speed_gpu")
 """Those that are of a GPU."""
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))

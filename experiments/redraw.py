@@ -49,6 +49,7 @@ DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "fit_pose": lambda result, path: fit_pose.draw(result["starts"], path),
     "fit_transfer": lambda result, path: fit_transfer.draw(result["scenes"], path),
     "gradient_agreement": lambda result, path: gradient_agreement.draw(result["scenes"], path),
+    "gradient_agreement_gpu": lambda result, path: gradient_agreement.draw(result["scenes"], path),
     "gradient_errors": lambda result, path: gradient_errors.draw(
         result["relative errors"], result["widths"], path
     ),
