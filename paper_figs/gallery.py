@@ -99,7 +99,7 @@ def draw(page: Page, row: int, name: str, subject: Subject, paths: int) -> None:
         for each in (None, shaded, templates)
     )
     columns = {
-        "emission": emitted,
+        "unlit": emitted,
         "Phong": phong,
         "scatterer templates": exposed(lit),
         "path traced": exposed(traced.radiance),

@@ -32,6 +32,7 @@ h2 { border-bottom: 1px solid #bbb; margin-top: 3rem } h3 { margin: 2.2rem 0 0.4
 .said b { display: block; font-size: 0.8rem; color: #666 }
 img { max-width: 100%; border: 1px solid #ddd } .wide { overflow-x: auto }
 table { border-collapse: collapse; font-size: 0.8rem } td, th { padding: 0.15rem 0.7rem; text-align: left }
+td:first-child, th:first-child { white-space: nowrap }
 tr:nth-child(even) { background: #f3f3f3 } small { color: #666 } code { font-size: 0.85em }
 @media (max-width: 50rem) { .said { grid-template-columns: 1fr } }
 """
@@ -40,7 +41,8 @@ tr:nth-child(even) { background: #f3f3f3 } small { color: #666 } code { font-siz
 KEPT = (
     "Each figure and table stands below what its paper reports, and what to look at in ours. Charts and "
     "tables are made from the records of experiments; pictures of scenes, which take minutes to render, are "
-    "those that were kept. `jaxvol figures --run` measures and renders all of it anew."
+    "those that were kept. A click shows a picture in full size. The energy of wood grain is a little above "
+    "or below 0 where there is none. `jaxvol figures --run` measures and renders all of it anew."
 )
 ANEW = (
     "Each figure and table stands below what its paper reports, and what to look at in ours. All of it was "

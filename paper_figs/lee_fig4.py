@@ -50,7 +50,7 @@ def main(chosen: Namespace) -> None:
     page = Page(
         1 + len(REACHES), 1, chosen.size, "Lee, Kwon and Shin, Fig. 4: an ear, light from behind the head"
     )
-    for column, (title, reach) in enumerate({"no light": None, **REACHES}.items()):
+    for column, (title, reach) in enumerate({"unlit": None, **REACHES}.items()):
         lighting = None if reach is None else ScattererTemplates(FLESH, LIGHTS, reach=reach, **HOW)
         rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
         image = np.asarray(rendering.image(BLACK))

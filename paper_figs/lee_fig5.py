@@ -48,7 +48,7 @@ LIGHTS = DirectionalLight((0.95, 0.05, -0.3), (34.0, 34.0, 34.0)), ConstantLight
 PHONG = Phong(DirectionalLight(LIGHTS[0].direction, (1.5, 1.5, 1.5)), ambient=0.15)
 FAR_TOO: dict[str, Any] = {"reach": (2, 4, 8)}
 COLUMNS: dict[str, Any] = {
-    "no light": None,
+    "unlit": None,
     "Phong": PHONG,
     "hard, one template for each material": {"occlusion": "hard", "choice": "material", **FAR_TOO},
     "soft, 4 templates blended": {

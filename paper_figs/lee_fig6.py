@@ -23,7 +23,7 @@ IRRADIANCE = (40.0, 40.0, 40.0)
 AROUND = ConstantLight((1.3, 1.3, 1.3))
 BLENDED = {"templates": 4, "blend": True, "packets": 16, "threshold": 0.004, "reach": (2, 4, 8)}
 COLUMNS: dict[str, dict[str, Any] | None] = {
-    "no light": None,
+    "unlit": None,
     "hard, one of 8 for each pixel": {"occlusion": "hard"},
     "soft, 4 templates blended": BLENDED,
 }

@@ -377,8 +377,8 @@ def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     assert kisti_table.tested_every(measured) in text
 
 
-def test_what_the_readme_says_of_plans_and_choices_is_in_the_records():
-    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+def test_what_is_said_of_plans_and_choices_is_in_the_records():
+    text = " ".join((ROOT / "docs" / "features.md").read_text(encoding="utf-8").split())
     results = [record.read(record.RESULTS / f"{name}.json")["result"] for name in PLANS]
     rows = [row for result in results for row in result["summary"]["by tolerance"].values()]
     images, held, within, searched = (

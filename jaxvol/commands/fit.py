@@ -85,10 +85,10 @@ def _fit(options: argparse.Namespace) -> None:
     error = (2 * result.loss) ** 0.5
     print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")
     if points := _undetermined(result.uncertainty):
-        numbers, many = ", ".join(map(str, points)), "s" if len(points) > 1 else ""
+        values = ", ".join(f"{float(result.parameters.values[point]):g}" for point in points)
         print(
-            f"{path}: what the images do not determine is arbitrary: colours or extinction of point{many} "
-            f"{numbers} of {len(result.parameters.values)}, counted from 0"
+            f"{path}: what the images do not determine is arbitrary: colours or extinction of "
+            f"{len(points)} of {len(result.parameters.values)} points, those of the values {values}"
         )
 
 

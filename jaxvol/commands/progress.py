@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
-PATIENCE, INTERVAL = 2.0, 0.25
-"""Seconds before the line is shown, and between its changes."""
+PATIENCE, INTERVAL, IN_LOGS = 2.0, 0.25, 60.0
+"""Seconds before the line is shown, between its changes, and between lines where it is none of a terminal."""
 
 Told = Callable[[int, int], None]
 """Called with how many are done, and of how many."""
@@ -17,28 +17,32 @@ Told = Callable[[int, int], None]
 @contextmanager
 def working(what: str) -> Iterator[Told]:
     """Show `what` with the seconds that it has taken, on the terminal of stderr, until the context ends;
-    yields a function that adds how many are done of how many. Where stderr is no terminal, such as a log, the
-    line is `what` alone, once, and stays."""
+    yields a function that adds how many are done of how many. Where stderr is no terminal, such as a log,
+    lines stay: `what` alone, and then, each minute, with what is done."""
     begun, count = time.monotonic(), ""
 
     def told(done: int, of: int) -> None:
         nonlocal count
         count = f"{done} of {of}, "
 
+    def line() -> str:
+        return f"{what}: {count}{time.monotonic() - begun:.0f} s"
+
     ended, terminal = threading.Event(), sys.stderr.isatty()
 
     def show() -> None:
-        wait = PATIENCE
-        if not terminal:
-            if not ended.wait(wait):
-                print(f"{what} ...", file=sys.stderr, flush=True)
+        if ended.wait(PATIENCE):
             return
-        while not ended.wait(wait):
-            wait = INTERVAL
-            line = f"{what}: {count}{time.monotonic() - begun:.0f} s"
-            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-        if wait == INTERVAL:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        if not terminal:
+            print(f"{what} ...", file=sys.stderr, flush=True)
+            while not ended.wait(IN_LOGS):
+                print(line(), file=sys.stderr, flush=True)
+            return
+        while True:
+            print(f"\r\x1b[K{line()}", end="", file=sys.stderr, flush=True)
+            if ended.wait(INTERVAL):
+                break
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
     thread = threading.Thread(target=show, daemon=True)
     thread.start()

@@ -96,6 +96,7 @@ def rendered(
         rendering = frames.render(camera, told)
     spent = {**(before or {}), "compiling and rendering": time.perf_counter() - begun}
     parts = ", ".join(f"{what} {seconds:.2f} s" for what, seconds in spent.items())
+    parts = parts if len(spent) > 1 else next(iter(spent))  # a single one is the whole
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     shape = frames.volume.shape if frames.source is None else frames.source.shape

@@ -44,7 +44,7 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
         raise ValueError(f"{cameras} must hold a list of cameras; got {type(entries).__name__}.")
     if len(entries) != len(images):
         raise ValueError(
-            f"{cameras} must hold one camera for each of {len(images)} images; got {len(entries)}."
+            f"cameras: {cameras} must hold one camera for each of the {len(images)} images; got {len(entries)}."
         )
     pictures = [_picture(path) for path in images]
     return [
@@ -107,10 +107,10 @@ def _json(path: File) -> Any:
 
 def _fields(what: str, content: Any, allowed: Sequence[str], needed: Sequence[str]) -> dict[str, Any]:
     if not isinstance(content, dict) or not set(needed) <= set(content) <= set(allowed):
-        got = ", ".join(content) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(
-            f"{what} must be an object with {', '.join(needed)} (of {', '.join(allowed)}); got {got}."
-        )
+        got = ", ".join(content) if isinstance(content, dict) else f"a {type(content).__name__}"
+        others = [name for name in allowed if name not in needed]
+        optional = f", and perhaps {', '.join(others)}" if others else ""
+        raise ValueError(f"{what} must be an object with {', '.join(needed)}{optional}; got {got}.")
     return content
 
 

@@ -41,9 +41,13 @@ def test_what_is_soon_done_is_not_shown(shown):
     assert shown(Terminal(), patience=30, seconds=0) == ""
 
 
-def test_a_log_has_one_line_of_what_takes_long(shown):
+def test_a_log_has_a_line_of_what_takes_long_and_one_each_minute(shown, monkeypatch):
     assert shown(io.StringIO(), patience=0.01, seconds=0.3) == "rendering a.png, frames ...\n"
     assert shown(io.StringIO(), patience=30, seconds=0) == ""
+    monkeypatch.setattr(progress, "IN_LOGS", 0.05)
+    first, second, *_ = shown(io.StringIO(), patience=0.01, seconds=0.5).splitlines()
+    assert first == "rendering a.png, frames ..."
+    assert second == "rendering a.png, frames: 3 of 7, 0 s"
 
 
 def test_it_ends_with_an_error(monkeypatch):
