@@ -86,7 +86,7 @@ ENTRIES = (
         "with it.",
         "Terraces under ray casting, noise under jitter, and neither with alignment (last column). Its RMSE is "
         "larger: the left rule finds too little material where rays enter a vessel, and the last cells that "
-        "reach too far had made up for some of it; `quadrature=\"midpoint\"` removes that error. Terraces are "
+        'reach too far had made up for some of it; `quadrature="midpoint"` removes that error. Terraces are '
         "structure, told by the energy of wood grain and not by the noise.",
     ),
     Entry(
@@ -105,7 +105,7 @@ ENTRIES = (
         "jittered 0.775 / 3.739 / 1.771 / 1.199; aligned as well 0.775 / 3.745 / 1.772 / 1.216. The text "
         "says that the overhead is below 1 %; the rows of head and vessels have 1.0 and 2.0 %.",
         "Ratios to ray casting, with their 95 % intervals, and the paper's as rows of the same table. \"All "
-        "samples\": no ray leaps or ends early; \"as in the paper\": with early termination and leaps in all "
+        'samples": no ray leaps or ends early; "as in the paper": with early termination and leaps in all '
         "columns, which makes frames shorter and the same cost a larger part of them. Ours cost more than the "
         "paper's: 6 % in the geometric mean with all samples, and 16 % as in the paper.",
         "record",
@@ -185,8 +185,8 @@ ENTRIES = (
         "The first table is shaded, as in the report, the second unshaded; the third gives the speed-up "
         "(and the time) by how many samples lie between two tests. The report's numbers are rows of the "
         "tables. The report fetches every sample and skips only the shading of those that are invisible: "
-        "\"shading skipped\", which makes the engine slower here (below 1), since gathering the visible samples "
-        "takes longer than shading all. \"ESS\" alone is `SpaceLeaping`, which skips fetching as well.",
+        '"shading skipped", which makes the engine slower here (below 1), since gathering the visible samples '
+        'takes longer than shading all. "ESS" alone is `SpaceLeaping`, which skips fetching as well.',
         "record",
         "kisti",
     ),

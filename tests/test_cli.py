@@ -556,7 +556,8 @@ def test_fit_finds_a_transfer_function_that_makes_the_pictures(volume_file, seen
         assert main([*command, "--max-steps", "20"]) == 0
     printed = capsys.readouterr().out
     assert re.search(
-        r"not determine is arbitrary: colours or extinction of \d of 8 points, those of the values 0\b", printed
+        r"not determine is arbitrary: colours or extinction of \d of 8 points, those of the values 0\b",
+        printed,
     )
     assert float(printed.partition("RMSE ")[2].split()[0]) < 0.01
     transfer = jv.read_transfer(output)
@@ -570,7 +571,7 @@ BAD_FIT = {
     "no picture's file": ({"--images": ["CAMERAS", "CAMERAS"]}, "cannot be read as a picture"),
     "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
     "too deep": ({"--cameras": ["deep.json"]}, "deep.json is not JSON"),
-    "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "one camera for each of the 3 images; got 2"),
+    "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "each of the 3 images; got 2"),
     "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
     "start": ({"--start": ["CAMERAS"]}, "must be an object with values, colors, extinction; got a list"),
     "clim": ({"--clim": ["5", "4"]}, "clim must be (low, high)"),

@@ -44,7 +44,8 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
         raise ValueError(f"{cameras} must hold a list of cameras; got {type(entries).__name__}.")
     if len(entries) != len(images):
         raise ValueError(
-            f"cameras: {cameras} must hold one camera for each of the {len(images)} images; got {len(entries)}."
+            f"cameras: {cameras} must hold one camera for each of the {len(images)} images; "
+            f"got {len(entries)}."
         )
     pictures = [_picture(path) for path in images]
     return [
