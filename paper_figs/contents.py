@@ -84,10 +84,10 @@ ENTRIES = (
         "Fig. 12: sampling alignment",
         "Where rays leave the volume through vessels, the back face is bumpy without alignment and smooth "
         "with it.",
-        "Terraces under ray casting, noise under jitter, and neither with alignment (last column). Its RMSE is "
-        "larger: the left rule finds too little material where rays enter a vessel, and the last cells that "
-        'reach too far had made up for some of it; `quadrature="midpoint"` removes that error. Terraces are '
-        "structure, told by the energy of wood grain and not by the noise.",
+        "Terraces under ray casting, noise under jitter, and neither with alignment (last column). Its "
+        "RMSE is larger: the left rule finds too little material where rays enter a vessel, and the last "
+        'cells that reach too far had made up for some of it; `quadrature="midpoint"` removes that error.'
+        " Terraces are structure, told by the energy of wood grain and not by the noise.",
     ),
     Entry(
         "fig13",
@@ -104,10 +104,10 @@ ENTRIES = (
         "casting 0.767 / 3.728 / 1.768 / 1.192; jittered 0.771 / 3.741 / 1.765 / 1.196; empty-space "
         "jittered 0.775 / 3.739 / 1.771 / 1.199; aligned as well 0.775 / 3.745 / 1.772 / 1.216. The text "
         "says that the overhead is below 1 %; the rows of head and vessels have 1.0 and 2.0 %.",
-        "Ratios to ray casting, with their 95 % intervals, and the paper's as rows of the same table. \"All "
-        'samples": no ray leaps or ends early; "as in the paper": with early termination and leaps in all '
-        "columns, which makes frames shorter and the same cost a larger part of them. Ours cost more than the "
-        "paper's: 6 % in the geometric mean with all samples, and 16 % as in the paper.",
+        "Ratios to ray casting, with their 95 % intervals, and the paper's as rows of the same table. "
+        '"All samples": no ray leaps or ends early; "as in the paper": with early termination and leaps '
+        "in all columns, which makes frames shorter and the same cost a larger part of them. Ours cost "
+        "more than the paper's: 6 % in the geometric mean with all samples, and 16 % as in the paper.",
         "record",
         "overhead",
     ),
@@ -118,8 +118,8 @@ ENTRIES = (
         "At R = 8, 53 % less time than with the distance map alone, in CT of a colon of 512 x 512 x 541 "
         "voxels. Larger and smaller cells gain less.",
         "The cross is the paper's number. Ours, off a distance map of voxels (orange points against the "
-        "orange line), gains nothing: that map alone leaves little to gain. Bands are 95 % intervals of medians "
-        "of few runs, and may begin or end at the median.",
+        "orange line), gains nothing: that map alone leaves little to gain. Bands are 95 % intervals of "
+        "medians of few runs, and may begin or end at the median.",
         "record",
         "minimum_distance",
     ),
@@ -137,9 +137,9 @@ ENTRIES = (
         "Table 1: overlap and rates by split",
         "1280 x 490 x 325 voxels on a card of 768 MB, 375 x 375 pixels: 22.87 frames a second with overlap "
         "and 20.88 by reloading at the best split, 2,4,2, with 0.63 % of overlap. Rule: keep that below 3 %.",
-        "The formula gives the paper's overlap column, up to a unit that is not explained. Rates follow the "
-        "number of loads, not the overlap. In brackets, 95 % intervals of medians of few runs, which may begin "
-        "at the median; the splits that take longest were timed once.",
+        "The formula gives the paper's overlap column, up to a unit that is not explained. Rates follow "
+        "the number of loads, not the overlap. In brackets, 95 % intervals of medians of few runs, which "
+        "may begin at the median; the splits that take longest were timed once.",
         "record",
         "bricks",
     ),
@@ -185,8 +185,9 @@ ENTRIES = (
         "The first table is shaded, as in the report, the second unshaded; the third gives the speed-up "
         "(and the time) by how many samples lie between two tests. The report's numbers are rows of the "
         "tables. The report fetches every sample and skips only the shading of those that are invisible: "
-        '"shading skipped", which makes the engine slower here (below 1), since gathering the visible samples '
-        'takes longer than shading all. "ESS" alone is `SpaceLeaping`, which skips fetching as well.',
+        '"shading skipped", which makes the engine slower here (below 1), since gathering the visible '
+        'samples takes longer than shading all. "ESS" alone is `SpaceLeaping`, which skips fetching as '
+        "well.",
         "record",
         "kisti",
     ),
@@ -242,7 +243,8 @@ ENTRIES = (
         "own",
         "All kinds of light",
         "",
-        "Rows: five scenes. Columns: unlit (every sample emits its colour), Phong, scatterer templates, path tracing.",
+        "Rows: five scenes. Columns: unlit (every sample emits its colour), Phong, scatterer templates, "
+        "path tracing.",
         data=True,
     ),
 )
