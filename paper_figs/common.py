@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
+from PIL import Image
 
 import jaxvol as jv
 from experiments import record
@@ -167,7 +168,11 @@ class Page:
         return axes
 
     def save(self, path: Path) -> None:
-        with whole_file(path) as part:
-            self.figure.savefig(part, dpi=DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
+        """Write the page, down to the last line that is not white."""
+        self.figure.canvas.draw()
+        pixels = np.asarray(self.figure.canvas.buffer_rgba())[..., :3]  # pyright: ignore[reportAttributeAccessIssue]
         plt.close(self.figure)
+        last = np.flatnonzero((pixels < 255).any(axis=(1, 2)))[-1]
+        with whole_file(path) as part:
+            Image.fromarray(pixels[: last + 1 + GAP]).save(part, "PNG", optimize=True)
         print(path)
