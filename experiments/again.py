@@ -1,10 +1,10 @@
 """Records results again, one after the other, each in full and in a process of its own.
 
-`python -m experiments.again` records all, which takes many hours; `--only speed shading` some;
-`--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine that
-does nothing else: most results are times. A result replaces the old one when it is there as a whole, so that
-Ctrl-C loses one of them. All records are of one engine if its code is not changed meanwhile: `--list` names
-those for which it was (`changes.py`). What was recorded on a GPU is left alone where there is none.
+`python -m experiments.again` records all, which takes some four hours on two cores; `--only speed shading`
+some; `--list` prints how long each took when it was recorded, and of which commit it is. Run it on a machine
+that does nothing else: most results are times. A result replaces the old one when it is there as a whole, so
+that Ctrl-C loses one of them. All records are of one engine if its code is not changed meanwhile: `--list`
+names those for which it was (`changes.py`). What was recorded on a GPU is left alone where there is none.
 """
 
 import os
@@ -23,13 +23,18 @@ from .command import command
 
 
 ARGUMENTS = {
-    "accuracy": "accuracy --repetitions 5",
+    "accuracy": "accuracy --repetitions 3",
     "bricks": "bricks --size 40 --repetitions 3",
+    "compare": "compare 77f9c25 HEAD",
+    "fit_transfer": "fit_transfer --size 64 --resolution 64",
+    "gradient_agreement": "gradient_agreement --only 'head phantom' tooth engine lidc0314_airway aneurism"
+    " --methods none hierarchy min_distance",
     "gradient_agreement_gpu": "gradient_agreement --only 'head phantom' tooth engine --methods none hierarchy"
     " distance",
     "jitter_accuracy": "jitter_accuracy --repetitions 7",
     "overhead": "overhead --sizes 512",
-    "planning_seed_1": "planning --scenes 40 --every 2 --seed 1",
+    "planning": "planning --scenes 100",
+    "planning_seed_1": "planning --scenes 40 --every 4 --seed 1",
     "scan_conversion": "scan_conversion --size 256 --repetitions 3",
     "shading": "shading --repetitions 25",
     "speed": "speed --gradients --sizes 512 --repetitions 7",

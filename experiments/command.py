@@ -22,13 +22,16 @@ HELP = {
 }
 """Of options that several scripts have."""
 
+POSITIONAL = ("commits",)
+
 
 def command(about: str | None, output: Path, **options: Any) -> Callable[[Callable[[Namespace], None]], Main]:
     """Decorator that makes a script's `main` of a function of its options.
 
     - `about`: what the script does, its docstring.
     - `output`: default of `--output`, the folder to write into, which is made.
-    - `options`: the other options, by name: the default of an integer, or what `add_argument` takes.
+    - `options`: the other options, by name: the default of an integer, or what `add_argument` takes; those
+      of `POSITIONAL` are given without their names.
 
     The arguments as they were given, but for the output, are `argv` among the options: what was asked for,
     wherever it is written.
@@ -37,7 +40,8 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
     options["output"] = {"type": Path, "default": output, "metavar": "FOLDER"}
     for name, option in options.items():
         how = option if isinstance(option, dict) else {"type": int, "default": option}
-        parser.add_argument("--" + name.replace("_", "-"), **{"help": HELP.get(name), **how})
+        flag = name if name in POSITIONAL else "--" + name.replace("_", "-")
+        parser.add_argument(flag, **{"help": HELP.get(name), **how})
 
     def made(run: Callable[[Namespace], None]) -> Main:
         def main(argv: Sequence[str] | None = None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
-from . import typechecker
+from . import faults, programs, typechecker
 
 
 typechecker.leave_inner_functions()
@@ -21,30 +21,44 @@ with install_import_hook("jaxvol", "tests.typechecker.check"):
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Hypothesis draws the same examples in every run, so that no test fails by chance.
-hypothesis.settings.register_profile("jaxvol", derandomize=True)
+# Hypothesis draws the same examples in every run, so that no test fails by chance, and reports the first that
+# fails: to look for a simpler one takes minutes where examples are images.
+hypothesis.settings.register_profile(
+    "jaxvol", derandomize=True, deadline=None, phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate]
+)
 hypothesis.settings.load_profile("jaxvol")
 
-PROGRAMS = pytest.StashKey[str]()
-"""The compilation cache that all processes of this session share."""
+FOLDER = pytest.StashKey[str]()
+"""The compilation cache that all processes of this session share, where it is removed at the end."""
+
+
+def pytest_addoption(parser):
+    parser.addoption("--most-programs", type=int, help="fail if the session compiles more programs than this")
+    parser.addoption("--fault", help="inject a fault of `tests.faults`")
 
 
 def pytest_configure(config):
     """Compile each program once per session, for all workers, kernels and subprocesses.
 
-    The cache folder is new in each session and removed at its end, so that no stale program is tested."""
-    typechecker.InnerFunctions.checked = config.option.markexpr != "not slow"
-    if hasattr(config, "workerinput"):
-        return  # a worker of pytest-xdist inherits the environment variables
-    if config.option.markexpr == "not slow":
-        # The fast tests spend most of their time compiling. Optimization level 1 of LLVM, without expensive
-        # passes, and XLA's older emitter of fused kernels make it shorter. The programs are somewhat slower
-        # and compute the same numbers. The slow tests, and any other selection, compile as users do.
-        flags = ["--xla_backend_optimization_level=1", "--xla_llvm_disable_expensive_passes=true"]
-        if jax.__version_info__ < (0, 11):  # later ones have only the newer emitter, and stop at the flag
-            flags.append("--xla_cpu_use_fusion_emitters=false")
-        os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
-    folder = config.stash[PROGRAMS] = tempfile.mkdtemp(prefix="jaxvol-programs-")
+    The cache folder is new in each session and removed at its end, unless JAX_COMPILATION_CACHE_DIR names one
+    to keep, with which a second session takes less than half the time."""
+    fast = config.option.markexpr == "not slow"
+    typechecker.InnerFunctions.checked = not fast
+    worker = hasattr(config, "workerinput")  # of pytest-xdist; it inherits the environment variables
+    if not worker:
+        if fast:
+            # The fast tests spend most of their time compiling. Optimization level 1 of LLVM, without
+            # expensive passes, and XLA's older emitter of fused kernels make it shorter. The programs are
+            # somewhat slower and compute the same numbers. The slow tests, and any other selection, compile
+            # as users do.
+            flags = ["--xla_backend_optimization_level=1", "--xla_llvm_disable_expensive_passes=true"]
+            if jax.__version_info__ < (0, 11):  # later ones have only the newer emitter, and stop at the flag
+                flags.append("--xla_cpu_use_fusion_emitters=false")
+            os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
+        if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+            config.stash[FOLDER] = tempfile.mkdtemp(prefix="jaxvol-programs-")
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = config.stash[FOLDER]
+    folder = os.environ["JAX_COMPILATION_CACHE_DIR"]
     settings = {
         "jax_compilation_cache_dir": folder,
         "jax_persistent_cache_min_compile_time_secs": 0,
@@ -53,11 +67,14 @@ def pytest_configure(config):
     for name, value in settings.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+    if config.option.fault is not None:
+        faults.all_faults()[config.option.fault].inject()
+    config.pluginmanager.register(programs.Programs(Path(folder), config.option.most_programs), "programs")
 
 
 def pytest_unconfigure(config):
-    if PROGRAMS in config.stash:
-        shutil.rmtree(config.stash[PROGRAMS], ignore_errors=True)
+    if FOLDER in config.stash:
+        shutil.rmtree(config.stash[FOLDER], ignore_errors=True)
 
 
 @pytest.fixture(autouse=True)

@@ -1,111 +1,252 @@
-"""What is compared of every compositing mode: both engines, and gradients with central differences."""
+"""Compositing modes: what pixels show of values along rays, in NumPy; gradients by central differences."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
 
-from .scenes import around, soft_transfer
+from . import oracle
+from .scenes import LEAVES, soft_transfer
 
 
-def reference_image(volume, transfer, camera, march, mode, lighting=None):
-    """rgba and depth of every pixel, ray by ray."""
-    column, row = jnp.meshgrid(*(jnp.arange(n) for n in camera.size))
-    rays = jnp.vectorize(lambda x, y: tuple(part for end in camera.ray(x, y) for part in end))
-    x, y, z, *direction = rays(column, row)
+class Additive(jv.Weighting):
+    """A part of all opacities is summed; nothing hides what lies behind it."""
 
-    @jax.jit
-    @jax.vmap
-    @jax.vmap
-    def one(origin, direction, column, row):
-        rendering = jv.render_ray_reference(
-            *(volume, transfer, origin, direction, march),
-            pixel=(column, row),
-            compositing=mode,
-            lighting=lighting,
-        )
-        return rendering.rgba, rendering.depth
+    part: float = eqx.field(static=True, default=0.01)
 
-    return one(jnp.stack([x, y, z], -1), jnp.stack(direction, -1), column, row)
+    def weight(self, alpha, before):
+        return self.part * alpha
+
+    def slope(self, alpha, after, worth, behind):
+        return self.part * (1 - alpha) * worth
 
 
-def same_images(found, expected, *, atol=1e-6):
-    """Asserts that two renderings show the same, at the same depths."""
-    np.testing.assert_allclose(found.rgba, expected.rgba, atol=atol)
-    finite = np.isfinite(expected.depth)
-    np.testing.assert_array_equal(np.isfinite(found.depth), finite)
-    np.testing.assert_allclose(found.depth[finite], expected.depth[finite], rtol=max(atol, 1e-6))
+class FoggedSurface(jv.Isosurface):
+    """An isosurface that is darker the farther away it is, and brighter the denser what lies before it is: it
+    uses what the march has found in every way in which a mode may."""
+
+    def pixel(self, sampler, state):
+        rgba, depth = super().pixel(sampler, state)
+        _, extinction = sampler.shaded(state.front)
+        return rgba * jnp.exp(-0.3 * sampler.differentiable_depth(state.front)) * (1 + extinction), depth
+
+
+VALUE = 0.45
+"""Of the isosurface, for values from 0 to 1."""
+
+MODES: dict[str, jv.Weighting | jv.Selection] = {
+    "over": jv.Over(),
+    "additive": Additive(),
+    "average": jv.Average(0.5),
+    "maximum": jv.Maximum(0.5),
+    "minimum": jv.Minimum(0.5),
+    "first visible": jv.FirstVisible(),
+    "isosurface": jv.Isosurface(VALUE),
+}
+
+QUADRATURE: dict[str, Any] = {"average": "midpoint"}
+"""By which marches of a mode sample; else "left"."""
 
 
 def ball_in_a_corner():
-    """A ball of 8-bit values, greatest in its middle, with much empty space around it."""
+    """A ball of values from 0 to 1, greatest in its middle, with much empty space around it."""
     ball = jv.phantom("sphere", 12)
-    return jv.Volume((255 * np.pad(np.asarray(ball.data), ((2, 10),) * 3)).astype(np.uint8), ball.spacing)
+    return jv.Volume(np.pad(np.asarray(ball.data, np.float32), ((2, 10),) * 3), ball.spacing)
 
 
-LEAVES = {
-    "voxels": lambda scene: scene[0].data,
-    "spacing": lambda scene: scene[0].spacing,
-    "colors": lambda scene: scene[1].colors,
-    "extinction": lambda scene: scene[1].extinction,
-    "position": lambda scene: scene[2].position,
-    "step": lambda scene: scene[3].step,
-}
-"""Differentiable leaves of a scene (volume, transfer function, camera, march, mode)."""
+def scaled_transfer(top, transfer=None):
+    """A transfer function for values from 0 to 1, by default the soft one, for values from 0 to `top`."""
+    transfer = soft_transfer() if transfer is None else transfer
+    return jv.TransferFunction(np.asarray(transfer.values) * top, transfer.colors, transfer.extinction)
 
 
-def check_gradients(volume, mode, parameters, adjoint, *, constant=(), normals=False, quadrature="left"):
-    """Asserts that the gradient of a loss of colours and depths (and normals) is that of central differences,
-    in float64: of each leaf alone under replay, and of all of them together.
+def classified(transfer, values):
+    """Colours and extinctions of values."""
+    points, colors, extinction = (
+        np.asarray(part, np.float64) for part in (transfer.values, transfer.colors, transfer.extinction)
+    )
+    return np.stack([np.interp(values, points, c) for c in colors.T], -1), np.interp(
+        values, points, extinction
+    )
 
-    `parameters`: leaves of the mode, by name. `constant`: those on which the loss does not depend."""
-    march = jv.March(0.11, (jv.AlphaCorrection(), jv.SpaceLeaping()), quadrature, max_samples=64)
-    scene = volume, soft_transfer(), around(volume, (9, 8)), march, mode
-    named = {**LEAVES, **{name: lambda s, of=of: of(s[4]) for name, of in parameters.items()}}
 
-    def leaves(scene):
-        return tuple(of(scene) for of in named.values())
+class Rays:
+    """The rays of a camera through a volume, one after the other, in float64. Depths are past the entry."""
 
-    hit = np.isfinite(jv.render(*scene[:4], compositing=mode).depth)
-    assert hit.mean() > 0.2
-    random = np.random.default_rng(3)
-    weights = random.normal(size=(8, 9, 8))
-    ways = {name: jnp.asarray(random.choice([-1.0, 1.0], of(scene).shape)) for name, of in named.items()}
-    # extinctions of 0 stay 0, since none is negative
-    ways["extinction"] = jnp.where(scene[1].extinction > 0, ways["extinction"], 0)
-    ways = tuple(ways.values())
+    def __init__(self, volume, camera):
+        self.data, self.spacing, self.corner = (
+            np.asarray(part, np.float64) for part in (volume.data, volume.spacing, volume.origin)
+        )
+        self.origins, self.directions = (
+            np.asarray(part, np.float64).reshape(-1, 3) for part in camera.rays()
+        )
+        last = self.corner + (np.array(self.data.shape) - 1) * self.spacing
+        first, last = oracle.box_interval(self.origins, self.directions, self.corner, last)
+        self.hit = last > first
+        self.t_in, self.length = np.where(self.hit, first, 0), np.where(self.hit, last - first, 0)
 
-    def loss(given, adjoint="replay"):
-        moved = eqx.tree_at(leaves, scene, given)
-        image = jv.render(*moved[:4], compositing=moved[4], adjoint=adjoint)
-        parts = [image.rgba, jnp.where(hit, image.depth, 0)[..., None]]
-        shown = jnp.concatenate([*parts, *([image.normal] if normals else [])], axis=-1)
-        return jnp.sum(shown * weights[..., : shown.shape[-1]])
+    def points(self, depth):
+        """World points at depths (rays, cells)."""
+        t = self.t_in[:, None] + np.clip(depth, 0, self.length[:, None])
+        return self.origins[:, None] + t[..., None] * self.directions[:, None]
 
-    def difference(part, h=1e-7):
-        ends = [
-            loss(
-                tuple(
-                    leaf + sign * h * way if name in part else leaf
-                    for name, leaf, way in zip(named, leaves(scene), ways, strict=True)
-                )
-            )
-            for sign in (1, -1)
-        ]
-        return float(ends[0] - ends[1]) / (2 * h)
+    def value(self, depth, data=None):
+        """Values at depths (rays, cells), or what is interpolated of other `data`."""
+        at = (self.points(depth) - self.corner) / self.spacing
+        found = map_coordinates(
+            self.data if data is None else data, at.reshape(-1, 3).T, order=1, mode="nearest"
+        )
+        return found.reshape(np.shape(depth))
 
-    if adjoint == "forward":
-        slope = jax.jvp(lambda given: loss(given, "forward"), (leaves(scene),), (ways,))[1]
+    def cells(self, step, start=None, empty=None):
+        """Front and width of cells (rays, cells), the last one cut at the exit, and of width 0 behind it.
+        `start`: of the first cells, in steps; or, with `empty`, how far the first empty cell is from the next
+        one. `empty`: which cells are, by front and width."""
+        front = step * np.arange(int(self.length.max() / step) + 2) + np.zeros((len(self.length), 1))
+        start = np.zeros(len(front)) if start is None else start
+        if empty is None:
+            front += step * start[:, None]
+        else:
+            seen = empty(front, np.clip(self.length[:, None] - front, 0, step))
+            behind = np.cumsum(seen, axis=1) - seen > 0
+            front -= step * (1 - start)[:, None] * behind
+        return front, np.clip(self.length[:, None] - front, 0, step)
+
+
+def numbers(transform, camera):
+    """The random number of a transform for every pixel."""
+    width, height = camera.size
+    row, column = (jnp.asarray(index.reshape(-1), jnp.int32) for index in np.mgrid[:height, :width])
+    noise = jax.jit(jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32)))
+    return np.asarray(noise(column, row), np.float64)
+
+
+def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
+    """What pixels show under a mode of `MODES`, by NumPy, with `EmptySpaceJitter` and cells that are cut at
+    the exit: rgba, distance, and how many samples the rays have. `value`: of the isosurface."""
+    rays = Rays(volume, camera)
+
+    def crosses(front, width):
+        return (rays.value(front) >= value) != (rays.value(front + width) >= value)
+
+    def empty(front, width):
+        if name == "isosurface":
+            return ~crosses(front, width)
+        return classified(transfer, rays.value(front))[1] == 0
+
+    start = None if name == "average" else numbers(jitter, camera)
+    front, width = rays.cells(step, start, None if name == "average" else empty)
+    depth, valid = front + width / 2 * (name == "average"), width > 0
+    values = rays.value(depth)
+    color, extinction = classified(transfer, values)
+    alpha = -np.expm1(-extinction * width)
+    if name in ("over", "additive", "average"):
+        hidden = np.concatenate([np.ones((len(alpha), 1)), np.cumprod(1 - alpha, axis=1)[:, :-1]], axis=1)
+        weight = {"over": hidden * alpha, "additive": 0.01 * alpha, "average": width}[name]
+        opacity = weight.sum(axis=1)
+        whole = np.where(opacity > 0, opacity, 1)
+        depth = np.where(opacity > 0, (weight * depth).sum(axis=1) / whole, np.inf)
+        premultiplied = (weight[..., None] * color).sum(axis=1)
+        if name == "average":
+            premultiplied, opacity = layer(transfer, (weight * values).sum(axis=1) / whole, rays.hit)
     else:
-        gradient = jax.grad(lambda given: loss(given, adjoint))(leaves(scene))
-        slopes = {
-            name: float(jnp.vdot(part, way)) for name, part, way in zip(named, gradient, ways, strict=True)
-        }
-        slope = sum(slopes.values())
-        if adjoint == "replay":
-            found = [difference({name}) for name in named]
-            np.testing.assert_allclose(list(slopes.values()), found, rtol=1e-5, atol=1e-5)
-            assert {name for name in named if abs(slopes[name]) < 1e-9} == set(constant)
-    np.testing.assert_allclose(slope, difference(set(named)), rtol=1e-5)
+        least = np.where(valid, values, -np.inf if name == "maximum" else np.inf)
+        chosen = {
+            "maximum": np.argmax(least, axis=1),
+            "minimum": np.argmin(least, axis=1),
+            "first visible": np.argmax(alpha > 0, axis=1),
+            "isosurface": np.argmax(crosses(front, width), axis=1),
+        }[name]
+        at = np.arange(len(chosen)), chosen
+        depth, visible = depth[at], rays.hit
+        if name == "first visible":
+            visible = alpha[at] > 0
+        if name == "isosurface":
+            visible = crosses(front, width)[at]
+            depth = bisected(rays, front[at], (front + width)[at], value)
+        if name in ("first visible", "isosurface"):
+            seen = value if name == "isosurface" else rays.value(depth[:, None])[:, 0]
+            premultiplied, opacity = visible[:, None] * classified(transfer, seen)[0], visible.astype(float)
+        else:
+            premultiplied, opacity = layer(transfer, rays.value(depth[:, None])[:, 0], visible)
+        depth = np.where(opacity > 0, depth, np.inf)
+    shape = camera.size[::-1]
+    rgba = np.concatenate([premultiplied, opacity[:, None]], axis=1).reshape(*shape, 4)
+    return rgba, (rays.t_in + depth).reshape(shape), np.sum(valid)
+
+
+def layer(transfer, value, visible, thickness=0.5):
+    """Premultiplied colour and opacity of a layer of a value."""
+    color, extinction = classified(transfer, value)
+    opacity = visible * -np.expm1(-thickness * extinction)
+    return opacity[:, None] * color, opacity
+
+
+def bisected(rays, near, far, value):
+    """Where values cross one, between depths on either side."""
+    rises = rays.value(near[:, None])[:, 0] < value
+    for _ in range(50):
+        middle = (near + far) / 2
+        behind = (rays.value(middle[:, None])[:, 0] >= value) == rises
+        near, far = np.where(behind, near, middle), np.where(behind, middle, far)
+    return near
+
+
+def same_image(found, rgba, depth, *, atol=2e-5, rtol=1e-5):
+    """Asserts that a rendering shows this, at these distances."""
+    np.testing.assert_allclose(found.rgba, rgba, atol=atol)
+    finite = np.isfinite(depth)
+    np.testing.assert_array_equal(np.isfinite(found.depth), finite)
+    np.testing.assert_allclose(np.asarray(found.depth)[finite], depth[finite], rtol=rtol)
+
+
+def check_gradients(
+    scene, parameters, adjoint="replay", *, normals=False, constant=(), lighting=None, jit=True
+):
+    """Asserts that the gradient of a loss of colours and depths (and normals) is that of central differences,
+    for each leaf of the scene; and 0 for a camera that looks away. All by one program, in float64.
+
+    `scene`: volume, transfer function, camera, march, mode. `parameters`: further leaves of it, by name.
+    `constant`: those on which the loss does not depend. `jit`: without, 8-bit voxels are packed."""
+    leaves = {name: of for name, of in (LEAVES | parameters).items() if eqx.is_inexact_array(of(scene))}
+    random = np.random.default_rng(3)
+    weights = random.normal(size=(*scene[2].size[::-1], 8))
+
+    def loss(given):
+        moved = eqx.tree_at(lambda s: tuple(of(s) for of in leaves.values()), scene, tuple(given.values()))
+        image = jv.render(*moved[:4], compositing=moved[4], adjoint=adjoint, lighting=lighting)
+        hit = jnp.isfinite(image.depth)
+        parts = [image.rgba, jnp.where(hit, image.depth, 0)[..., None], *([image.normal] if normals else [])]
+        seen = jnp.concatenate(parts, axis=-1)
+        return jnp.sum(seen * weights[..., : seen.shape[-1]]), jnp.mean(hit)
+
+    def along(given, way):
+        """Loss, its slope along a direction, and the share of the pixels that show anything."""
+        if adjoint == "forward":
+            return jax.jvp(loss, (given,), (way,), has_aux=True)
+        (found, hit), gradient = jax.value_and_grad(loss, has_aux=True)(given)
+        return found, sum(jnp.vdot(gradient[name], way[name]) for name in way), hit
+
+    along = jax.jit(along) if jit else along
+    given = {name: of(scene) for name, of in leaves.items()}
+    ways = {name: jnp.asarray(random.choice([-1.0, 1.0], leaf.shape)) for name, leaf in given.items()}
+    # extinctions of 0 stay 0, since none is negative
+    ways["extinction"] = jnp.where(given["extinction"] > 0, ways["extinction"], 0)
+    none = {name: jnp.zeros_like(leaf) for name, leaf in given.items()}
+    slopes, expected, h = {}, [], 1e-7
+    for name, way in ways.items():
+        _, slope, hit = along(given, {**none, name: way})
+        slopes[name] = float(slope)
+        assert hit > 0.2
+        ahead, behind = (along({**given, name: given[name] + side * h * way}, none)[0] for side in (1, -1))
+        expected.append(float(ahead - behind) / (2 * h))
+    np.testing.assert_allclose([*slopes.values()], expected, rtol=1e-5, atol=1e-7, err_msg=str([*slopes]))
+    assert {name for name, slope in slopes.items() if abs(slope) < 1e-9} == set(constant)
+    away = {**given, "focal_point": 2 * given["position"] - given["focal_point"]}
+    _, slope, hit = along(away, ways)
+    assert hit == slope == 0

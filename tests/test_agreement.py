@@ -1,20 +1,17 @@
-"""Do `render`, the reference engine and an independent float64 marcher give the same image?"""
-
-import itertools
+"""Do the fast engine, the reference and an independent marcher in float64 show the same, whatever transforms
+are given?"""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 
-from . import oracle
-from .scenes import CAMERAS, FEW, TRANSFORMS, VOLUMES, in_float64, slow, soft_transfer, to_float64
-
-
-STEP = 0.07
+from . import oracle, switch
+from .scenes import CAMERAS, QUADRATURES, VOLUMES, around, in_float64, soft_transfer, to_float64
 
 
 def oracle_image(volume, transfer, camera, march):
@@ -50,12 +47,16 @@ def clipped_by(clip):
     return {"planes": planes, "inside_out": clip.inside_out}
 
 
+@eqx.filter_jit
+def drawn(noise, column, row, dtype):
+    return jax.vmap(lambda c, r: noise((c, r), dtype))(column, row)
+
+
 def random_numbers(transform, camera):
     """The transform's random number for every pixel, row by row."""
     width, height = camera.size
-    row, column = (jnp.asarray(index.reshape(-1), jnp.int32) for index in np.mgrid[:height, :width])
-    numbers = jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32))(column, row)
-    return np.asarray(numbers, np.float64)
+    row, column = (index.reshape(-1).astype(np.int32) for index in np.mgrid[:height, :width])
+    return np.asarray(drawn(transform.noise, column, row, camera.position.dtype), np.float64)
 
 
 def compare(rendering, rgba, samples, *, tolerance, left=0.0):
@@ -71,7 +72,7 @@ def compare(rendering, rgba, samples, *, tolerance, left=0.0):
 
 @eqx.filter_jit
 def reference_image(volume, transfer, camera, march):
-    """Render every pixel with the reference engine."""
+    """Every pixel by the reference engine."""
 
     def one(column, row):
         origin, direction = (jnp.stack(part) for part in camera.ray(column, row))
@@ -82,76 +83,47 @@ def reference_image(volume, transfer, camera, march):
     return jax.vmap(across, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
 
 
-FAST = {
-    *((name, "left") for name in ("plain", "aligned", "jittered")),
-    *((name, "midpoint") for name in FEW[2:4]),
-    (FEW[4], "left"),
-    (FEW[5], "midpoint"),
-    (FEW[2], "preintegrated"),
+SCENES = {
+    "seed": st.integers(0, 2**32 - 1),
+    "step": st.floats(0.06, 0.3),
+    "volume": st.sampled_from(sorted(VOLUMES)),
+    "view": st.sampled_from(["around", "inside"]),
+    "left": st.floats(0.01, 0.5),
 }
-"""Cases of the fast run, which cover every transform; the slow run adds the others."""
-
-CASES = [
-    pytest.param(*case, marks=[] if case in FAST else pytest.mark.slow)
-    for case in (
-        *((name, "left") for name in TRANSFORMS),
-        *itertools.product(FEW, ("midpoint", "preintegrated")),
-    )
-]
 
 
-@pytest.mark.parametrize(("transforms", "quadrature"), CASES)
-def test_render_agrees_with_the_independent_marcher(transforms, quadrature):
-    march = jv.March(STEP, TRANSFORMS[transforms], quadrature)
-    left = 0.05 if "terminated" in transforms else 0.0
-    transfer = soft_transfer()
-    # parallel rays need programs of their own: two sets are enough for them
-    views = [view for name, view in CAMERAS.items() if name != "orthographic" or transforms in FEW[1:3]]
-    for volume in (make() for make in VOLUMES.values()):
-        for view in views:
-            camera = view(volume)
-            rendering = jv.render(volume, transfer, camera, march)
-            compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=2e-5, left=left)
+@pytest.mark.parametrize("quadrature", QUADRATURES)
+def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_independent_marcher(quadrature):
+    """In float64, where rounding decides of no sample."""
 
+    @settings(max_examples=20)
+    @given(on=switch.SUBSETS, **SCENES)
+    def check(on, seed, step, volume, view, left):
+        with in_float64():
+            volume, transfer = to_float64(VOLUMES[volume]()), to_float64(soft_transfer())
+            camera, values = to_float64(CAMERAS[view](volume)), {"seed": seed, "left": left}
 
-SECOND_ORDER = pytest.mark.parametrize(
-    ("transforms", "quadrature"),
-    [
-        *((FEW[2], quadrature) for quadrature in ("midpoint", "preintegrated")),
-        *slow(*itertools.product([*FEW[:2], *FEW[3:]], ("midpoint", "preintegrated"))),
-    ],
-)
+            def march(transforms, most=None):
+                return to_float64(jv.March(step, transforms, quadrature, max_samples=most))
 
-
-@SECOND_ORDER
-def test_render_agrees_with_the_reference(transforms, quadrature):
-    march = jv.March(STEP, TRANSFORMS[transforms], quadrature)
-    counted = jv.March(STEP, TRANSFORMS[transforms], quadrature, max_samples=80)
-    left = 0.05 if "terminated" in transforms else 0.0
-    transfer = soft_transfer()
-    for volume in (make() for make in VOLUMES.values()):
-        for view in CAMERAS.values():
-            camera = view(volume)
-            rendering = jv.render(volume, transfer, camera, march)
-            reference = reference_image(volume, transfer, camera, counted)
+            scene = volume, transfer, camera
+            rgba, samples = oracle_image(*scene, march(switch.plain(on, **values)))
+            switched = switch.switched(on, **values)
+            fast = jv.render(*scene, march(switched))
+            assert fast.rgba.dtype == jnp.float64
+            np.testing.assert_allclose(fast.rgba, rgba, atol=1e-10, rtol=0)
+            reference = reference_image(*scene, march(switched, 80))
             assert not np.any(reference.exhausted)
-            compare(rendering, reference.rgba, np.asarray(reference.samples), tolerance=2e-5, left=left)
-            np.testing.assert_array_equal(rendering.aligned, reference.aligned)
-
-
-@SECOND_ORDER
-def test_float64_reference_agrees_with_the_independent_marcher_to_rounding(transforms, quadrature):
-    with in_float64():
-        march = to_float64(jv.March(STEP, TRANSFORMS[transforms], quadrature, max_samples=80))
-        transfer = to_float64(soft_transfer())
-        for make in VOLUMES.values():
-            volume = to_float64(make())
-            camera = to_float64(CAMERAS["around"](volume))
-            reference = reference_image(volume, transfer, camera, march)
-            assert reference.rgba.dtype == jnp.float64
-            rgba, samples = oracle_image(volume, transfer, camera, march)
+            np.testing.assert_allclose(reference.rgba, rgba, atol=1e-10, rtol=0)
             np.testing.assert_array_equal(reference.samples, samples)
-            np.testing.assert_allclose(reference.rgba, rgba, atol=1e-12, rtol=0)
+            np.testing.assert_array_equal(fast.aligned, reference.aligned)
+            assert "leaping" in on or np.array_equal(fast.samples, samples)
+            # energy: the weights of a ray and its transmittance sum to 1
+            white = jv.TransferFunction(transfer.values, jnp.ones((8, 3)), transfer.extinction)
+            rgba = np.asarray(jv.render(volume, white, camera, march(switched)).rgba)
+            np.testing.assert_allclose(rgba[..., 0], rgba[..., 3], atol=1e-12)
+
+    check()
 
 
 @pytest.mark.parametrize(
@@ -172,14 +144,19 @@ def test_float64_reference_agrees_with_the_independent_marcher_to_rounding(trans
     ],
 )
 def test_real_volumes_agree_with_the_independent_marcher(real_volume, file, spacing, points):
+    """In their own types, in float32, by the usual transforms."""
     volume = jv.load(real_volume(file), spacing=spacing)
     colors = [(0.2, 0.1, 0.1), (0.8, 0.5, 0.3), (1.0, 1.0, 1.0)]
     transfer = jv.TransferFunction.from_points(
         [(value, color, opacity) for (value, opacity), color in zip(points, colors, strict=True)]
     )
-    camera = CAMERAS["around"](volume, (40, 40))
-    march = jv.March(0.8, (jv.AlphaCorrection(),), "left")
+    camera = around(volume, (40, 40))
+    march = jv.March(0.8, (jv.EmptySpaceJitter(1), jv.AlphaCorrection(), jv.SpaceLeaping()))
     rendering = jv.render(volume, transfer, camera, march)
     assert float(rendering.rgba[..., 3].max()) > 0.5
-    # 300 voxels behind the entry, float32 resolves 3e-5 voxels, and neighbouring voxels differ by thousands
-    compare(rendering, *oracle_image(volume, transfer, camera, march), tolerance=3e-5)
+    rgba, _ = oracle_image(volume, transfer, camera, march)
+    off = np.abs(np.asarray(rendering.rgba) - rgba).max(axis=-1)
+    # 300 voxels behind the entry, float32 resolves 3e-5 voxels, and neighbouring voxels differ by thousands.
+    # A ray that grazes what is transparent may shift at another sample
+    assert np.mean(off > 3e-5) < 0.005
+    np.testing.assert_array_equal(rendering.exhausted, False)

@@ -4,11 +4,7 @@ import ast
 import importlib
 import inspect
 import pkgutil
-import subprocess
-import sys
 from pathlib import Path
-
-import pytest
 
 import jaxvol as jv
 from jaxvol.lighting import Light
@@ -18,51 +14,13 @@ from jaxvol.space import Path as RayPath
 
 ROOT = Path(jv.__file__).parent
 
-ORDER = [
-    "_util",
-    "programs",
-    "volume",
-    "occupancy",
-    "variation",
-    "space",
-    "transfer",
-    "labels",
-    "transfer2d",
-    "display",
-    "presets",
-    "camera",
-    "automatic",
-    "beams",
-    "march",
-    "transforms",
-    "scan_conversion",
-    "lighting",
-    "compositing",
-    "selection",
-    "projections",
-    "isosurface",
-    "modes",
-    "rendering",
-    "arguments",
-    "reference",
-    "engine",
-    "planning",
-    "render",
-    "path_tracing",
-    "metrics",
-    "phantoms",
-    "formats",
-    "datasets",
-    "bricks",
-    "fitting",
-    "unseen",
-    "viewer",
-    "figures",
-    "commands",
-    "cli",
-    "__main__",
-    "__init__",
-]
+NAMES = """
+    _util programs volume occupancy variation space transfer labels transfer2d display presets camera
+    automatic beams march transforms scan_conversion lighting compositing selection projections isosurface
+    modes rendering arguments reference engine planning render path_tracing metrics phantoms formats datasets
+    bricks fitting unseen viewer figures commands cli __main__ __init__
+"""
+ORDER = [str(name) for name in NAMES.split()]
 """Order of imports, from the volume to the command line: a file imports only entries before its own."""
 
 DO_NOTHING = {Transform, RayPath, Light}
@@ -94,17 +52,14 @@ def imported(file: Path) -> set[Path]:
     return found - {file}
 
 
-def test_every_file_has_a_place_in_the_order():
+def test_every_file_has_a_place_and_imports_nothing_that_comes_later():
     assert {place(file) for file in files()} == set(ORDER)
-
-
-@pytest.mark.parametrize("file", files(), ids=lambda file: str(file.relative_to(ROOT)))
-def test_no_file_imports_what_comes_later(file):
-    here = ORDER.index(place(file))
-    for other in imported(file):
-        there = ORDER.index(place(other))
-        assert there <= here, f"{file.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
-        assert there < here or place(other) not in ("__init__",), other
+    for file in files():
+        here = ORDER.index(place(file))
+        for other in imported(file):
+            there = ORDER.index(place(other))
+            assert there <= here, f"{file.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
+            assert there < here or place(other) not in ("__init__",), other
 
 
 def test_there_are_no_circular_imports():
@@ -130,14 +85,3 @@ def test_a_class_is_abstract_or_final():
             if base.__module__.startswith("jaxvol") and base not in DO_NOTHING:
                 abstract = inspect.isabstract(base) or bool(getattr(base, "__abstractvars__", ()))
                 assert abstract, f"{kind.__name__} inherits from {base.__name__}, which is not abstract"
-
-
-def test_an_import_computes_nothing():
-    """So that JAX can still be told of other processes, whose devices are to take part."""
-    code = (
-        "import jaxvol, jax, socket; free = socket.create_server(('localhost', 0)); "
-        "port = free.getsockname()[1]; free.close(); "
-        "jax.distributed.initialize(f'localhost:{port}', 1, 0)"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stderr[-2000:]

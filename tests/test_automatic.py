@@ -1,15 +1,20 @@
 """Does a transfer function that is guessed from a histogram show what is there?"""
 
+import math
+
 import jax
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.automatic import FRONT, framed, front_of, labels_shown, upright, visible_points
+from jaxvol.automatic import FRONT, framed, front_of, labels_shown, transfer_by_copy, upright, visible_points
 from jaxvol.automatic.body import is_body
 from jaxvol.automatic.framing import MARGIN
 from jaxvol.automatic.labels import INSIDE
+from jaxvol.automatic.sampling import SAMPLED
 from jaxvol.automatic.thresholds import thresholds
+from jaxvol.bricks import source_of
+from jaxvol.commands.data import copy_of, middle_of
 from jaxvol.commands.orbit import turned
 from jaxvol.lighting import Phong
 
@@ -45,11 +50,16 @@ def test_thresholds_part_three_classes():
 def test_what_is_around_is_transparent_and_what_is_dense_opaque():
     volume = ball(0.8, 0.35)
     transfer = jv.automatic_transfer(volume)
-    across = float(np.linalg.norm(np.subtract(*volume.corners)))
+    across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
     assert opacity_at(transfer, 10, across) == 0
     assert 0.2 < opacity_at(transfer, 100, 0.2 * across) < 0.95  # what is inside shines through
     assert opacity_at(transfer, 200, 0.1 * across) > 0.9
-    camera = jv.Camera.looking_at(volume, size=(32, 32))
+
+
+@pytest.mark.slow
+def test_a_picture_shows_what_is_dense_through_what_is_around_it():
+    volume = ball(0.8, 0.35)
+    transfer, camera = jv.automatic_transfer(volume), jv.Camera.looking_at(volume, size=(32, 32))
     rgba = np.asarray(
         jv.render(volume, transfer, camera, jv.March(0.4, MARCH, "midpoint"), lighting=Phong()).rgba
     )
@@ -68,25 +78,43 @@ def test_units_of_length_and_of_values_do_not_matter():
     np.testing.assert_allclose(one.extinction, 20 * np.asarray(other.extinction), rtol=1e-4)
 
 
-def test_an_object_that_the_faces_cut_is_no_block():
+def test_an_object_that_the_faces_cut_is_no_block_and_few_values_are_shown_too():
     volume = ball(3.0, 0.35)
     transfer = jv.automatic_transfer(volume)
-    across = float(np.linalg.norm(np.subtract(*volume.corners)))
+    across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
     assert opacity_at(transfer, 100, across) < 0.5
     assert opacity_at(transfer, 200, 0.1 * across) > 0.9
+    for kinds in (1, 2, 3):
+        data = (np.arange(27) % kinds).astype(np.uint8).reshape(3, 3, 3)
+        extinction = np.asarray(jv.automatic_transfer(jv.Volume(data)).extinction)
+        assert np.isfinite(extinction).all()
+        assert extinction.max() > 0
 
 
-@pytest.mark.parametrize("kinds", [1, 2, 3])
-def test_volumes_of_few_values_are_shown_too(kinds):
-    data = (np.arange(27) % kinds).astype(np.uint8).reshape(3, 3, 3)
-    transfer = jv.automatic_transfer(jv.Volume(data))
-    assert np.isfinite(np.asarray(transfer.extinction)).all()
-    assert float(transfer.extinction.max()) > 0
+def test_of_a_large_volume_a_copy_tells_the_same_if_grain_is_looked_at_as_it_is():
+    data = np.asarray(jv.phantom("head", 160).data, np.float32)[:, :140, :130]
+    waves = 20 * np.sin(np.pi / 3 * np.add.outer(np.arange(160), np.arange(140)))[..., None]
+    volume = jv.Volume(np.where(data > 60, data + waves, data), (1, 1, 2))
+    assert math.prod(volume.shape) > SAMPLED
+    source = source_of(volume)
+    copy = copy_of(source, 2**28)
+    assert max(copy.shape) <= 80
+    whole, found = jv.automatic_transfer(volume), transfer_by_copy(copy, middle_of(source))
+    for name in ("values", "colors", "extinction"):
+        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-5)
+    # waves of six voxels are grain to those who see every second voxel alone
+    assert jv.automatic_transfer(copy).values.shape != whole.values.shape
 
 
-def test_what_is_no_volume_is_named():
+def test_what_is_no_volume_or_a_traced_one_is_refused():
     with pytest.raises(ValueError, match="volume must be a jaxvol Volume"):
         jv.automatic_transfer(np.zeros((3, 3, 3)))
+    volume = jv.phantom("head", 16)
+    with pytest.raises(ValueError, match="volume is traced here, and its histogram is needed"):
+        jax.jit(jv.automatic_transfer)(volume)
+    found, inside = jv.automatic_transfer(volume), jax.jit(lambda _: jv.automatic_transfer(volume))(0.0)
+    np.testing.assert_array_equal(found.extinction, inside.extinction)
+    np.testing.assert_array_equal(found.colors, inside.colors)
 
 
 def extent(points):
@@ -137,24 +165,21 @@ def in_picture(camera, points):
     return plane / (camera.size[0] / camera.size[1], 1)
 
 
-@pytest.mark.parametrize("parallel", [False, True])
-@pytest.mark.parametrize("size", [(32, 32), (48, 32), (16, 32)])
-def test_a_framed_camera_just_sees_all_points(parallel, size):
+def test_a_framed_camera_just_sees_all_points():
     points = np.random.default_rng(1).normal(size=(40, 3)) * (3, 1, 0.5) + (10, -20, 5)
     volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
-    camera = jv.Camera.looking_at(volume, (1, -1, 0.3), view_angle=40, parallel=parallel, size=size)
-    seen = in_picture(framed(camera, points), points)
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    # both sides of the tighter axis are at the margin, and the other is as far inside on both sides
-    assert max(high) == pytest.approx(1 / MARGIN, abs=1e-4)
-    np.testing.assert_allclose(low[np.argmax(high)], -1 / MARGIN, atol=1e-4)
-    assert np.abs(seen).max() < 1 / MARGIN + 1e-4
-    np.testing.assert_allclose(low + high, 0, atol=1e-4)
-
-
-def test_a_camera_that_turns_sees_all_points_all_the_time():
-    points = np.random.default_rng(1).normal(size=(40, 3)) * (3, 1, 0.5)
-    volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
+    for parallel in (False, True):
+        for size in ((32, 32), (48, 32), (16, 32)):
+            camera = jv.Camera.looking_at(volume, (1, -1, 0.3), view_angle=40, parallel=parallel, size=size)
+            seen = in_picture(framed(camera, points), points)
+            low, high = seen.min(axis=0), seen.max(axis=0)
+            # both sides of the tighter axis are at the margin, and the other is as far inside on both sides
+            assert max(high) == pytest.approx(1 / MARGIN, abs=1e-4)
+            np.testing.assert_allclose(low[np.argmax(high)], -1 / MARGIN, atol=1e-4)
+            assert np.abs(seen).max() < 1 / MARGIN + 1e-4
+            np.testing.assert_allclose(low + high, 0, atol=1e-4)
+    # one that turns sees them all the time
+    points -= (10, -20, 5)
     camera = jv.Camera.looking_at(volume, (1, -1, 0.3), size=(32, 32))
     angles = range(0, 360, 15)
     found = framed(camera, points, [turned(camera, angle, (0, 0, 1)) for angle in angles])
@@ -169,20 +194,18 @@ def standing(axis, end):
     return jv.Volume((200 * ((x**2).sum(axis=0) < 0.5)).astype(np.uint8))
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("end", [0, -1])
-def test_what_one_face_cuts_stands_on_it(axis, end):
-    up = upright(standing(axis, end))
-    assert up is not None
-    np.testing.assert_array_equal(up, np.eye(3)[axis] * (-1 if end else 1))
-    side = front_of(up)
-    assert side @ up == FRONT[2]  # from as far above
-    np.testing.assert_allclose(np.linalg.norm(side), np.linalg.norm(FRONT))
-    if axis == 2 and end == 0:
-        np.testing.assert_array_equal(side, FRONT)
-
-
-def test_nothing_is_up_where_no_face_or_two_cut():
+def test_what_one_face_cuts_stands_on_it():
+    for axis in range(3):
+        for end in (0, -1):
+            up = upright(standing(axis, end))
+            assert up is not None
+            np.testing.assert_array_equal(up, np.eye(3)[axis] * (-1 if end else 1))
+            side = front_of(up)
+            assert side @ up == FRONT[2]  # from as far above
+            np.testing.assert_allclose(np.linalg.norm(side), np.linalg.norm(FRONT))
+            if axis == 2 and end == 0:
+                np.testing.assert_array_equal(side, FRONT)
+    # nothing is up where no face or two cut
     assert upright(ball(0.6, 0.3)) is None
     both = np.maximum(np.asarray(standing(1, 0).data), np.asarray(standing(1, -1).data))
     assert upright(jv.Volume(both)) is None
@@ -206,33 +229,26 @@ def labels(n=24):
 
 
 def test_labels_are_shown_in_colours_of_their_own():
-    shown = labels_shown(jv.Volume(labels()))
+    shown = labels_shown(jv.Volume(labels(), (1, 2, 3), (4, 5, 6)))
     assert shown is not None
     volume, transfer = shown
-    assert np.asarray(volume.data).max() == INSIDE
-    camera = jv.Camera.looking_at(volume, (0, -1, 0), size=(24, 24))
-    march = jv.March(0.4, (jv.AlphaCorrection(labels=True), jv.EarlyTermination()), "midpoint")
-    rgba = np.asarray(jv.render(volume, transfer, camera, march, lighting=Phong()).rgba)
-    left, right = rgba[12, 9], rgba[12, 15]
-    assert min(left[3], right[3]) > 0.9
-    assert np.abs(left[:3] / left[:3].max() - right[:3] / right[:3].max()).max() > 0.5
+    np.testing.assert_array_equal(volume.spacing, (1, 2, 3))
+    np.testing.assert_array_equal(volume.origin, (4, 5, 6))
+    # voxels are smooth, and opaque inside; labels, counted from 1 on, reach two voxels beyond
+    data, kinds = np.asarray(volume.data), np.asarray(volume.labels)
+    assert data[8, 12, 12] == data[16, 12, 12] == INSIDE
+    assert 0 < data[3, 12, 12] < data[4, 12, 12] < INSIDE
+    assert kinds[[1, 2, 8, 16, 12], 12, [12, 12, 12, 12, 1]].tolist() == [0, 1, 1, 2, 3]
+    colors = np.asarray(transfer.stacked.colors)[1:4, 0]
+    assert np.abs(colors[:, None] - colors[None])[np.triu_indices(3, 1)].max(axis=-1).min() > 0.3
+    across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
+    assert opacity_at(jax.tree.map(lambda leaf: leaf[1], transfer.stacked), INSIDE, 0.02 * across) > 0.9
 
 
-@pytest.mark.parametrize("name", ["head", "engine", "colon", "vessels"])
-def test_grey_values_are_not_taken_for_labels(name):
-    assert labels_shown(jv.phantom(name, 24)) is None
-
-
-def test_floats_two_values_and_many_are_no_labels():
-    assert labels_shown(jv.Volume(labels().astype(np.float32))) is None
-    assert labels_shown(jv.Volume((labels() > 0).astype(np.uint8))) is None
-    assert labels_shown(jv.Volume(np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4))) is None
-
-
-def test_a_traced_volume_is_refused_and_one_from_outside_is_not():
-    volume = jv.phantom("head", 16)
-    with pytest.raises(ValueError, match="volume is traced here, and its histogram is needed"):
-        jax.jit(jv.automatic_transfer)(volume)
-    found, inside = jv.automatic_transfer(volume), jax.jit(lambda _: jv.automatic_transfer(volume))(0.0)
-    np.testing.assert_array_equal(found.extinction, inside.extinction)
-    np.testing.assert_array_equal(found.colors, inside.colors)
+def test_other_volumes_are_not_taken_for_labels():
+    for name in ("head", "engine", "colon", "vessels"):
+        assert labels_shown(jv.phantom(name, 24)) is None
+    floats, two = labels().astype(np.float32), (labels() > 0).astype(np.uint8)
+    many = np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4)
+    for data in (floats, two, many):
+        assert labels_shown(jv.Volume(data)) is None

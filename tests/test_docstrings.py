@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+import jaxvol as jv
 from jaxvol import arguments
 from jaxvol._util import checks
 
@@ -83,11 +84,7 @@ def lacks(thing):
 @pytest.mark.parametrize("path", ENTRIES)
 def test_a_public_docstring_says_what_goes_in_what_comes_out_and_what_is_raised(path):
     assert lacks(ENTRIES[path]) == []
-
-
-@pytest.mark.parametrize("path", ENTRIES)
-def test_sections_are_written_alike(path):
-    """So that the reference shows them alike: in bold, in this order, with a colon."""
+    # sections are written alike, so that the reference shows them alike: in bold, in this order, with a colon
     doc = inspect.getdoc(ENTRIES[path]) or ""
     at = [doc.find(f"**{name}:**") for name in SECTIONS if f"**{name}:**" in doc]
     assert at == sorted(at)
@@ -104,3 +101,21 @@ def test_a_gap_is_found():
         return step * size
 
     assert lacks(function) == ["Returns", "Raises", "Arguments", "`size`"]
+
+
+def public(module):
+    """What users may name of a module: its own objects, neither submodules nor what it imports."""
+    return {
+        name: value
+        for name, value in vars(module).items()
+        if name == "PRESETS"
+        or (getattr(value, "__module__", "").startswith("jaxvol") and not name.startswith("_"))
+    }
+
+
+def test_the_reference_holds_every_public_name_once():
+    shown = list(entries().values())
+    for module in (jv, jv.lighting, jv.bricks, jv.metrics):
+        for name, value in public(module).items():
+            count = sum(value is each for each in shown)
+            assert count == 1, f"{module.__name__}.{name} is {count} times in docs/api"

@@ -8,7 +8,6 @@ near plane, where ours are counted from the entry. Together this is about 1/255 
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,122 +40,27 @@ class Scene(NamedTuple):
     def voxel(self) -> float:
         return float(self.volume.spacing[0])
 
+    def drawn_by_vtk(self, shade: Phong | None = None) -> tuple[np.ndarray, Any]:
+        """VTK's image over the background, (height, width, 3) in [0, 1], top row first, and its mapper."""
+        step = STEP * self.voxel
+        drawn = peer_vtk.prepare(*self, step, background=BACKGROUND, shade=shade)
+        return drawn.image(), drawn.mapper
 
-HEAD = [
-    (40, (0.1, 0.05, 0.03), 0.0),
-    (78, (0.8, 0.5, 0.4), 0.03),
-    (110, (0.7, 0.3, 0.25), 0.02),
-    (160, (0.5, 0.4, 0.3), 0.05),
-    (200, (0.95, 0.9, 0.8), 0.5),
-    (255, (1.0, 1.0, 1.0), 0.9),
-]
-HEAD_VIEW: dict[str, Any] = {
+    def drawn(self, mapper: Any, lighting: Phong | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Our image over the background as VTK would display it, and which pixels show the object."""
+        rendering = jv.render(*self, jv.March(STEP * self.voxel), lighting=lighting)
+        image, opacity = rendering.image(BACKGROUND), np.asarray(rendering.rgba)[..., 3]
+        return peer_vtk.as_displayed(np.asarray(image), mapper), opacity > 0.01
+
+
+HEAD = [(40, (0.1, 0.05, 0.03), 0.0), (78, (0.8, 0.5, 0.4), 0.03), (110, (0.7, 0.3, 0.25), 0.02)]
+HEAD += [(160, (0.5, 0.4, 0.3), 0.05), (200, (0.95, 0.9, 0.8), 0.5), (255, (1.0, 1.0, 1.0), 0.9)]
+VIEW: dict[str, Any] = {
     "position": (1.5, -3.0, 1.2),
     "focal_point": (0.1, 0.0, 0.05),
     "view_up": (0.3, 0.1, 1.0),
     "size": (160, 120),
 }
-
-
-@functools.cache
-def head_volume() -> jv.Volume:
-    return jv.phantom("head", 96)
-
-
-def head(**view: Any) -> Scene:
-    transfer = jv.TransferFunction.from_points(HEAD, unit_distance=0.02)
-    return Scene(head_volume(), transfer, jv.Camera(**(HEAD_VIEW | view)))
-
-
-def engine(real_volume: Callable) -> Scene:
-    volume = jv.load(real_volume("engine_256x256x128_uint8.raw.gz"))
-    return Scene(volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=(256, 256)))
-
-
-def bonsai(real_volume: Callable) -> Scene:
-    """A view past the faces at which the volume is cut off: VTK skips rays along their edges."""
-    volume = jv.load(real_volume("bonsai_256x256x256_uint8.raw.gz"))
-    camera = jv.Camera((835, 385, 553), (128, 173, 128), (0, 1, 0), 16, size=(256, 256))
-    return Scene(volume, jv.preset("bonsai"), camera)
-
-
-SCENES: dict[str, Callable[[Callable], Scene]] = {
-    "head, perspective": lambda _: head(view_angle=40),
-    "head, parallel": lambda _: head(parallel_scale=1.1),
-    "engine": engine,
-    "bonsai": bonsai,
-}
-
-
-def drawn_by_vtk(scene: Scene, shade: Phong | None = None) -> tuple[np.ndarray, Any]:
-    """VTK's image over the background, (height, width, 3) in [0, 1], top row first, and its mapper."""
-    drawn = peer_vtk.prepare(
-        *(scene.volume, scene.transfer, scene.camera, STEP * scene.voxel),
-        background=BACKGROUND,
-        shade=shade,
-    )
-    return drawn.image(), drawn.mapper
-
-
-def drawn_by_us(scene: Scene, mapper: Any, lighting: Phong | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Our image over the background as VTK would display it, and a mask of the pixels inside the object."""
-    march = jv.March(STEP * scene.voxel)
-    rendering = jv.render(scene.volume, scene.transfer, scene.camera, march, lighting=lighting)
-    image, opacity = rendering.image(BACKGROUND), rendering.rgba[..., 3]
-    return peer_vtk.as_displayed(np.asarray(image), mapper), np.asarray(opacity) > 0.01
-
-
-def difference(image: np.ndarray, other: np.ndarray, inside: np.ndarray) -> float:
-    return float(np.abs(image - other)[inside].mean())
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_vtk_draws_the_same_picture_to_the_pixel(real_volume, name):
-    scene = SCENES[name](real_volume)
-    theirs, mapper = drawn_by_vtk(scene)
-    ours, inside = drawn_by_us(scene, mapper)
-    assert inside.mean() > 0.1
-    right = difference(ours, theirs, inside)
-    assert right < AGREED
-    # images that are off by a single pixel differ much more
-    moved = {"right": (0, 1), "left": (0, -1), "down": (1, 0), "up": (-1, 0)}
-    wrong = {f"one pixel {where}": np.roll(ours, by, axis=(0, 1)) for where, by in moved.items()}
-    wrong |= {"upside down": ours[::-1], "mirrored": ours[:, ::-1], "blue for red": ours[..., ::-1]}
-    for what, image in wrong.items():
-        assert difference(image, theirs, inside) > 3 * right, what
-
-
-def cthead(real_volume: Callable) -> Scene:
-    volume = jv.load(real_volume("cthead_256x256x113_uint16le.raw.gz"), spacing=(1, 1, 2))
-    points = [(700, (0.8, 0.5, 0.4), 0.0), (1000, (0.8, 0.5, 0.4), 0.04), (1150, (0.9, 0.6, 0.5), 0.02)]
-    bones = [(1300, (1.0, 0.95, 0.85), 0.5), (3200, (1.0, 1.0, 1.0), 0.9)]
-    transfer = jv.TransferFunction.from_points(points + bones)
-    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.2), (0, 0, -1), size=(256, 256), parallel=True)
-    return Scene(volume, transfer, camera)
-
-
-@pytest.mark.parametrize("name", ["engine", "cthead"])
-def test_vtk_shades_alike(real_volume, name):
-    """VTK shades nodes, by gradients rounded to some 10 000 directions, and interpolates what that gives; its
-    head light shines along the camera's axis, ours along each ray."""
-    scene, phong = (SCENES | {"cthead": cthead})[name](real_volume), Phong()
-    axis = np.asarray(scene.camera.focal_point - scene.camera.position)
-    theirs, mapper = drawn_by_vtk(scene, phong)
-    ours, inside = drawn_by_us(scene, mapper, phong)
-    assert inside.mean() > 0.1
-    right = difference(ours, theirs, inside)
-    assert right < SHADED_AGREED
-    wrong = {
-        "unlit": None,
-        "ambient": Phong(ambient=0.3),
-        "diffuse": Phong(diffuse=0.5),
-        "specular": Phong(specular=0.0),
-        "from above": Phong(DirectionalLight(axis + np.linalg.norm(axis) * np.array([0, 0, 1]))),
-    }
-    for what, lighting in wrong.items():
-        assert difference(drawn_by_us(scene, mapper, lighting)[0], theirs, inside) > 1.5 * right, what
-
-
 PERSPECTIVE, PARALLEL = {"view_angle": 40.0}, {"parallel_scale": 1.1}
 ASPECT = 120 / 160
 MISREAD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
@@ -172,24 +76,70 @@ MISREAD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("what", MISREAD)
-def test_a_camera_read_in_another_way_draws_another_picture(what):
-    view, change = MISREAD[what]
-    meant, misread = head(**view), head(**(view | change))
-    theirs, mapper = drawn_by_vtk(meant)
-    ours, inside = drawn_by_us(meant, mapper)
+@functools.cache
+def head_volume() -> jv.Volume:
+    return jv.phantom("head", 96)
+
+
+def head(**view: Any) -> Scene:
+    transfer = jv.TransferFunction.from_points(HEAD, unit_distance=0.02)
+    return Scene(head_volume(), transfer, jv.Camera(**(VIEW | view)))
+
+
+def difference(image: np.ndarray, other: np.ndarray, inside: np.ndarray) -> float:
+    return float(np.abs(image - other)[inside].mean())
+
+
+@pytest.mark.parametrize("name", ["perspective", "parallel", "engine"])
+def test_vtk_draws_the_same_picture_to_the_pixel(real_volume, name):
+    view = {"perspective": PERSPECTIVE, "parallel": PARALLEL}.get(name)
+    if view is None:
+        volume = jv.load(real_volume("engine_256x256x128_uint8.raw.gz"))
+        scene = Scene(volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=(256, 256)))
+    else:
+        scene = head(**view)
+    theirs, mapper = scene.drawn_by_vtk()
+    ours, inside = scene.drawn(mapper)
+    assert inside.mean() > 0.1
     right = difference(ours, theirs, inside)
     assert right < AGREED
-    assert difference(drawn_by_us(misread, mapper)[0], theirs, inside) > 10 * right
+    # images that are off by a single pixel differ much more
+    moved = {"right": (0, 1), "left": (0, -1), "down": (1, 0), "up": (-1, 0)}
+    wrong = {f"one pixel {where}": np.roll(ours, by, axis=(0, 1)) for where, by in moved.items()}
+    wrong |= {"upside down": ours[::-1], "mirrored": ours[:, ::-1], "blue for red": ours[..., ::-1]}
+    for what, image in wrong.items():
+        assert difference(image, theirs, inside) > 3 * right, what
+    # and so does a camera whose numbers are read in another way, or a volume half a voxel away
+    for what, (given, change) in MISREAD.items():
+        if given is view:
+            assert difference(head(**(given | change)).drawn(mapper)[0], theirs, inside) > 10 * right, what
+    n, volume = scene.volume.shape[0], scene.volume
+    in_cells = jv.Volume(volume.data, spacing=(2 / n,) * 3, origin=(1 / n - 1,) * 3)
+    half_off = jv.Volume(volume.data, volume.spacing, volume.origin + scene.voxel / 2)
+    for other in (in_cells, half_off) if view is PERSPECTIVE else ():
+        assert difference(scene._replace(volume=other).drawn(mapper)[0], theirs, inside) > 2 * right
 
 
-def test_the_voxels_stand_where_vtk_has_them():
-    scene = head(**PERSPECTIVE)
-    theirs, mapper = drawn_by_vtk(scene)
-    ours, inside = drawn_by_us(scene, mapper)
-    n = scene.volume.shape[0]
-    in_cells = jv.Volume(scene.volume.data, spacing=(2 / n,) * 3, origin=(1 / n - 1,) * 3)
-    half_off = jv.Volume(scene.volume.data, scene.volume.spacing, scene.volume.origin + scene.voxel / 2)
-    for volume in (in_cells, half_off):
-        wrong, _ = drawn_by_us(scene._replace(volume=volume), mapper)
-        assert difference(wrong, theirs, inside) > 2 * difference(ours, theirs, inside)
+def test_vtk_shades_alike(real_volume):
+    """VTK shades nodes, by gradients rounded to some 10 000 directions, and interpolates what that gives; its
+    head light shines along the camera's axis, ours along each ray."""
+    volume = jv.load(real_volume("cthead_256x256x113_uint16le.raw.gz"), spacing=(1, 1, 2))
+    points = [(700, (0.8, 0.5, 0.4), 0.0), (1000, (0.8, 0.5, 0.4), 0.04), (1150, (0.9, 0.6, 0.5), 0.02)]
+    points += [(1300, (1.0, 0.95, 0.85), 0.5), (3200, (1.0, 1.0, 1.0), 0.9)]
+    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.2), (0, 0, -1), size=(256, 256), parallel=True)
+    scene, phong = Scene(volume, jv.TransferFunction.from_points(points), camera), Phong()
+    axis = np.asarray(camera.focal_point - camera.position)
+    theirs, mapper = scene.drawn_by_vtk(phong)
+    ours, inside = scene.drawn(mapper, phong)
+    assert inside.mean() > 0.1
+    right = difference(ours, theirs, inside)
+    assert right < SHADED_AGREED
+    wrong = {
+        "unlit": None,
+        "ambient": Phong(ambient=0.3),
+        "diffuse": Phong(diffuse=0.5),
+        "specular": Phong(specular=0.0),
+        "from above": Phong(DirectionalLight(axis + np.linalg.norm(axis) * np.array([0, 0, 1]))),
+    }
+    for what, lighting in wrong.items():
+        assert difference(scene.drawn(mapper, lighting)[0], theirs, inside) > 1.5 * right, what

@@ -2,65 +2,53 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Bool
 
 import jaxvol as jv
-from jaxvol.metrics import (
-    boundary_noise,
-    comb_frequency,
-    low_frequency_energy,
-    rmse,
-    wood_grain_energy,
-)
+from jaxvol.metrics import boundary_noise, comb_frequency, low_frequency_energy, rmse, wood_grain_energy
 from jaxvol.transforms.jitter import Noise
 
-from .scenes import slow
+from .switch import switch
 
 
-JITTERS = {"jitter": jv.Jitter, "empty space": jv.EmptySpaceJitter}
-SEEDS = range(5)
+KINDS = {"jitter": jv.Jitter, "empty space": jv.EmptySpaceJitter}
 
 
-def rendered(scene, *transforms):
-    """Colour over black. All images use alpha correction, so that exits make no difference."""
+def rendered(scene, kind="", seed=0, refined=1):
+    """Colour over black, with alpha correction, so that exits make no difference. Jitters are switched on and
+    off, so that all images of a scene share a program."""
     volume, transfer, camera, step = scene
-    march = jv.March(step, (*transforms, jv.AlphaCorrection()))
+    jitters = (switch(made(seed), name == kind) for name, made in KINDS.items())
+    march = jv.March(step / refined, (*jitters, jv.AlphaCorrection()))
     rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba  # compiles fastest
     return np.asarray(rgba[..., :3], np.float64)
 
 
-def converged(scene, refined):
-    """A converged image, by the midpoint rule, whose error is of second order in the step."""
-    volume, transfer, camera, step = scene
-    march = jv.March(step / refined, (jv.AlphaCorrection(), jv.EarlyTermination(1e-6)), "midpoint")
-    rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba
-    return np.asarray(rgba[..., :3], np.float64)
-
-
-# -- inclined plane ---------------------------------------------------------------------------------------
+# -- an inclined plane, and a block that the box cuts -----------------------------------------------------
 # The scene is stated for the unit cube and rendered as [-1, 1]³, so that a step of 1/128 becomes 2/128 and an
-# extinction of 60 value becomes 30 value.
+# extinction of 60 value becomes 30 value. Images are of 256 x 256 pixels: with fewer, noise hides the comb.
 
-SLOPE = 0.35
+SLOPE, SIDE, STEP = 0.35, 256, 2 / 128
 
 
-class Plane(jv.Field):
-    """The field of `jv.phantom("plane")`, evaluated exactly instead of from voxels."""
+def plane(x, z):
+    return ((z + 1) / 2 - 0.25 - SLOPE * (x + 1) / 2) / 0.004
+
+
+class CutPlane(jv.Field):
+    """The field of `jv.phantom("plane")`, or of "cut_block", evaluated exactly instead of from voxels."""
+
+    cut: Bool[Array, ""]
 
     def value(self, volume, coordinate):
         x, _, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
-        return jax.nn.sigmoid(((z + 1) / 2 - 0.25 - SLOPE * (x + 1) / 2) / 0.004)
-
-
-class Sphere(jv.Field):
-    """The field of `jv.phantom("sphere")`, evaluated exactly instead of from voxels."""
-
-    def value(self, volume, coordinate):
-        x, y, z = (c * volume.spacing[i] + volume.origin[i] for i, c in enumerate(coordinate))
-        return jax.nn.sigmoid((0.5 - jnp.sqrt(x * x + y * y + z * z)) / 0.008)
+        block = 0.5 + 0.1 * jnp.sin(20 * (z + 1))
+        return jnp.where(self.cut & (x < 0), block, jax.nn.sigmoid(plane(x, z)))
 
 
 def surface_transfer():
@@ -70,214 +58,145 @@ def surface_transfer():
     return jv.TransferFunction(values, colors, [0, 0, 1.5, 30])
 
 
-def seen_along_z(field, scale, size=256):
-    volume = jv.Volume(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3, field=field())
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
-    return volume, surface_transfer(), camera, 2 / 128
+def scene_of(*, cut=False, start=-3.0):
+    """Orthographic, along z; a pixel is 1/256 wide. `start`: of the rays, which is z."""
+    field = CutPlane(jnp.asarray(cut))
+    volume = jv.Volume(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3, field=field)
+    camera = jv.Camera((0, 0, start), (0, 0, start + 3), (0, 1, 0), size=(SIDE, SIDE), parallel_scale=0.5)
+    return volume, surface_transfer(), camera, STEP
 
 
 @cache
-def plane(scale=0.5):
-    scene = seen_along_z(Plane, scale)
-    return scene, converged(scene, 16)
+def columns():
+    return np.asarray(scene_of()[2].rays()[0], np.float64)[0, :, 0]
 
 
-def comb_of(error, scale=0.5):
+@cache
+def exact_plane():
+    """The image of the plane, all of whose rows are alike, by a fine quadrature in NumPy."""
+    z = np.linspace(-1, 1, 2**13 + 1)
+    width = z[1] - z[0]
+    value = 1 / (1 + np.exp(-plane(columns()[:, None], z[:-1] + width / 2)))
+    depth = width * np.where(value > 0.05, 30 * value, 0)
+    weight = np.exp(-np.cumsum(depth, 1) + depth) * -np.expm1(-depth)
+    row = np.sum(weight * (0.3 + 0.6 * value), 1)
+    return np.tile(row[:, None], (SIDE, 1, 3))
+
+
+def comb_of(error):
     # x falls along the columns in this view, and so does the depth
-    return wood_grain_energy(error, comb_frequency(2 / 128, (-SLOPE, 0), 2 * scale / 256))
+    return wood_grain_energy(error, comb_frequency(STEP, (-SLOPE, 0), 1 / SIDE))
 
 
-@pytest.mark.parametrize("name", ["empty space", *slow("jitter")])
-def test_jitter_breaks_the_comb_of_an_inclined_plane_and_leaves_the_error(name):
-    scene, reference = plane()
-    plain = rendered(scene)
-    comb = comb_of(plain - reference)
+@pytest.fixture(scope="module")
+def plain():
+    return rendered(scene_of())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_jitter_breaks_the_comb_of_an_inclined_plane_and_leaves_the_error(kind, plain):
+    before = plain - exact_plane()
     # the rings are more than half of the error's variance
-    assert comb > 0.5 * np.sum(np.var(plain - reference, axis=(0, 1)))
-    for seed in SEEDS:
-        image = rendered(scene, JITTERS[name](seed))
-        assert comb_of(image - reference) <= comb / 500, seed
-        assert abs(wood_grain_energy(image - reference)) <= wood_grain_energy(plain - reference) / 10, seed
-        assert rmse(image, reference) == pytest.approx(rmse(plain, reference), rel=0.05), seed
+    assert comb_of(before) > 0.5 * np.sum(np.var(before, axis=(0, 1)))
+    for seed in (0, 1):
+        error = rendered(scene_of(), kind, seed) - exact_plane()
+        assert comb_of(error) <= comb_of(before) / 500, seed
+        assert abs(wood_grain_energy(error)) <= wood_grain_energy(before) / 10, seed
+        assert rmse(error, 0 * error) == pytest.approx(rmse(before, 0 * before), rel=0.05), seed
 
 
-def test_one_shift_for_all_pixels_moves_the_comb_and_does_not_break_it():
+def test_one_shift_for_all_pixels_moves_the_comb_and_does_not_break_it(plain):
     """The metric responds to jitter, not to a common shift: here all rays begin half a step later."""
-    (volume, transfer, camera, step), reference = plane()
-    later = jv.Camera((0, 0, -1 + step / 2), (0, 0, 1), (0, 1, 0), size=camera.size, parallel_scale=0.5)
-    combs = [comb_of(rendered((volume, transfer, c, step)) - reference) for c in (camera, later)]
-    assert combs[1] == pytest.approx(combs[0], rel=0.05)
+    later = rendered(scene_of(start=-1 + STEP / 2))
+    assert comb_of(later - exact_plane()) == pytest.approx(comb_of(plain - exact_plane()), rel=0.05)
 
-
-# -- blue noise -----------------------------------------------------------------------------------------
-
-
-def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
-    pixel = tuple(jnp.asarray(axis.ravel()) for axis in np.meshgrid(*[np.arange(256, dtype=np.int32)] * 2))
-    for seed in SEEDS:
-        energy = {}
-        for pattern in ("white", "blue"):
-            noise = Noise(seed, pattern, stream=0)
-            drawn = np.asarray(jax.vmap(lambda x, y, *, noise=noise: noise((x, y), jnp.float32))(*pixel))
-            energy[pattern] = low_frequency_energy(drawn.reshape(256, 256))
-        assert energy["blue"] <= energy["white"] / 5, seed
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("scale", "bound"), [(0.125, 1 / 5), (0.5, 1 / 2.5)])
-@pytest.mark.parametrize("name", ["jitter", "empty space"])
-def test_blue_jitter_leaves_less_slow_error_where_the_rings_are_wide(name, scale, bound):
-    """The error is a function of ξ + φ, where φ runs from 0 to 1 once per ring. This shifts the spectrum of
-    the noise by the comb's frequency, so that narrow rings (scale 0.5: 11 pixels) move high frequencies to
-    low ones. With rings of 46 pixels (scale 0.125) the error is as blue as expected."""
-    scene, reference = plane(scale)
-    energy = {
-        pattern: np.mean(
-            [low_frequency_energy(rendered(scene, JITTERS[name](s, pattern)) - reference) for s in SEEDS]
-        )
-        for pattern in ("white", "blue")
-    }
-    assert energy["blue"] <= bound * energy["white"]
-
-
-# -- any scene ------------------------------------------------------------------------------------------
-
-SIZE = (128, 128)
-
-
-@cache
-def head():
-    return jv.phantom("head", 128)
-
-
-def skin():
-    """Opaque head surface, with as many control points as the preset, so that they share programs."""
-    values = np.array([0, 40, 90, 120, 150, 180, 210, 230, 255])
-    colors = np.tile(np.interp(values, [0, 40, 90, 255], [0.1, 0.2, 0.8, 1.0])[:, None], 3)
-    return jv.TransferFunction(values, colors, np.where(values > 40, 60, 0))
-
-
-def sphere_scene(_):
-    return seen_along_z(Sphere, 0.55, SIZE[0])
-
-
-def head_scene(_, transfer=None):
-    camera = jv.Camera((1.0, -3.2, 0.8), (0, 0, 0), (0, 0, 1), 30.0, size=SIZE)
-    return head(), transfer or jv.preset("head", unit_distance=0.01), camera, 2 / 64
-
-
-def skin_scene(_):
-    return head_scene(_, skin())
-
-
-AIRWAY = "lidc0314_airway_256x192x200_int16le.raw.gz"
-
-
-def airway(real_volume):
-    return jv.load(real_volume(AIRWAY), spacing=(0.78125, 0.78125, 1.0))
-
-
-def airway_scene(real_volume):
-    """A magnified view down the trachea, from inside."""
-    camera = jv.Camera((99.5, 43.7, 182), (99.0, 73.7, 150), (0, 1, 0), 70.0, size=SIZE).zoom(2)
-    return airway(real_volume), jv.preset("ct_airway"), camera, 0.5
-
-
-def engine_scene(real_volume):
-    volume = jv.load(real_volume("engine_256x256x128_uint8.raw.gz"))
-    return volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=SIZE).zoom(2), 2.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [engine_scene, sphere_scene, head_scene, skin_scene, airway_scene])
-def test_jitter_breaks_wood_grain_in_any_scene(make, real_volume):
-    scene = make(real_volume)
-    reference = converged(scene, 8)
-    plain = rendered(scene)
-    structure = wood_grain_energy(plain - reference)
-    # there is wood grain: more than a tenth of the error's variance
-    assert structure > 0.1 * np.sum(np.var(plain - reference, axis=(0, 1)))
-    for kind in JITTERS.values():
-        for seed in (0, 1):
-            image = rendered(scene, kind(seed))
-            assert abs(wood_grain_energy(image - reference)) <= structure / 10, (kind, seed)
-
-
-def chest_scene(real_volume):
-    """Rays enter through tissue and meet bone before any transparent sample."""
-    volume = airway(real_volume)
-    return volume, jv.preset("ct_chest"), jv.Camera.looking_at(volume, size=SIZE).zoom(4), 2.0
-
-
-def cut_head_volume():
-    """The head with its face cut off, so that the boundary cuts skin, bone and brain."""
-    first = 40
-    data = np.asarray(head().data)[:, first:, :]
-    return jv.Volume(data, head().spacing, head().origin + np.array([0, first * 2 / 127, 0], np.float32))
-
-
-def cut_skull_scene(_):
-    return cut_head(jv.preset("head", unit_distance=0.01))[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [cut_skull_scene, chest_scene])
-def test_empty_space_jitter_leaves_wood_grain_behind_material_alone(make, real_volume):
-    """Its limitation: a ray that meets no transparent sample is not jittered."""
-    scene = make(real_volume)
-    reference = converged(scene, 8)
-    plain, jitter, empty_space = (
-        wood_grain_energy(rendered(scene, *transforms) - reference)
-        for transforms in ((), (jv.Jitter(0),), (jv.EmptySpaceJitter(0),))
-    )
-    assert abs(jitter) <= plain / 10
-    assert 0.5 * plain < empty_space < 1.1 * plain
-
-
-# -- cut faces ------------------------------------------------------------------------------------------
-
-
-def cut_block():
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=SIZE, parallel_scale=0.5)
-    origins, _ = camera.rays()
-    return (jv.phantom("cut_block", 128), surface_transfer(), camera, 2 / 128), np.asarray(origins)[
-        ..., 0
-    ] < -0.05
-
-
-def cut_head(transfer):
-    volume = cut_head_volume()
-    # fine enough for the anatomy on the cut face to be smooth from pixel to pixel
-    camera = jv.Camera((0, -3.2, 0.1), (0, 0, 0.1), (0, 0, 1), size=(192, 192), parallel_scale=0.6)
-    origins, _ = (np.asarray(part, np.float64) for part in camera.rays())
-    x, z = (np.round((origins[..., axis] + 1) / (2 / 127)).astype(int) for axis in (0, 2))
-    inside = (x >= 0) & (x <= 127) & (z >= 0) & (z <= 127)
-    face = np.asarray(volume.data)[np.clip(x, 0, 127), 0, np.clip(z, 0, 127)]
-    return (volume, transfer, camera, 2 / 128), inside & (face > 60)
-
-
-CUTS = {
-    "block": cut_block,
-    "head": lambda: cut_head(jv.preset("head", unit_distance=0.01)),
-    "skin": lambda: cut_head(skin()),
-}
 
 # mean square error of colours up to 1, rounded to float32
 ROUNDING = 3 * (2.0**-23) ** 2
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "block" else pytest.param(name, marks=pytest.mark.slow) for name in CUTS]
-)
-def test_a_cut_face_is_smooth_under_empty_space_jitter_and_noisy_under_jitter(name):
-    scene, face = CUTS[name]()
+def assert_smooth(scene, face):
+    """A cut face is smooth under empty-space jitter, and noisy under jitter."""
     assert face.mean() > 0.25
     plain = boundary_noise(rendered(scene), face)
     for seed in (0, 1):
-        jitter = boundary_noise(rendered(scene, jv.Jitter(seed)), face)
-        residual = boundary_noise(rendered(scene, jv.Jitter(seed, front_residual=True)), face)
-        assert boundary_noise(rendered(scene, jv.EmptySpaceJitter(seed)), face) <= 1.05 * plain + ROUNDING, (
-            seed
-        )
-        assert jitter >= 5 * plain + 1e-6, seed
-        assert residual <= jitter / 2, seed
+        jittered, spared = (boundary_noise(rendered(scene, kind, seed), face) for kind in KINDS)
+        assert spared <= 1.05 * plain + ROUNDING, seed
+        assert jittered >= 5 * plain + 1e-6, seed
+
+
+def test_a_cut_face_is_smooth_under_empty_space_jitter_and_noisy_under_jitter():
+    assert_smooth(scene_of(cut=True), np.tile(columns() < -0.05, (SIDE, 1)))
+
+
+# -- blue noise -------------------------------------------------------------------------------------------
+
+
+def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
+    row, column = (jnp.asarray(axis) for axis in np.indices((SIDE, SIDE), np.int32))
+
+    @eqx.filter_jit
+    def drawn(noise):
+        return jnp.vectorize(lambda x, y: noise((x, y), jnp.float32))(column, row)
+
+    for seed in (0, 1):
+        white, blue = (low_frequency_energy(drawn(Noise(seed, p, stream=0))) for p in ("white", "blue"))
+        assert blue <= white / 5, seed
+
+
+# -- any scene --------------------------------------------------------------------------------------------
+
+SIZE = (128, 128)
+FINE = 16
+"""Times by which steps of the references are shorter: they have less than a hundredth of the wood grain."""
+
+
+def engine(real_volume):
+    volume = jv.load(real_volume("engine_256x256x128_uint8.raw.gz"))
+    return volume, jv.preset("engine"), jv.Camera.looking_at(volume, size=SIZE).zoom(2), 2.0
+
+
+def airway(real_volume):
+    """A magnified view down the trachea, from inside."""
+    volume = jv.load(
+        real_volume("lidc0314_airway_256x192x200_int16le.raw.gz"), spacing=(0.78125, 0.78125, 1.0)
+    )
+    camera = jv.Camera((99.5, 43.7, 182), (99.0, 73.7, 150), (0, 1, 0), 70.0, size=SIZE).zoom(2)
+    return volume, jv.preset("ct_airway"), camera, 0.5
+
+
+@pytest.mark.parametrize("make", [engine, pytest.param(airway, marks=pytest.mark.slow)])
+def test_jitter_breaks_wood_grain_in_real_volumes(make, real_volume):
+    scene = make(real_volume)
+    reference = rendered(scene, refined=FINE)
+    before = rendered(scene) - reference
+    structure = wood_grain_energy(before)
+    # there is wood grain: more than a tenth of the error's variance
+    assert structure > 0.1 * np.sum(np.var(before, axis=(0, 1)))
+    for kind in KINDS:
+        assert abs(wood_grain_energy(rendered(scene, kind) - reference)) <= structure / 10, kind
+
+
+def cut_head():
+    """The head with its face cut off, so that the boundary cuts skin, bone and brain."""
+    whole, first = jv.phantom("head", 128), 40
+    origin = np.asarray(whole.origin) + np.array([0, first * 2 / 127, 0], np.float32)
+    return jv.Volume(np.asarray(whole.data)[:, first:, :], whole.spacing, origin)
+
+
+@pytest.mark.slow
+def test_empty_space_jitter_spares_a_cut_head_and_its_wood_grain_behind_material():
+    """Its limitation: a ray that meets no transparent sample is not jittered."""
+    volume = cut_head()
+    # fine enough for the anatomy on the cut face to be smooth from pixel to pixel
+    camera = jv.Camera((0, -3.2, 0.1), (0, 0, 0.1), (0, 0, 1), size=(192, 192), parallel_scale=0.6)
+    scene = volume, jv.preset("head", unit_distance=0.01), camera, 2 / 128
+    origins = np.asarray(camera.rays()[0], np.float64)
+    x, z = (np.round((origins[..., axis] + 1) / (2 / 127)).astype(int) for axis in (0, 2))
+    inside = (x >= 0) & (x <= 127) & (z >= 0) & (z <= 127)
+    material = np.asarray(volume.data)[np.clip(x, 0, 127), 0, np.clip(z, 0, 127)] > 60
+    assert_smooth(scene, inside & material)
+    reference = rendered(scene, refined=FINE)
+    plain, jitter, spared = (wood_grain_energy(rendered(scene, k) - reference) for k in ("", *KINDS))
+    assert abs(jitter) <= plain / 10
+    assert 0.5 * plain < spared < 1.1 * plain

@@ -29,6 +29,8 @@ def varying(tree: PyTree, *like: PyTree) -> PyTree:
     These axes are part of an array's type in JAX. A loop must start with arrays of the types that it ends
     with, and zeros do not vary. Outside of `jax.shard_map` this changes nothing."""
     axes = frozenset().union(*(varies_over(leaf) for leaf in jax.tree.leaves((tree, like))))
+    if not axes:
+        return tree
 
     def one(leaf: Any) -> Any:
         missing = tuple(sorted(axes - varies_over(leaf))) if eqx.is_array(leaf) else ()

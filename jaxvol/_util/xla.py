@@ -43,16 +43,22 @@ def compiled(function: Callable[..., Any], *, has_jvp: bool = False) -> Callable
 
     def run(*args: Any) -> Any:
         # inside a larger program or a transformation, compiler options are not allowed
-        if not is_traced(args, jnp.zeros(())):
+        if not is_traced(args, _probe()):
             return alone(*args)
         return inner(*args) if has_jvp and not _only_vmapped(args) else in_turn(*args)
 
     return run
 
 
+@jax.jit
+def _probe() -> Array:
+    """A tracer wherever a program is being traced; compiled, since this is asked for each image."""
+    return jnp.zeros(())
+
+
 def computed_now(function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)` of concrete arrays, computed at once also where a larger program is being traced."""
-    if not is_traced(jnp.zeros(())):
+    if not is_traced(_probe()):
         return function(*args)
     # not by `jax.ensure_compile_time_eval`, inside which jax 0.7 cannot compile a loop
     jitted: Any = eqx.filter_jit(function)

@@ -80,11 +80,12 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
                 "lies before. Use another method."
             )
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
-        through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1))
+        fault = jnp.zeros((), bool)
+        through = lines(source, columns.reshape(1, -1), rows.reshape(1, -1), fault)
         own = OwnRays(*(jnp.stack(part, axis=-1) for part in (through.origin, through.direction)))
         one_tile = tiling._replace(tile=columns.size, devices=None)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
-        rays = tiles.rays(own, space, only)
+        rays = tiles.rays(own, space, only, fault)
         beams = Beams(rays, tiles.beam_count, tiles.box(own, rays, only))
         pipeline = Pipeline(
             plain, volume, classification_of(transfer, volume, integrated=march.integrates), FirstVisible()

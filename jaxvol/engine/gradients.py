@@ -19,7 +19,7 @@ from ..lighting.shading import Shader, Surroundings
 from ..march import EmptySpaceIndex
 from ..reference import Pipeline
 from ..rendering import Rendering
-from ..space import Ray, invalid
+from ..space import Ray
 from ..volume import Volume, with_voxels, without_voxels
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
@@ -134,7 +134,7 @@ class Pull(NamedTuple):
         def made(moving: PyTree) -> Ray:
             volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
             space = march_.locate(with_voxels(volume_, volume.data))
-            return invalid(self.tiles.rays(source_, space, number), self.fault)
+            return self.tiles.rays(source_, space, number, self.fault)
 
         return eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
 

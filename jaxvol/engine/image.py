@@ -13,7 +13,7 @@ from ..compositing import Outputs
 from ..lighting.shading import lit_classification
 from ..reference import Pipeline, begin, end, has_fault, step
 from ..rendering import Rendering
-from ..space import Ray, Space, invalid
+from ..space import Ray, Space
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, VisibleRangeRecorder
 from .devices import on_devices
@@ -85,7 +85,7 @@ def _over_tiles(
     fault = fault_of(scene)
 
     def tile(each: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
-        return one(each[0], invalid(tiles.rays(scene.source, space, each[0]), fault))
+        return one(each[0], tiles.rays(scene.source, space, each[0], fault))
 
     renderings, more = tiles.map(tile)
     return jax.tree.map(tiles.assemble, renderings), more

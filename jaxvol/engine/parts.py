@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Int
 from ..march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
 from ..rendering import Rendering
-from ..space import Ray, invalid
+from ..space import Ray
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, with_fields
 from .devices import on_devices
@@ -44,7 +44,7 @@ def set_out(scene: Scene, options: RenderOptions) -> Underway:
     space, pipeline = pipeline_of(scene._replace(lighting=None), NOTHING)
 
     def one(each: tuple[Int[Array, ""]]) -> Underway:
-        rays = invalid(tiles.rays(scene.source, space, each[0]), fault)
+        rays = tiles.rays(scene.source, space, each[0], fault)
         at = vmap_rays(lambda ray: begin(pipeline, ray, options.outputs))(rays)
         return Underway(rays, with_fields(at, finished=rays.length <= 0))
 

@@ -118,8 +118,9 @@ class RayTiles(eqx.Module):
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
     @abstractmethod
-    def rays(self, source: Any, space: Space, tile: Int[Array, ""]) -> Ray:
-        """The rays of a tile, cut to the volume. Those that only fill up groups miss it."""
+    def rays(self, source: Any, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
+        """The rays of a tile, cut to the volume. Those that only fill up groups miss it. If there is a
+        `fault` in the scene, all of them are NaN, and so invalid."""
 
     @abstractmethod
     def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
@@ -141,7 +142,7 @@ class _PixelTiles(RayTiles):
     across: int = eqx.field(static=True)
     down: int = eqx.field(static=True)
 
-    def rays(self, source: Camera, space: Space, tile: Int[Array, ""]) -> Ray:
+    def rays(self, source: Camera, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         side, group = self.tiling.side, self.tiling.group
         order = jnp.arange(self.tiling.rays_per_beam)
         group_y, group_x, y, x = jnp.unravel_index(order, (2, 2, side, side))
@@ -149,7 +150,7 @@ class _PixelTiles(RayTiles):
         column, row = column.reshape(-1, group), row.reshape(-1, group)
         width, height = self.size
         wanted = (column < width) & (row < height)
-        return entering(space, lines(source, column, row), wanted, self.tiling.searched)
+        return entering(space, lines(source, column, row, fault), wanted, self.tiling.searched)
 
     def box(self, source: Camera, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         y, x = jnp.divmod(jnp.arange(4), 2)
@@ -185,7 +186,7 @@ class _OwnRayTiles(RayTiles):
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""]) -> Ray:
+    def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
             source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
@@ -194,7 +195,7 @@ class _OwnRayTiles(RayTiles):
         known = jnp.minimum(number, max(count - 1, 0))
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
-        own = Line((x, y, z), (dx, dy, dz), source.pixel(known))
+        own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
         return entering(space, own, number < count, self.tiling.searched)
 
     def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
@@ -218,36 +219,48 @@ def _own_line(source: OwnRays, index: Int[Array, ""]) -> Line:
     return Line((x, y, z), (dx, dy, dz), source.pixel(index))
 
 
-def _of_pixel(source: Camera, column: Int[Array, ""], row: Int[Array, ""]) -> Line:
-    left, top = (first.astype(column.dtype) for first in source.first_pixel)
-    return Line(*source.ray(column, row), (column + left, row + top))
-
-
 def lines_at(source: Camera | OwnRays, indices: Int[Array, " rays"]) -> Line:
     """The rays of indices into the flattened image, as the march rounds them."""
     if not isinstance(source, Camera):
         return jax.vmap(partial(_own_line, source))(indices)
     rows, columns = jnp.divmod(indices, source.size[0])
-    return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None]))
+    fault = jnp.zeros((), bool)
+    return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None], fault))
+
+
+def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Line:
+    """The rays of pixels. If the camera is not finite, or there is a `fault`, all of them are NaN."""
+    left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
+    found = _rounded(camera, columns, rows, fault)
+    if camera.parallel_scale is not None:
+        origin, direction = found
+    else:  # the position need not be stored for each ray
+        x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
+        origin, direction = (x, y, z), found
+    return Line(origin, direction, (columns + left, rows + top))
+
+
+def _through(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
+    """What is computed of the rays of pixels: directions, and origins too in parallel projection."""
+    ends = vmap_rays(camera.ray)(columns, rows)
+    return ends[1] if camera.parallel_scale is None else ends
 
 
 @jax.custom_jvp
-def lines(camera: Camera, columns: Lanes, rows: Lanes) -> Line:
-    """The rays of pixels, rounded alike in every program.
+def _rounded(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Any:
+    """`_through`, rounded alike in every program.
 
-    Otherwise a program that also differentiates them would round them differently, by 1e-4 of a voxel; and a
-    sample on the other side of a voxel's face has another slope. So they are computed in a branch of their
-    own, without derivatives. If the camera is not finite, all rays are NaN."""
-    return in_memory(all_finite(camera), vmap_rays(partial(_of_pixel, camera)), columns, rows)
+    Otherwise a program that also differentiates it would round it differently, by 1e-4 of a voxel; and a
+    sample on the other side of a voxel's face has another slope. So it is computed in a branch of its own,
+    without derivatives."""
+    return in_memory(all_finite(camera) & ~fault, partial(_through, camera), columns, rows)
 
 
-@lines.defjvp
-def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -> tuple[Line, Line]:
-    camera, columns, rows = primals
-    _, change = jax.jvp(
-        lambda camera: vmap_rays(partial(_of_pixel, camera))(columns, rows), (camera,), tangents[:1]
-    )
-    return lines(*primals), change
+@_rounded.defjvp
+def _(primals: tuple[Camera, Lanes, Lanes, Any], tangents: tuple[Camera, Any, Any, Any]) -> tuple[Any, Any]:
+    camera, columns, rows, _ = primals
+    _, change = jax.jvp(lambda camera: _through(camera, columns, rows), (camera,), tangents[:1])
+    return _rounded(*primals), change
 
 
 def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:

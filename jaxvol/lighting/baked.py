@@ -136,7 +136,9 @@ def bake(shading: Shading, around: Surroundings, nodes: tuple[int, int, int]) ->
 
     ratios = jnp.stack(chosen.fold(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
     ratios = _dilate(ratios, visible.reshape(nx, ny, nz))
-    highest = jnp.maximum(ratios.max((0, 1, 2)), 1e-6)
+    # XLA's maximum of a large array skips NaN on CPUs
+    known = ~jnp.isnan(ratios).any((0, 1, 2))
+    highest = jnp.where(known, jnp.maximum(ratios.max((0, 1, 2)), 1e-6), jnp.nan)
     steps = jnp.round(ratios.reshape(-1, 3) / highest[None] * LEVELS).astype(jnp.uint32)
     words = steps[:, 0] | steps[:, 1] << 10 | steps[:, 2] << 20
     return BakedLighting(words, highest, (nx, ny, nz))

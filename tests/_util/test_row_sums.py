@@ -1,4 +1,6 @@
-"""Sums of rows by index, as on a CPU and as on a GPU."""
+"""Sums of rows by index, and of cubes of voxels, as on a CPU and as on a GPU."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -7,41 +9,58 @@ import pytest
 
 from jaxvol._util import platform
 from jaxvol._util.row_sums import COPIES, ROWS, row_sums, without_zeros
+from jaxvol._util.voxel_fetch import scatter_add
 
 
-@pytest.fixture(params=["cpu", "gpu"])
-def each_platform(request, monkeypatch):
-    monkeypatch.setattr(platform, "platform", lambda: request.param)
-    return request.param
-
-
-@pytest.mark.parametrize("number", [1, 5, ROWS // COPIES + 1, 2 * ROWS])
-def test_sums_are_those_of_float64(number, each_platform):
+@pytest.mark.parametrize(
+    ("number", "name"), [(5, "cpu"), (5, "gpu"), (ROWS // COPIES + 1, "gpu"), (2 * ROWS, "gpu")]
+)
+def test_sums_are_those_of_float64(number, name, monkeypatch):
+    monkeypatch.setattr(platform, "platform", lambda: name)
     random = np.random.default_rng(number)
-    index = random.integers(0, number, (7, 301))
+    index = random.integers(0, number, (7, 301)).astype(np.int32)
     rows = random.normal(size=(7, 301, 3)).astype(np.float32)
     rows[random.random((7, 301)) < 0.4] = 0
     expected = np.zeros((number, 3))
     np.add.at(expected, index, rows.astype(np.float64))
-    found = row_sums(number, jnp.asarray(index, jnp.int32), jnp.asarray(rows))
+    sums = jax.jit(partial(row_sums, number))
+    found = sums(index, rows)
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
-
-
-def test_nan_is_not_lost(each_platform):
-    rows = jnp.asarray([[0.0, jnp.nan], [1.0, 2.0], [0.0, 0.0]])
-    found = row_sums(2, jnp.asarray([1, 0, 0]), rows)
-    np.testing.assert_array_equal(found, [[1, 2], [0, np.nan]])
+    rows[3, 5, 1] = np.nan  # is not lost
+    assert np.argwhere(np.isnan(sums(index, rows))).tolist() == [[index[3, 5], 1]]
 
 
 def test_zeros_are_left_out_and_the_rows_of_one_index_are_dealt_to_copies(monkeypatch):
     """What takes time on a GPU: additions to the same place."""
     rows = jnp.asarray([[0.0, 0.0], [0.0, -1.0], [3.0, 0.0], [-0.0, 0.0]])
-    np.testing.assert_array_equal(without_zeros(jnp.asarray([0, 1, 2, 3]), rows, 9), [9, 1, 2, 9])
-
+    np.testing.assert_array_equal(without_zeros(jnp.arange(4), rows, 9), [9, 1, 2, 9])
     monkeypatch.setattr(platform, "platform", lambda: "gpu")
-    index, ones = jnp.zeros(4 * COPIES, jnp.int32), jnp.ones((4 * COPIES, 1))
+    index, ones = np.zeros(4 * COPIES, np.int32), jnp.ones((4 * COPIES, 1))
     program = jax.make_jaxpr(lambda index: row_sums(7, index, ones))(index)
     (scatter,) = (step for step in program.eqns if step.primitive.name == "scatter-add")
     assert scatter.invars[0].aval.shape == (7 * COPIES, 1)
-    np.testing.assert_array_equal(row_sums(7, index, ones)[:, 0], [4 * COPIES] + [0] * 6)
+
+
+@pytest.mark.parametrize("name", ["cpu", "gpu"])
+def test_cubes_are_added_to_the_voxels_that_they_were_fetched_from(name, monkeypatch):
+    monkeypatch.setattr(platform, "platform", lambda: name)
+    shape, random = (4, 5, 6), np.random.default_rng(0)
+    nodes = random.integers(0, np.array(shape) - 1, (200, 3))
+    nodes[:2] = (0, 0, 0), np.array(shape) - 2  # the last pair ends with the last voxel
+    parts = random.normal(size=(200, 2, 2, 2)).astype(np.float32)
+    parts[random.random((200, 2, 2)) < 0.5] = 0  # pairs to which nothing is added
+    for half in (0, 1):  # or to one of them
+        parts[..., half][random.random((200, 2, 2)) < 0.3] = 0
+    expected = np.ones(shape)
+    for (i, j, k), part in zip(nodes, parts, strict=True):
+        expected[i : i + 2, j : j + 2, k : k + 2] += part
+    base = np.ravel_multi_index(tuple(nodes.T), shape).astype(np.int32)
+
+    @jax.jit
+    def added(voxels, base, parts):
+        cube = [[[parts[:, x, y, z] for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+        return scatter_add(voxels, shape, [base], [cube])
+
+    found = added(np.ones(np.prod(shape), np.float32), base, parts)
+    np.testing.assert_allclose(found.reshape(shape), expected, rtol=0, atol=1e-5)

@@ -1,11 +1,9 @@
 """Does memory stay within the budget, and is nothing lost or repeated if a render is killed?"""
 
-import os
 import signal
 import subprocess
 import sys
 import textwrap
-from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +11,11 @@ import pytest
 
 import jaxvol as jv
 from experiments.peak_memory import STATUS
-from jaxvol.bricks import stream
 from jaxvol.bricks.files import FileSource
+from jaxvol.bricks.opening import source_of
+from jaxvol.bricks.render import bricks_of
 
-from .test_render_bricks import TRANSFER, balls, outside
+from .scenes import CAMERA, LEAPING, PLAIN, TRANSFER, balls, raw_file
 
 
 SIDE = 577
@@ -24,13 +23,6 @@ SIDE = 577
 BUDGET = 24
 BESIDE = 48
 """MiB that an image of 32 x 32 pixels may take beside its voxels, once its programs are compiled."""
-
-LINUX = pytest.mark.skipif(not STATUS.exists(), reason="needs Linux's /proc")
-
-PEAK = """
-    from experiments.peak_memory import peak
-    print(peak())
-"""
 
 IMAGES = """
     import sys
@@ -65,28 +57,8 @@ def program(text: str, *arguments: object) -> list[str]:
     return [sys.executable, "-c", textwrap.dedent(text), *map(str, arguments)]
 
 
-@LINUX
-def test_a_peak_is_that_of_the_process_alone():
-    """And not of what started it, which may have held more than any bound asks for."""
-    here = b"." * 2**28
-    run = subprocess.run(program(PEAK), capture_output=True, text=True, check=True)
-    assert 1 < float(run.stdout) < 64 < len(here) / 2**20
-
-
-def test_what_was_freed_goes_back_once_much_was_read(file, monkeypatch):
-    """After each of many small bricks it would take as long as marching through them."""
-    returns = []
-    monkeypatch.setattr(stream, "give_back", lambda: returns.append(None))
-    bricks = rendered(file).bricks
-    assert bricks.loads > 2
-    assert returns == []
-    monkeypatch.setattr(stream, "KEPT", 2 * bricks.bytes_read // bricks.loads)
-    rendered(file)
-    assert len(returns) == bricks.loads // 2
-
-
 @pytest.mark.slow
-@LINUX
+@pytest.mark.skipif(not STATUS.exists(), reason="needs Linux's /proc")
 def test_memory_stays_within_the_budget_and_30_percent(tmp_path):
     """In a process of its own. That reading everything would be seen is tested beside it."""
     path = tmp_path / "data.raw"
@@ -94,9 +66,8 @@ def test_memory_stays_within_the_budget_and_30_percent(tmp_path):
     with path.open("wb") as file:
         for z in range(SIDE):
             file.write(((x // 8 + y // 8 + z // 8) % 7 * 30 + 9).astype(np.uint8).data)
-    run = subprocess.run(
-        program(IMAGES, path, SIDE, BUDGET * 2**20), capture_output=True, text=True, check=True
-    )
+    command = program(IMAGES, path, SIDE, BUDGET * 2**20)
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
     _, own, faulty = (line.split() for line in run.stdout.splitlines())
     loads, needed, peak = map(float, own)
     assert loads == needed > 20
@@ -104,10 +75,32 @@ def test_memory_stays_within_the_budget_and_30_percent(tmp_path):
     assert float(faulty[2]) > SIDE**3 / 2**20
 
 
+# ---- what is read ----
+
+
+@pytest.mark.parametrize("value", [0, 250])
+def test_voxels_outside_of_the_ranges_found_before_are_refused(value, tmp_path, monkeypatch):
+    """As where a file changes within a tick of the clock: its fingerprint is the same."""
+    data = np.full((24, 25, 26), 100, np.uint8)
+    monkeypatch.setattr(FileSource, "fingerprint", lambda _: {"same": 1})
+
+    def read():
+        stream = bricks_of(source_of(tmp_path / "a.npy"), TRANSFER, CAMERA, PLAIN, memory=10**6)
+        return stream.read(0, *stream.around(0))[1].result()
+
+    np.save(tmp_path / "a.npy", data)
+    np.testing.assert_array_equal(read(), data)
+    data[20, 20, 20] = value
+    np.save(tmp_path / "a.npy", data)
+    with pytest.raises(ValueError, match=rf"a.npy changed since the ranges.* 100\.0 to 100\.0 .*{value}"):
+        read()
+
+
+# ---- killed ----
+
 WAY = """
     import sys, time
     import signal
-    import jaxvol as jv
     from tests.bricks.test_memory import rendered
 
     # as in a terminal, however the tests are run
@@ -118,11 +111,7 @@ WAY = """
         time.sleep(100)
 """
 DURING_THE_IMAGE = """
-    def second(done, of):
-        if done == 2:
-            wait()
-
-    rendered(sys.argv[1], progress=second)
+    rendered(sys.argv[1], progress=lambda done, of: wait() if done == 2 else None)
 """
 DURING_THE_PASS = """
     from jaxvol.bricks import summary
@@ -137,27 +126,18 @@ DURING_THE_PASS = """
     summary.slabs = first
     rendered(sys.argv[1])
 """
-WHILE_THE_CACHE_IS_WRITTEN = """
-    import os
-    os.replace = wait
-    rendered(sys.argv[1])
-"""
 
 
 def rendered(path, **options):
     """An image of the balls in a raw file, at a budget that takes several slabs and bricks."""
-    march, camera = jv.March(0.5, (jv.SpaceLeaping(),)), outside(jv.Volume(balls()), 24)
-    return jv.render_bricks(path, TRANSFER, camera, march, memory=115_000, **options)
+    return jv.render_bricks(path, TRANSFER, CAMERA, LEAPING, memory=90_000, **options)
 
 
 def killed(way: str, path: Path, sign: signal.Signals) -> None:
     """Renders a file in another process, and ends it where it waits."""
-    process = subprocess.Popen(
-        program(textwrap.dedent(WAY) + textwrap.dedent(way), path),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=Path(__file__).parents[2],
-    )
+    command = program(textwrap.dedent(WAY) + textwrap.dedent(way), path)
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "cwd": Path(__file__).parents[2]}
+    process = subprocess.Popen(command, **how)
     assert process.stdout is not None
     assert process.stdout.readline() == b"here\n"
     process.send_signal(sign)
@@ -165,58 +145,27 @@ def killed(way: str, path: Path, sign: signal.Signals) -> None:
     assert process.returncode != 0
 
 
-def checksums(folder: Path) -> dict[str, str]:
-    return {file.name: blake2b(file.read_bytes()).hexdigest() for file in folder.iterdir()}
-
-
-@pytest.fixture
-def file(tmp_path):
-    path = tmp_path / "balls_41x35x50_uint8.raw"
-    path.write_bytes(balls().tobytes(order="F"))
-    return path
-
-
-@pytest.fixture
-def reads(monkeypatch):
-    """The boxes that are read of files."""
-    boxes, stored = [], FileSource._stored
-
-    def counted(source, low, high, axes):
-        boxes.append((low, high))
-        return stored(source, low, high, axes)
-
-    monkeypatch.setattr(FileSource, "_stored", counted)
-    return boxes
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGINT])
-def test_an_image_that_is_killed_damages_nothing_and_its_pass_is_not_repeated(file, reads, sign):
-    whole = rendered(file)
-    before = checksums(file.parent)
+def test_an_image_that_is_killed_damages_nothing_and_only_an_unfinished_pass_is_repeated(
+    tmp_path, monkeypatch
+):
+    path, reads, stored = raw_file(tmp_path), [], FileSource._stored
+    monkeypatch.setattr(FileSource, "_stored", lambda *box: reads.append(box) or stored(*box))
+    whole = rendered(path, cache=None)
     of_pass = len(reads) - whole.bricks.loads
     assert of_pass > 1
-    [cache] = file.parent.glob("balls*.npz")
-    cache.unlink()
-    killed(DURING_THE_IMAGE, file, sign)
-    assert checksums(file.parent).keys() == before.keys()
-    assert checksums(file.parent)[file.name] == before[file.name]
-    after, _ = checksums(file.parent), reads.clear()
-    again = rendered(file)
-    assert len(reads) == again.bricks.loads == whole.bricks.loads
-    assert checksums(file.parent) == after
-    np.testing.assert_array_equal(again.rgba, whole.rgba)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", [DURING_THE_PASS, WHILE_THE_CACHE_IS_WRITTEN])
-def test_a_pass_that_is_killed_begins_anew(file, reads, way):
-    whole = rendered(file, cache=None)
-    expected, _ = len(reads), reads.clear()
-    killed(way, file, signal.SIGKILL)
-    assert not list(file.parent.glob("balls*.npz"))
-    again = rendered(file)
-    assert len(reads) == expected > again.bricks.loads
-    np.testing.assert_array_equal(again.rgba, whole.rgba)
-    assert len(list(file.parent.glob("balls*.npz"))) == 1
-    assert os.stat(file).st_size == balls().size
+    for way, sign, finished in (
+        (DURING_THE_PASS, signal.SIGKILL, False),
+        (DURING_THE_IMAGE, signal.SIGKILL, True),
+        (DURING_THE_IMAGE, signal.SIGINT, True),
+    ):
+        killed(way, path, sign)
+        assert path.read_bytes() == balls().tobytes(order="F")
+        caches = list(tmp_path.glob("balls*.npz"))
+        assert len(caches) == finished
+        reads.clear()
+        again = rendered(path)
+        assert len(reads) == again.bricks.loads + (0 if finished else of_pass)
+        np.testing.assert_array_equal(again.rgba, whole.rgba)
+        for cache in tmp_path.glob("balls*.npz"):
+            cache.unlink()

@@ -4,7 +4,6 @@ import itertools
 import json
 import sys
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -19,32 +18,23 @@ from jaxvol.commands.orbit import angles_of, turned
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
 
 
-@pytest.fixture
-def folder(volume_file, tmp_path, monkeypatch):
-    """A folder of five frames."""
+def test_each_frame_is_what_render_makes_of_its_settings(volume_file, tmp_path, monkeypatch, drawn):
     monkeypatch.chdir(tmp_path)
     words = ["--frames", "5", "--degrees", "100", "--axis", "0", "1", "1"]
     assert main(["animate", volume_file.name, *SEEN, *words, "-o", "orbit"]) == 0
-    return tmp_path / "orbit"
-
-
-def test_each_frame_is_an_image_of_the_library_and_is_made_again_by_render(folder, volume_file, tmp_path):
-    files = sorted(folder.iterdir())
+    files = sorted((tmp_path / "orbit").iterdir())
     assert [file.name for file in files] == [f"frame_{number:04d}.png" for number in range(5)]
     camera = jv.Camera.looking_at(jv.load(volume_file), size=(16, 16))
-    march = jv.March(0.4, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
-    for number in (0, 3):
-        image = jv.render(
-            jv.load(volume_file), jv.preset("engine"), turned(camera, 25.0 * number, (0, 1, 1)), march
-        ).image((1, 1, 1))
-        found = imread(files[number])
-        assert np.abs(found - np.asarray(jv.to_srgb(image)) * 255).max() <= 1
-        assert main(["render", "--like", str(files[number]), "-o", "again.png"]) == 0
-        np.testing.assert_array_equal(imread(tmp_path / "again.png"), found)
-    assert (imread(files[0]) != imread(files[3])).any()
+    for number, (_, _, seen, march) in enumerate(drawn.scenes):
+        np.testing.assert_allclose(
+            seen.position, turned(camera, 25.0 * number, (0, 1, 1)).position, rtol=1e-5
+        )
+        assert float(march.step) == np.float32(0.4)
     said = json.loads(Image.open(files[3]).info["jaxvol"])
-    assert said["command"] == "render"
-    assert said["settings"]["turn"] == 75
+    assert (said["command"], said["settings"]["turn"]) == ("render", 75)
+    assert main(["render", "--like", str(files[3]), "-o", "again.png"]) == 0
+    np.testing.assert_array_equal(drawn.scenes[-1][2].position, drawn.scenes[3][2].position)
+    np.testing.assert_array_equal(imread("again.png"), imread(files[3]))
 
 
 def test_a_camera_turns_about_its_focal_point():
@@ -67,58 +57,33 @@ def test_a_closed_orbit_does_not_show_its_first_frame_twice():
     assert angles_of(90, 1) == [0]
 
 
-def test_a_gif_holds_all_frames(volume_file, tmp_path, monkeypatch):
+def frames_in(path):
+    """The frames of a GIF, and how long each lasts."""
+    with Image.open(path) as picture:
+        for number in range(getattr(picture, "n_frames", 1)):
+            picture.seek(number)
+            yield np.asarray(picture.convert("RGB")), picture.info["duration"]
+
+
+def test_a_gif_holds_all_frames_and_lasts_as_long_as_it_should(volume_file, tmp_path, drawn):
     output = tmp_path / "deep" / "a.gif"
-    traced = []
-    render = jv.render
-    monkeypatch.setattr(
-        "jaxvol.commands.frames.render", lambda *a, **how: traced.append(a) or render(*a, **how)
-    )
-    count = programs()
-    assert main(["animate", str(volume_file), *SEEN, "--frames", "2", "-o", str(output)]) == 0
-    first = programs() - count
     assert main(["animate", str(volume_file), *SEEN, "--frames", "6", "--fps", "5", "-o", str(output)]) == 0
-    assert len(traced) == 8
-    assert programs() - count == first  # one program for all frames
-    with Image.open(output) as picture:
-        assert getattr(picture, "n_frames") == 6  # noqa: B009  (of GIFs alone)
-        assert picture.info["duration"] == 200
-        assert picture.info["loop"] == 0
-        frames = []
-        for number in range(6):
-            picture.seek(number)
-            frames.append(np.asarray(picture.convert("RGB")).astype(int))
-    assert frames[0].shape == (16, 16, 3)
-    expected = np.asarray(jv.to_srgb(render(*traced[-1]).image((1, 1, 1)))) * 255
-    assert np.abs(frames[5] - expected).mean() < 3  # of 256 colours
-    assert all((a != b).any() for a, b in itertools.pairwise(frames))
+    assert len(drawn.scenes) == 6
     assert [path.name for path in output.parent.iterdir()] == ["a.gif"]
+    found, lasting = zip(*frames_in(output), strict=True)
+    assert lasting == (200,) * 6
+    assert all((one != other).any() for one, other in itertools.pairwise(found))
 
-
-def test_a_gif_lasts_as_long_as_it_should(tmp_path):
     images = [np.full((8, 8, 3), 20 * number, np.uint8) for number in range(12)]
-    _write_gif(tmp_path / "a.gif", iter(images), 12, 12)  # 8 and 1/3 hundredths of a second each
-    with Image.open(tmp_path / "a.gif") as picture:
-        lasting = []
-        for number in range(12):
-            picture.seek(number)
-            lasting.append(picture.info["duration"])
+    _write_gif(tmp_path / "b.gif", iter(images), 12, 12)  # 8 and 1/3 hundredths of a second each
+    found, lasting = zip(*frames_in(tmp_path / "b.gif"), strict=True)
+    np.testing.assert_array_equal(found, images)
     assert sum(lasting) == 1000
     assert set(lasting) == {80, 90}
+    assert Image.open(tmp_path / "b.gif").info["loop"] == 0
 
 
-COMPILED: list[str] = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, *_, **__: COMPILED.append(event) if "backend_compile" in event else None
-)
-
-
-def programs():
-    """How many programs were compiled, or taken from the cache, up to now."""
-    return len(COMPILED)
-
-
-def test_an_mp4_holds_all_frames(volume_file, tmp_path):
+def test_an_mp4_holds_all_frames(volume_file, tmp_path, drawn):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg, of jaxvol[video]")
     output = tmp_path / "a.mp4"
     assert main(["animate", str(volume_file), *SEEN, "--frames", "6", "-o", str(output)]) == 0
@@ -137,6 +102,8 @@ BAD = {
     "fps of a gif": (["--fps", "60"], "--fps: a .gif has 50 frames a second at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
     "step and tolerance": (["--tolerance", "0.1"], "--tolerance finds a step"),
+    "odd mp4": (["-o", "a.mp4", "--size", "9", "8"], "--size: an .mp4 has an even number of pixels"),
+    "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }
 
 
@@ -144,15 +111,11 @@ BAD = {
 def test_errors_are_one_line(case, volume_file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words, message = BAD[case]
+    if case == "no ffmpeg":
+        monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["animate", str(volume_file), *SEEN, *words]) == 2
     printed = capsys.readouterr().err
     assert printed.startswith("jaxvol animate: error: ")
     assert printed.count("\n") == 1
     assert message in printed
     assert [path.name for path in tmp_path.iterdir()] == [volume_file.name]
-
-
-def test_without_ffmpeg_the_extra_is_named(volume_file, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert main(["animate", str(volume_file), *SEEN, "-o", "a.mp4"]) == 2
-    assert 'pip install "jaxvol[video]"' in capsys.readouterr().err

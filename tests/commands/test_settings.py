@@ -73,21 +73,9 @@ def test_the_viewer_takes_its_options_from_a_file(config):
     path = config(
         'file = "a.raw"\nclim = [0, 9]\ncmap = "bone"\nopacity = "sigmoid"\nshade = false\nport = 9000'
     )
-    flags = [
-        "a.raw",
-        "--clim",
-        "0",
-        "9",
-        "--cmap",
-        "bone",
-        "--opacity",
-        "sigmoid",
-        "--no-shade",
-        "--port",
-        "9001",
-    ]
-    found, expected = options("view", "--config", path, "--port", 9001), options("view", *flags)
-    assert vars(found) | {"config": None} == vars(expected)
+    found = options("view", "--config", path, "--port", 9001)
+    flags = "a.raw --clim 0 9 --cmap bone --opacity sigmoid --no-shade --port 9001"
+    assert vars(found) | {"config": None} == vars(options("view", *flags.split()))
     with pytest.raises(ValueError, match="jaxvol view has no option 'size'"):
         options("view", "--config", config("size = [1, 2]"))
 
@@ -129,20 +117,14 @@ def test_parts_of_the_demo_may_stand_in_a_file(config, capsys):
 BAD = {
     "unknown": ("sise = [1, 2]", "settings.toml: jaxvol render has no option 'sise'. Did you mean size?"),
     "of another command": ('solver = "adam"', "jaxvol render has no option 'solver'"),
-    "a table": ("[render]\nstep = 1", "has no option 'render'"),
     "itself": ('config = "a.toml"', "has no option 'config'"),
     "text": ('step = "long"', "settings.toml: step must be a number; got 'long'"),
     "truth": ("step = true", "step must be a number; got True"),
-    "no truth": ("parallel = 1", "parallel must be true or false; got 1"),
     "fraction": ("size = [1.5, 2]", "size must be a whole number; got 1.5"),
-    "too few": ("view-up = [0, 1]", "view-up must be a list of 3 numbers; got [0, 1]"),
     "no list": ("view-up = 3", "view-up must be a list of 3 numbers; got 3"),
     "flat list": ("clip-plane = [1, 2, 3, 4, 5, 6]", "clip-plane must be a list of 6 numbers; got 1"),
-    "no list of lists": ("clip-plane = 1", "clip-plane must be a list of lists; got 1"),
     "choice": ('compositing = "under"', "compositing must be one of over, maximum"),
     "bytes": ('memory = "much"', "memory must be a number of bytes, such as 256M; got 'much'"),
-    "no bytes": ("memory = 0", "memory must be a number of bytes"),
-    "path": ("transfer = 5", "transfer must be a text; got 5"),
     "no TOML": ("step = ", "settings.toml is not TOML"),
 }
 
@@ -162,14 +144,11 @@ def test_a_file_that_is_not_there_is_named(tmp_path, capsys):
     assert re.search(r"--config: \S*no\.toml cannot be read", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize(("text", "count"), [("1000", 1000), ("256M", 2**28), ("2g", 2**31), ("0.5K", 512)])
-def test_memory_is_a_number_of_bytes(text, count):
-    assert options("plan", "a.raw", "--memory", text).memory == count
-
-
-@pytest.mark.parametrize("text", ["much", "", "-1", "0", "nan", "inf", "1e999", "5T"])
-def test_other_memory_is_refused(text, capsys):
-    with pytest.raises(SystemExit) as stop:
-        options("plan", "a.raw", f"--memory={text}")
-    assert stop.value.code == 2
-    assert "--memory" in capsys.readouterr().err
+def test_memory_is_a_number_of_bytes(capsys):
+    for text, count in (("1000", 1000), ("256M", 2**28), ("2g", 2**31), ("0.5K", 512)):
+        assert options("plan", "a.raw", "--memory", text).memory == count
+    for text in ("much", "", "-1", "0", "nan", "inf", "1e999", "5T"):
+        with pytest.raises(SystemExit) as stop:
+            options("plan", "a.raw", f"--memory={text}")
+        assert stop.value.code == 2
+        assert "--memory" in capsys.readouterr().err

@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh, PartitionSpec as P
 
 import jaxvol as jv
 from jaxvol.bricks.owned import bounds_of
 
+from ..bricks import scenes
 from ..scenes import anisotropic_noise, around, soft_transfer
 
 
@@ -32,74 +35,64 @@ def environment(devices: int) -> dict[str, str]:
     return {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": ":".join(sys.path)}
 
 
-def on_eight_devices(*cases: str) -> None:
-    """Runs cases of `on_devices.py`."""
+def on_eight_devices(fault: str | None, known: Path | str, *cases: str) -> None:
+    """Runs cases of `on_devices.py`, with the fault of this session, if any."""
     # `conftest` first, by which shapes and types are checked there, too
-    start = "import sys, tests.conftest; from tests.engine import on_devices; on_devices.run(*sys.argv[1:])"
-    command = [sys.executable, "-c", start, *cases]
+    start = f"""import sys, tests.conftest
+from tests import faults
+from tests.engine import on_devices
+if {fault!r}:
+    faults.all_faults()[{fault!r}].inject()
+on_devices.run(*sys.argv[1:])"""
+    command = [sys.executable, "-c", start, str(known), *cases]
     found = subprocess.run(command, cwd=ROOT, env=environment(8), capture_output=True, text=True, check=False)
     assert found.returncode == 0, f"{found.stdout[-2000:]}\n{found.stderr[-6000:]}"
 
 
-def test_work_is_balanced_and_images_and_gradients_are_those_of_one_device():
-    on_eight_devices("balance", "refused", "image_and_gradient")
+@pytest.fixture
+def fault(request) -> str | None:
+    return request.config.option.fault
 
 
-def test_devices_that_own_bricks_render_the_whole():
-    on_eight_devices("owned_bricks")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "cases",
-    [
-        ("numbers_of_devices", "sizes"),
-        ("every_device_works", "own_rays"),
-        ("modes",),
-        ("adjoints",),
-        ("transformations",),
-        ("owned_from_everywhere",),
-        ("bricks", "curved_bricks"),
-    ],
-    ids=" and ".join,
-)
-def test_on_eight_devices(cases):
-    on_eight_devices(*cases)
+def test_work_is_balanced_and_image_gradient_and_owned_bricks_are_those_of_one_device(fault, tmp_path):
+    (gradient, one), whole = scenes.whole_gradient(), scenes.whole()
+    known: dict[str, Any] = {name: getattr(one, name) for name in ("rgba", "depth", "samples")}
+    known |= {f"{name} by bricks": getattr(whole, name) for name in ("rgba", "depth")}
+    known |= {f"gradient {i}": leaf for i, leaf in enumerate(jax.tree.leaves(gradient))}
+    np.savez(tmp_path / "known.npz", **known)
+    on_eight_devices(fault, tmp_path / "known.npz", "balance", "image_and_gradient", "owned_bricks")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("devices", "bricks", "tolerance"), [(1, False, 1e-6), (2, False, 1e-6), (1, True, 3e-5)]
-)
-def test_two_processes_render_the_image_of_one(devices, bricks, tolerance, tmp_path):
-    """Each with so many devices, over sockets of this machine; and each with bricks of its own."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
-    size = ["--resolution", "32", "--size", "77", "--output", str(tmp_path / "image.npy")]
-    processes = [
-        subprocess.Popen(
-            [
-                sys.executable,
-                EXAMPLE,
-                "--coordinator",
-                address,
-                "--processes",
-                "2",
-                "--process",
-                str(i),
-                *size,
-            ],
-            env=environment(devices),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for i in range(2)
-    ]
-    said = [process.communicate(timeout=600)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], "\n".join(said)
-    assert f"by 2 processes on {2 * devices} devices" in said[0]
+@pytest.mark.parametrize("case", ["numbers_of_devices", "modes", "adjoints", "rays", "bricks"])
+def test_on_eight_devices(case, fault):
+    on_eight_devices(fault, "", case)
+
+
+def test_rays_that_a_caller_sharded_are_traced_with_types_checked_and_devices_are_refused_there():
+    """Traced only; on two devices it runs in the slow tests."""
+    volume, transfer, mesh = anisotropic_noise(), soft_transfer(), Mesh(np.array(jax.devices()), ("rays",))
+    march, rays = jv.March(0.07, (jv.Jitter(5), jv.SpaceLeaping())), (jnp.zeros((8, 3)), jnp.ones((8, 3)))
+
+    def traced(devices, checked):
+        def seen(transfer, origins, directions):
+            return jv.render_rays(volume, transfer, origins, directions, march, devices=devices).rgba
+
+        specs = {"in_specs": (P(), P("rays"), P("rays")), "out_specs": P("rays")}
+        sharded = jax.shard_map(seen, mesh=mesh, **specs, check_vma=checked)
+        return jax.eval_shape(jax.grad(lambda transfer: jnp.sum(sharded(transfer, *rays))), transfer)
+
+    assert traced(None, True).extinction.shape == transfer.extinction.shape
+    for checked in (True, False):
+        with pytest.raises(ValueError, match=r"devices cannot be given inside jax\.shard_map"):
+            traced(jax.devices(), checked)
+    with pytest.raises(ValueError, match=r"pixels must be integers of shape \(8, 2\); got float32"):
+        jv.render_rays(volume, transfer, *rays, march, pixels=np.zeros((8, 2), np.float32))
+
+
+@pytest.mark.slow
+def test_two_processes_render_the_image_of_one(tmp_path):
+    """Each with two devices, over sockets of this machine; and with bricks of their own."""
     spec = importlib.util.spec_from_file_location("several_processes", EXAMPLE)
     assert spec is not None
     assert spec.loader is not None
@@ -107,58 +100,71 @@ def test_two_processes_render_the_image_of_one(devices, bricks, tolerance, tmp_p
     spec.loader.exec_module(example)
     expected = jv.render(*example.scene(32, 77)).rgba
     assert float(expected[..., 3].max()) > 0.5
-    np.testing.assert_allclose(np.load(tmp_path / "image.npy"), expected, atol=tolerance, rtol=0)
+    for more, tolerance in (([], 1e-6), (["--bricks"], 3e-5)):
+        with socket.socket() as free:
+            free.bind(("localhost", 0))
+            address = f"localhost:{free.getsockname()[1]}"
+        how = ["--coordinator", address, "--processes", "2", "--output", str(tmp_path / "image.npy"), *more]
+        processes = [
+            subprocess.Popen(
+                [sys.executable, EXAMPLE, *how, "--process", str(i), "--resolution", "32", "--size", "77"],
+                env=environment(2),
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            for i in range(2)
+        ]
+        said = [process.communicate(timeout=600)[0] for process in processes]
+        assert [process.returncode for process in processes] == [0, 0], "\n".join(said)
+        assert "by 2 processes on 4 devices" in said[0]
+        np.testing.assert_allclose(np.load(tmp_path / "image.npy"), expected, atol=tolerance, rtol=0)
 
 
-BAD: dict[str, tuple[Any, str]] = {
-    "none": ([], "one or more different devices of one platform; got \\[\\]"),
-    "a number": (8, "a sequence of JAX devices, such as jax.devices\\(\\), or .* got 8"),
-    "numbers": ([0, 1], "a sequence of JAX devices, .* got 0"),
-    "a name": ("cpu", "a sequence of JAX devices, .* got 'cpu'"),
-}
+BAD: list[tuple[Any, str]] = [
+    ([], "one or more different devices of one platform; got \\[\\]"),
+    ([jax.devices()[0]] * 2, "one or more different devices of one platform"),
+    (8, "a sequence of JAX devices, such as jax.devices\\(\\), or .* got 8"),
+    ([0, 1], "a sequence of JAX devices, .* got 0"),
+    ("cpu", "a sequence of JAX devices, .* got 'cpu'"),
+    (jax.make_mesh((1, 1), ("x", "y")), r".* of one axis; got a mesh of the axes \{'x': 1, 'y': 1\}"),
+]
 
 
-@pytest.mark.parametrize(("given", "message"), BAD.values(), ids=BAD)
+@pytest.mark.parametrize(("given", "message"), BAD)
 def test_devices_that_are_none_are_refused(given, message):
-    volume = anisotropic_noise()
+    scene = anisotropic_noise(), soft_transfer(), around(anisotropic_noise())
     for render in (jv.render, jv.render_bricks):
         with pytest.raises(ValueError, match=f"devices must be {message}"):
-            render(volume, soft_transfer(), around(volume), jv.March(0.07), devices=given)
+            render(*scene, jv.March(0.07), devices=given)
     with pytest.raises(ValueError, match=f"devices must be {message}"):
-        jv.render_rays(volume, soft_transfer(), (0, 0, 0), (0, 0, 1), jv.March(0.07), devices=given)
+        jv.render_rays(*scene[:2], (0, 0, 0), (0, 0, 1), jv.March(0.07), devices=given)
 
 
 PROBE = jv.ToroidalMap(20.0, 10.0, (1.1, 2.0), (1.1, 2.0), (5.0, 30.0))
-UNOWNED: dict[str, tuple[tuple[jv.Transform, ...], dict[str, Any], str]] = {
-    "curved": ((PROBE,), {}, "ToroidalMap, where a ray may come back"),
-    "shifted": ((jv.EmptySpaceJitter(1),), {}, "EmptySpaceJitter, which shifts"),
-    "adaptive": ((jv.AdaptiveSampling(0.1),), {}, "AdaptiveSampling, whose strides"),
-    "selecting": ((), {"compositing": "maximum"}, "compositing by Maximum, which"),
-    "summing": ((), {"compositing": "average"}, "compositing by Average, which"),
-    "naive": ((), {"method": "naive"}, "method='naive'"),
-}
+UNOWNED: list[tuple[tuple[jv.Transform, ...], dict[str, Any], str]] = [
+    ((PROBE,), {}, "ToroidalMap, where a ray may come back"),
+    ((jv.EmptySpaceJitter(1),), {}, "EmptySpaceJitter, which shifts"),
+    ((jv.AdaptiveSampling(0.1),), {}, "AdaptiveSampling, whose strides"),
+    ((), {"compositing": "maximum"}, "compositing by Maximum, which"),
+    ((), {"compositing": "average"}, "compositing by Average, which"),
+    ((), {"method": "naive"}, "method='naive'"),
+    ((), {"gradient": True}, "gradients"),
+]
 
 
-@pytest.mark.parametrize(("transforms", "more", "message"), UNOWNED.values(), ids=UNOWNED)
+@pytest.mark.parametrize(("transforms", "more", "message"), UNOWNED)
 def test_what_does_not_join_front_to_back_is_refused_where_bricks_are_owned(transforms, more, message):
-    volume = anisotropic_noise()
-    given = volume, soft_transfer(), around(volume), jv.March(0.07, transforms)
-    with pytest.raises(ValueError, match=f'own="bricks" does not go with {message}.* Use own="rays"'):
-        jv.render_bricks(*given, devices=jax.devices(), own="bricks", **more)
+    volume, march = anisotropic_noise(), jv.March(0.07, transforms)
+    how = {name: given for name, given in more.items() if name != "gradient"}
 
-
-def test_owned_bricks_have_no_gradient():
-    volume = anisotropic_noise()
-
-    def loss(transfer):
+    def image(transfer):
         return jv.render_bricks(
-            volume, transfer, around(volume), jv.March(0.07), devices=jax.devices(), own="bricks"
+            volume, transfer, around(volume), march, devices=jax.devices(), own="bricks", **how
         ).rgba.sum()
 
-    with pytest.raises(ValueError, match=r'own="bricks" does not go with gradients\. Use own="rays"'):
-        jax.grad(loss)(soft_transfer())
-    with pytest.raises(ValueError, match="own must be one of rays, bricks; got 'voxels'"):
-        jv.render_bricks(volume, soft_transfer(), around(volume), jv.March(0.07), own="voxels")
+    with pytest.raises(ValueError, match=f'own="bricks" does not go with {message}.* Use own="rays"'):
+        (jax.grad(image) if "gradient" in more else image)(soft_transfer())
 
 
 def test_devices_own_as_many_bricks_that_are_needed():

@@ -65,13 +65,10 @@ ADAPTIVE = jv.AdaptiveSampling(0.02), jv.Jitter(3), jv.AlphaCorrection(), jv.Spa
 
 SCENES = {
     "defaults": engine,
-    "jittered, no leaps": lambda: engine(transforms=(jv.Jitter(3), jv.AlphaCorrection())),
     "shifted, no leaps": lambda: engine(transforms=(jv.EmptySpaceJitter(5), jv.EarlyTermination(0.05))),
     "few samples": lambda: engine(more={"max_samples": 37}),
     "adaptive": lambda: engine(transforms=ADAPTIVE, quadrature="preintegrated"),
-    "adaptive, shifted": lambda: engine(transforms=(*ADAPTIVE[:1], *DEFAULTS), quadrature="midpoint"),
     "distances": lambda: engine(transforms=(*DEFAULTS[:2], jv.SpaceLeaping("distance"))),
-    "nearest hits": lambda: engine(transforms=(*DEFAULTS[:2], jv.SpaceLeaping("min_distance"))),
     "toroidal": toroidal,
     "Phong": lambda: engine(lighting=Phong()),
     "scatterers": lambda: engine(lighting=SCATTERERS),
@@ -81,16 +78,17 @@ SCENES = {
 }
 
 
-OF_GRADIENTS = "defaults", "few samples", "adaptive", "toroidal", "Phong", "scatterers", "isosurface"
+OF_GRADIENTS = "defaults", "adaptive", "Phong", "scatterers", "isosurface"
 
 
-@pytest.mark.parametrize("name", slow(*(name for name in SCENES if name not in OF_GRADIENTS)))
+@pytest.mark.parametrize("name", ["defaults", *slow(*(name for name in SCENES if name not in OF_GRADIENTS))])
 def test_images_are_those_of_the_tiling_for_cpus(name):
     scene = SCENES[name]()
     assert_same(*(render_scene(scene, "all", "replay", tiling) for tiling in (SMALL, Tiling())))
 
 
-@pytest.mark.parametrize("name", [OF_GRADIENTS[0], *slow(*OF_GRADIENTS[1:])])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OF_GRADIENTS)
 def test_images_and_gradients_are_those_of_the_tiling_for_cpus(name):
     scene = SCENES[name]()
     weights = np.random.default_rng(0).normal(size=(38, 45, 4)).astype(np.float32)
@@ -143,6 +141,7 @@ def test_gradients_of_voxels_are_those_of_the_tiling_for_cpus():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * float(np.linalg.norm(expected)))
 
 
+@pytest.mark.slow
 def test_rays_that_are_out_of_samples_rest_in_surplus_turns():
     """At the default number of samples, of which one less than a turn's is left when a batch is refilled."""
     volume = jv.Volume(np.ones((2, 2, 2), np.float32))
@@ -207,7 +206,7 @@ def test_a_program_for_cuda_has_no_branch(on_a_gpu):
     assert "stablehlo.if" not in text
 
 
-OF_PROGRAMS = "adaptive", "distances", "nearest hits", "toroidal", "Phong", "scatterers", "isosurface"
+OF_PROGRAMS = "adaptive", "distances", "toroidal", "scatterers", "isosurface"
 
 
 @pytest.mark.parametrize("name", slow(*OF_PROGRAMS))

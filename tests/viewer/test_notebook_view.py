@@ -2,6 +2,8 @@
 
 import asyncio
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,11 +17,25 @@ from .test_model import BALL, LABELS, LOOK, MARCH
 pytest.importorskip("rendercanvas.anywidget", reason="needs rendercanvas: pip install jaxvol[notebooks]")
 
 
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch):
+    """Nothing is drawn: what is drawn is for `test_model.py`."""
+    monkeypatch.setattr("jaxvol.viewer.worker.Worker.ask", lambda self, request: None)
+
+
+@contextmanager
+def viewed(*scene, **more) -> Iterator[Any]:
+    view = jv.view(*scene, **{"march": MARCH, "lit": False, "size": (300, 210), **more})
+    try:
+        yield view
+    finally:
+        view.close()
+
+
 @pytest.fixture
 def shown():
-    view = jv.view(BALL, LOOK, march=MARCH, lit=False, size=(300, 210))
-    yield view
-    view.close()
+    with viewed(BALL, LOOK) as view:
+        yield view
 
 
 def pointer(kind, x, y, *, buttons=(), modifiers=(), **more):
@@ -76,27 +92,20 @@ def test_the_controls_of_points_window_and_level_agree(shown):
 
 
 def test_a_step_alone_is_moved_by_its_level_and_stretched_by_its_window():
-    step = jv.TransferFunction([90, 90], [(1, 0, 0), (0, 0, 1)], [0, 2])
-    view: Any = jv.view(BALL, step, march=MARCH, lit=False, size=(64, 48))
-    try:
+    with viewed(BALL, jv.TransferFunction([90, 90], [(1, 0, 0), (0, 0, 1)], [0, 2])) as view:
         assert (view._look.window.value, view._look.level.value) == (0, 90)
         view._look.level.value = 110.0
         assert view.model.state.look.values == pytest.approx((110, 110))
         view._look.window.value = 20.0
         assert view.model.state.look.values == pytest.approx((100, 120))
-    finally:
-        view.close()
 
 
-@pytest.mark.parametrize(("compositing", "offered"), [("over", True), ("average", False)])
-def test_light_is_offered_where_something_can_be_lit(compositing, offered):
-    view = jv.view(BALL, LOOK, march=MARCH, lit=False, compositing=compositing, size=(64, 48))
-    try:
-        names = [getattr(widget, "description", "") for widget in view.children[1].children]
-        assert ("light" in names) is offered
-        assert "AlphaCorrection" in names
-    finally:
-        view.close()
+def test_light_is_offered_where_something_can_be_lit():
+    for compositing, offered in (("over", True), ("average", False)):
+        with viewed(BALL, LOOK, compositing=compositing) as view:
+            names = [getattr(widget, "description", "") for widget in view.children[1].children]
+            assert ("light" in names) is offered
+            assert "AlphaCorrection" in names
 
 
 def test_the_plot_follows_the_points(shown):
@@ -108,8 +117,7 @@ def test_the_plot_follows_the_points(shown):
 
 
 def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
-    view = jv.view(LABELS, march=MARCH, lit=False, size=(64, 48))
-    try:
+    with viewed(LABELS) as view:
         rows = view._look.children
         assert [row.children[1].description for row in rows] == ["1", "2"]
         assert "#1f77b4" in rows[0].children[0].value
@@ -120,8 +128,6 @@ def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
         assert np.asarray(transfer.shown).tolist()[1:3] == [False, True]
         assert np.asarray(transfer.opacity).tolist()[1:3] == [1.0, 0.25]
         assert view.volume.labels is not None
-    finally:
-        view.close()
 
 
 def test_the_canvas_waits_for_no_tick(monkeypatch):

@@ -2,7 +2,6 @@
 
 import socket
 import threading
-import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -31,27 +30,22 @@ def page():
     served.close()
 
 
-def received(page, origin: str) -> int:
-    """Messages that a client from a page of this origin receives within a second; -1: it was sent away."""
+def is_taken(page, origin: str) -> bool:
+    """Whether a client from a page of this origin receives anything before it is sent away."""
     with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=VISER) as connection:
-        count, end = 0, time.monotonic() + 1
         try:
-            while (left := end - time.monotonic()) > 0:
-                connection.recv(timeout=left)
-                count += 1
-        except TimeoutError:
-            return count
+            connection.recv(timeout=30)
         except exceptions.ConnectionClosed:
-            return -1 if count == 0 else count
-        return count
+            return False
+        return True
 
 
 def test_only_its_own_pages_may_connect(page):
     """Any page that the browser shows may open a connection to a port of this machine."""
-    assert received(page, page.url) > 0
-    assert received(page, f"http://127.0.0.1:{page.port}") > 0
+    assert is_taken(page, page.url)
+    assert is_taken(page, f"http://127.0.0.1:{page.port}")
     for origin in ("https://example.org", f"http://example.org:{page.port}", "http://localhost:1", "null"):
-        assert received(page, origin) == -1
+        assert not is_taken(page, origin)
 
 
 def handled(page, origin: str) -> int:
@@ -88,21 +82,14 @@ def test_what_others_send_is_not_handled(page):
     assert handled(page, "https://example.org") == 0
 
 
-def test_it_is_bound_to_this_machine_alone(page):
-    with socket.create_connection(("127.0.0.1", page.port), timeout=5):
-        pass
+def test_nobody_else_reaches_it_and_it_serves_no_other_files(page):
     # an address of this machine, too, but not the one that it is bound to
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.2", page.port), timeout=5)
-
-
-def test_no_client_can_publish_it(page):
-    """A message of viser's asks for a tunnel to a public address."""
-    assert page._server.request_share_url() is None
+    assert (
+        page._server.request_share_url() is None
+    )  # a message of viser's asks for a tunnel to a public address
     assert page._server._share_tunnel is None
-
-
-def test_paths_outside_of_the_client_are_not_served(page):
     for path in ("/../../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd"):
         with socket.create_connection(("127.0.0.1", page.port), timeout=5) as connection:
             connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
@@ -119,40 +106,32 @@ def test_the_camera_of_a_page_is_that_of_the_volume(page):
     assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
 
 
-def controls(page) -> dict[str, Any]:
+def controls(transfer, **how) -> dict[str, Any]:
     """Those of a page that is opened, by their labels."""
     from jaxvol.viewer.page import _Panel
 
-    gui = page._server.gui
-    client: Any = SimpleNamespace(gui=gui)
-    _Panel(client, page._content, page._state).model.close()
-    return {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
+    page = jv.serve(VOLUME, transfer, port=18090, **how)
+    try:
+        gui = page._server.gui
+        client: Any = SimpleNamespace(gui=gui)
+        _Panel(client, page._content, page._state).model.close()
+        return {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
+    finally:
+        page.close()
 
 
 def test_the_controls_show_how_it_begins():
-    served = jv.serve(VOLUME, GRAY, march=jv.March(16.0), compositing="average", port=18090)
-    try:
-        shown = controls(served)
-    finally:
-        served.close()
+    shown = controls(GRAY, march=jv.March(16.0), compositing="average")
     assert shown["step (voxels)"].value == shown["step (voxels)"].max == 16
     assert "SpaceLeaping" in {name.replace("\u200b", "") for name in shown}
     assert "light" not in shown
-
-
-def test_a_step_alone_is_shown_as_a_window_of_0():
-    step = jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2])
-    served = jv.serve(VOLUME, step, port=18090)
-    try:
-        shown = controls(served)
-    finally:
-        served.close()
+    shown = controls(jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2]))
     assert (shown["window"].value, shown["level"].value) == (0, 9)
     assert shown["level"].max - shown["level"].min > 20
     assert "light" in shown
 
 
-@pytest.mark.parametrize("port", [99999, 0, -5, "x"])
-def test_a_port_that_is_none_is_named(port):
-    with pytest.raises(ValueError, match="port must be an integer from 1 to 65535; got"):
-        jv.serve(VOLUME, port=port)
+def test_a_port_that_is_none_is_named():
+    for port in (99999, 0, -5, "x"):
+        with pytest.raises(ValueError, match="port must be an integer from 1 to 65535; got"):
+            jv.serve(VOLUME, port=port)

@@ -42,15 +42,6 @@ class Log:
             time.sleep(0.001)
 
 
-def test_a_request_is_drawn_coarse_and_then_fine():
-    log = Log()
-    log.worker.ask(1)
-    log.go(5)
-    assert log.worker.wait(20)
-    assert log.done == [("coarse", 1), *((f"part {k}", 1) for k in range(4)), ("closed", 1)]
-    log.worker.close()
-
-
 def test_a_newer_request_cancels_a_fine_image_between_two_parts():
     log = Log()
     log.worker.ask(1)

@@ -49,7 +49,7 @@ def test_info_takes_the_header_of_a_raw_file(tmp_path, capsys):
 
 def test_info_says_what_is_assumed_of_other_files(tmp_path, capsys):
     tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed: pip install jaxvol[io]")
-    data = np.arange(6 * 5 * 7, dtype=np.uint8).reshape(6, 5, 7)
+    data = np.arange(210, dtype=np.uint8).reshape(6, 5, 7)
     np.savez(tmp_path / "bare.npz", data=data)
     np.savez(tmp_path / "told.npz", data=data, spacing=(1, 1, 1))
     tifffile.imwrite(tmp_path / "bare.tif", data, photometric="minisblack")

@@ -1,0 +1,375 @@
+"""Are bricks seen? Images by bricks are those of the whole volume, and so are gradients; little is read."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.bricks import summary_files
+from jaxvol.bricks.files import FileSource
+from jaxvol.bricks.sources import ArraySource
+from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
+
+from .scenes import (
+    CAMERA,
+    CURVED,
+    FROM_THE_SIDE,
+    LEAPING,
+    PLACE,
+    PLAIN,
+    SHAPE,
+    SHEETS,
+    TRANSFER,
+    WIDE,
+    assert_same,
+    balls,
+    fog,
+    loss,
+    parts,
+    raw_file,
+    whole,
+    whole_fog,
+    whole_gradient,
+)
+
+
+MEMORY = 75_000
+"""Bytes in which twelve bricks of the balls are rendered, read as two thirds of an axis."""
+
+
+# ---- straight rays ----
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return raw_file(tmp_path_factory.mktemp("balls"))
+
+
+def rendered(file, camera=CAMERA, transfer=TRANSFER, **options):
+    return jv.render_bricks(file, transfer, camera, LEAPING, **PLACE, **({"memory": MEMORY} | options))
+
+
+@pytest.fixture(scope="module")
+def image(file):
+    """The image of a file, and what was told of its progress."""
+    told = []
+    return rendered(file, progress=lambda *numbers: told.append(numbers)), told
+
+
+def test_bricks_of_a_file_look_like_the_whole_within_the_budget_of_memory(image):
+    found, told = image
+    assert_same(found, whole(), fields=("exhausted", "aligned"))
+    bricks = found.bricks
+    assert bricks.bytes_held <= MEMORY < 2.5 * balls().nbytes
+    assert np.all(np.less(bricks.stored, SHAPE) | np.equal(bricks.counts, 1))
+    assert 4 < bricks.loads <= bricks.needed < math.prod(bricks.counts)
+    assert bricks.bytes_read == bricks.loads * math.prod(bricks.stored)
+    assert bricks.reloads == 0
+    assert told == [(done + 1, bricks.needed) for done in range(bricks.loads)]
+
+
+def test_the_pass_over_all_voxels_is_not_repeated_after_an_interrupted_image_either(image, file, monkeypatch):
+    reads, stored = [], FileSource._stored
+    monkeypatch.setattr(FileSource, "_stored", lambda *box: reads.append(box) or stored(*box))
+    before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
+
+    def stop(done, of):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        rendered(file, progress=stop)
+    reads.clear()
+    again = rendered(file)
+    assert len(reads) == again.bricks.loads
+    assert before == {path.name: path.read_bytes() for path in file.parent.iterdir()}
+    np.testing.assert_array_equal(again.rgba, image[0].rgba)
+
+
+def test_what_nobody_sees_is_not_read(image, file):
+    counts = image[0].bricks.counts
+    through = eqx.tree_at(
+        lambda c: (c.position, c.focal_point, c.view_angle),
+        CAMERA,
+        (jnp.asarray([50.0, 7.0, 96.5]), jnp.asarray([12.0, 5.7, 23.2]), jnp.asarray(4.0)),
+    )
+    opaque = rendered(file, through, bricks=counts)
+    clear = eqx.tree_at(lambda t: t.extinction, TRANSFER, TRANSFER.extinction / 1e3)
+    assert float(opaque.rgba[..., 3].min()) > 0.99  # the nearer ball hides the other one
+    assert opaque.bricks.loads < rendered(file, through, clear, bricks=counts).bricks.loads
+    away = eqx.tree_at(lambda c: c.focal_point, CAMERA, jnp.asarray([400.0, 200, 400]))
+    assert rendered(file, away, bricks=counts).bricks.loads == 0
+    empty = rendered(np.zeros(SHAPE, np.uint8, order="F"), bricks=counts)
+    assert empty.bricks.needed == empty.bricks.loads == 0
+    assert not np.any(empty.rgba)
+    assert np.all(np.isinf(empty.depth))
+
+
+# ---- gradients ----
+
+
+def by_bricks(spacing, *others):
+    """Not in a file, and of another order in memory."""
+    data = np.ascontiguousarray(balls())
+    return jv.render_bricks(data, *others, spacing=spacing, origin=PLACE["origin"], bricks=(2, 1, 3))
+
+
+@pytest.fixture(scope="module")
+def gradient():
+    """Gradient and image, and how often all voxels were read for their ranges."""
+    passes, scan = [], summary_files.scan
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(summary_files, "scan", lambda *given, **more: passes.append(1) or scan(*given, **more))
+        return *eqx.filter_grad(loss, has_aux=True)(parts(), by_bricks), len(passes)
+
+
+def test_image_and_gradient_by_bricks_are_those_of_the_whole(gradient):
+    (expected, one), (found, every, passes) = whole_gradient(), gradient
+    assert_same(every, one, fields=("exhausted", "samples"))
+    leaves = jax.tree.leaves(expected)
+    assert all(np.any(leaf) for leaf in (expected[0], expected[1].colors, expected[2].position))
+    assert expected[1].extinction[0] != 0  # of what no brick shows
+    for own, other in zip(jax.tree.leaves(found), leaves, strict=True):
+        assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
+    assert passes == 1  # the second march has the ranges of the first
+
+
+def changed(extinction):
+    """The parts with other extinctions."""
+    spacing, transfer, *others = parts()
+    return spacing, eqx.tree_at(lambda t: t.extinction, transfer, extinction), *others
+
+
+def test_the_gradient_agrees_with_differences(gradient):
+    at = TRANSFER.extinction
+    for i, change in ((1, 2e-3), (2, 1e-2)):
+        more, less = (loss(changed(at.at[i].add(sign * change)), by_bricks)[0] for sign in (1, -1))
+        np.testing.assert_allclose(gradient[0][1].extinction[i], (more - less) / (2 * change), rtol=2e-3)
+
+
+def test_other_transformations_say_what_to_do():
+    def opacity(extinction):
+        return by_bricks(*changed(extinction)).rgba[..., 3]
+
+    at = TRANSFER.extinction
+    seen, pull = jax.vjp(opacity, at)
+    for pulled in (lambda: jax.jit(pull)(seen), lambda: jax.vmap(pull)(seen[None])):
+        with pytest.raises(ValueError, match="the gradient by bricks reads its source"):
+            pulled()
+    for mapped in (jax.jit(opacity), lambda at: jax.vmap(opacity)(at[None])):
+        with pytest.raises(ValueError, match=r"not inside jax\.jit"):
+            mapped(at)
+    for forward in (
+        lambda: jax.jvp(opacity, (at,), (at,)),
+        lambda: jax.hessian(lambda a: opacity(a).sum())(at),
+    ):
+        with pytest.raises(ValueError, match=r"gradients in reverse mode.*none in forward mode \(jax\.jvp"):
+            forward()
+
+    def image(source):
+        return jnp.sum(jv.render_bricks(source, TRANSFER, WIDE, PLAIN).rgba)
+
+    data = jnp.asarray(balls(), jnp.float32)
+    for given, at in ((image, data), (lambda spacing: image(jv.Volume(data, spacing)), jnp.ones(3))):
+        with pytest.raises(ValueError, match=r"source must not be traced.*no gradients to voxels"):
+            jax.grad(given)(at)
+
+
+# ---- curved rays ----
+
+
+@pytest.mark.parametrize("method", ["overlap", "reload"])
+def test_bricks_look_like_the_whole_where_rays_leave_them_and_come_back(method):
+    found = jv.render_bricks(fog(), SHEETS, FROM_THE_SIDE, CURVED, bricks=(1, 1, 4), method=method)
+    assert_same(found, whole_fog())
+    bricks = found.bricks
+    assert bricks.stored[2] < 64
+    assert bricks.reloads == bricks.loads - bricks.needed
+    assert (bricks.reloads == 0) == (method == "overlap")
+
+
+# ---- arguments ----
+
+ARRAY = np.ascontiguousarray(balls())
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"memory": 1000}, "memory must be at least .* got 1000"),
+    ({"memory": -1}, "memory must be an integer of at least 1; got -1"),
+    ({"bricks": (2, 2)}, "bricks must be three numbers"),
+    ({"bricks": (0, 1, 1)}, r"bricks must be three numbers .*, each .* at least 1.*; got \(0, 1, 1\)"),
+    ({"bricks": (2, 1.5, 2)}, "bricks must be three numbers .* got .*1.5"),
+    (
+        {"bricks": (1000, 1000, 1000), "source": np.broadcast_to(np.uint8(0), (41, 42, 43))},
+        r"bricks must be no more than 65536 .* got .*1000, 1000\), .* 41 x 42 x 43 voxels into 68880",
+    ),
+    ({"method": np.array(["overlap", "reload"])}, "method must be one of overlap, reload, naive"),
+    ({"method": "fast"}, "method must be one of overlap, reload, naive; got 'fast'"),
+    ({"tolerance": "x"}, "tolerance must be"),
+    ({"tolerance": -5.0, "level": 0}, "tolerance must be"),
+    ({"tolerance": 0.1, "level": 0}, "tolerance chooses a level, and level=0 is one.*got toler"),
+    ({"level": 1}, 'level must be an integer from 0 to 0, or "auto"; got 1'),
+    ({"outputs": "depth"}, "outputs must be one of all, rgba"),
+    ({"source": "no_such.raw"}, "no_such.raw"),
+    ({"source": None}, "source must be an array, a Volume, .* got None"),
+    ({"source": {}}, "source must be an array, a Volume, "),
+    ({"cache": ""}, "cache must be .* got ''"),
+    ({"cache": __file__}, "cache must be .* is a file"),
+    ({"transfer": 3}, "transfer must be a transfer function"),
+    ({"transfer": jv.LabelTransferFunction({1: TRANSFER})}, "bricks have no labels"),
+    ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
+    (
+        {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), DirectionalLight((1, 0, 0)), baked=True)},
+        "farthest_read",
+    ),
+    ({"compositing": "over!"}, "compositing must be one of"),
+    ({"progress": 5}, "progress must be a function"),
+    ({"own": "bricks"}, "devices="),
+    ({"own": "voxels"}, "own must be one of rays, bricks; got 'voxels'"),
+]
+
+
+class Unread(ArraySource):
+    def _stored(self, low, high, axes):
+        raise AssertionError("read")
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_bad_arguments_are_named_before_anything_is_read(changes, message):
+    given = {"source": ARRAY, "transfer": TRANSFER, "camera": CAMERA, "march": PLAIN} | changes
+    if given["source"] is ARRAY and "cache" not in changes:
+        given["source"] = Unread(ARRAY)
+    with pytest.raises((ValueError, OSError), match=message):
+        jv.render_bricks(**given)
+    with pytest.raises(TypeError, match="no arguments beside"):
+        jv.render_bricks(ARRAY, TRANSFER, CAMERA, PLAIN, beside=3)
+
+
+# ---- what users run ----
+
+
+@pytest.fixture
+def engine(real_volume):
+    return jv.Volume(jv.load(real_volume("engine_256x256x128_uint8.raw.gz")).data, (1, 0.7, 1.3))
+
+
+SUN = DirectionalLight((0.9, 0.7, 0.6), (9, 9, 9))
+OBLIQUE = ((128, 90, 80), (0.6, -0.9, -0.5))
+WAYS: dict[str, tuple[jv.March, dict[str, Any]]] = {
+    "as in the paper": (
+        jv.March(
+            1.0,
+            (jv.EmptySpaceJitter(0), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(1 / 255)),
+        ),
+        {},
+    ),
+    "residual, clipped": (
+        jv.March(2.5, (jv.Jitter(0, front_residual=True), jv.Clip(planes=[OBLIQUE])), "midpoint"),
+        {},
+    ),
+    "adaptive, by beams": (
+        jv.March(0.5, (jv.Jitter(1), jv.AdaptiveSampling(0.01), jv.SpaceLeaping("beam")), "preintegrated"),
+        {},
+    ),
+    "templates": (
+        jv.March(0.5, (jv.SpaceLeaping("distance"),)),
+        {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), SUN)},
+    ),
+    "isosurface": (
+        jv.March(0.5, (jv.SpaceLeaping(),)),
+        {"compositing": jv.Isosurface(100), "lighting": Phong()},
+    ),
+    "maximum by two dimensions": (
+        jv.March(0.5, (jv.SpaceLeaping(),)),
+        {"compositing": "maximum", "transfer": jv.TransferFunction2D.from_transfer(TRANSFER, (0.0, 60.0))},
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_bricks_of_a_real_volume_look_like_the_whole_in_every_way(engine, way):
+    march, options = WAYS[way]
+    options = {"transfer": TRANSFER} | options
+    camera = jv.Camera((400, 300, 500), engine.center, (0, 1, 0), 30.0, size=(48, 48))
+    one = jv.render(engine, camera=camera, march=march, **options)
+    # kept in memory in another order than the whole
+    data = np.asarray(engine.data).transpose(1, 2, 0).copy().transpose(2, 0, 1)
+    found = jv.render_bricks(
+        data, camera=camera, march=march, spacing=engine.spacing, bricks=(2, 3, 2), **options
+    )
+    assert_same(found, one)
+    assert np.all(np.less(found.bricks.stored, engine.shape)[:2])  # or no margin would be seen
+    if way == "isosurface":
+        np.testing.assert_allclose(found.normal, one.normal, rtol=0, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_random_splits_and_cameras_look_like_the_whole(engine):
+    rng, center = np.random.default_rng(0), np.asarray(engine.center)
+    march = jv.March(0.9, (jv.SpaceLeaping(), jv.EmptySpaceJitter(3)))
+    cameras = [
+        jv.Camera(
+            center + rng.normal(size=3) * far, center + rng.normal(size=3), (0, 1, 0.1), 60.0, size=(32, 32)
+        )
+        for far in (5, 60, 400)
+    ]
+    cameras += [jv.Camera((400, 300, 500), center, (0, 1, 0), parallel_scale=100.0, size=(32, 32))]
+    for camera in cameras:
+        bricks = tuple(int(n) for n in rng.integers(1, 5, 3))
+        one = jv.render(engine, TRANSFER, camera, march)
+        assert_same(jv.render_bricks(engine, TRANSFER, camera, march, bricks=bricks), one)
+
+
+HALF = math.pi / 2
+SCAN = (40, 48, 64)
+
+
+def probe_fog():
+    """A toroidal volume, red near the probe and blue behind, and a probe at whose apex nodes lie densely."""
+    probe = jv.ToroidalMap(1.0, 2.0, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
+    points = [
+        (v, color, 0.02)
+        for v, color in ((0, (1, 0, 0)), (120, (1, 0, 0)), (135, (0, 0, 1)), (255, (0, 0, 1)))
+    ]
+    return (
+        np.broadcast_to(np.linspace(20, 250, 64), SCAN).astype(np.uint8),
+        jv.TransferFunction.from_points(points),
+        probe,
+    )
+
+
+@pytest.mark.slow
+def test_a_toroidal_volume_is_rendered_within_its_memory_and_wrongly_in_naive_order():
+    """Where a step covers many more nodes at the apex than in the middle."""
+    data, transfer, probe = probe_fog()
+    camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(48, 48))
+    march, memory = jv.March(0.5, (probe, jv.Jitter(0))), 254_000
+    one = jv.render(jv.Volume(data), transfer, camera, march)
+    for method in ("overlap", "reload"):
+        found = jv.render_bricks(data, transfer, camera, march, memory=memory, method=method)
+        assert_same(found, one)
+        assert np.prod(found.bricks.counts) > 1
+        assert found.bricks.bytes_held <= memory
+        assert np.any(np.less(found.bricks.stored, SCAN))
+    naive = jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 4), method="naive")
+    assert naive.bricks.loads == 4
+    wrong = np.abs(np.asarray(naive.rgba - one.rgba))
+    assert wrong[..., :3].max() > 0.1
+    # only the order is wrong: what is hidden behind what, not how much is
+    np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
+    with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
+        jv.render_bricks(data, transfer, camera, jv.March(1.0, (probe,)), memory=150_000)
+
+
+@pytest.mark.slow
+def test_a_stretch_behind_a_gap_that_is_shorter_than_a_step_is_seen():
+    """No sample of equal steps lies in such a stretch; its cell is cut at its two ends."""
+    data, transfer, _ = probe_fog()
+    probe = jv.ToroidalMap(10.0, 20.0, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
+    camera = jv.Camera((84, 68, 61), probe.center, (0, 0.3, 1), 40, size=(48, 48))
+    march = jv.March(6.0, (probe, jv.AlphaCorrection()))
+    one = jv.render(jv.Volume(data), transfer, camera, march)
+    assert_same(jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 2)), one)

@@ -1,0 +1,114 @@
+"""Faults of readers, writers, the command, the viewer, what is shown by default."""
+
+from contextlib import contextmanager
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from . import Fault
+
+
+@contextmanager
+def in_place(path):
+    yield path
+
+
+class Everything:
+    def __contains__(self, _):
+        return True
+
+
+def all_shown(transfer):
+    return eqx.tree_at(
+        lambda t: (t.shown, t.opacity), transfer, (transfer.shown | True, 0 * transfer.opacity + 1)
+    )
+
+
+FAULTS: list[Fault] = [
+    Fault(
+        "DICOM: slices in the order of their names",
+        "formats.dicom:_pixels",
+        lambda pixels: lambda slices: pixels(sorted(slices, key=lambda each: each.path)),
+        ("formats/test_dicom.py::test_a_shuffled_series_comes_out_sorted_and_rescaled",),
+    ),
+    Fault(
+        "files: an axis is reversed, and the origin stays",
+        "formats.orientation:toward_axes",
+        lambda toward: (
+            lambda data, steps, origin, turn: toward(data, steps, origin, turn) | {"origin": origin}
+        ),
+        ("formats/test_medical.py::test_an_image_comes_out_as_it_was_written[.nrrd]",),
+    ),
+    Fault(
+        "Kretz: uneven angles are taken as even ones",
+        "formats.kretz:UNEVEN",
+        lambda _: 1.0,
+        ("formats/test_kretz.py::test_a_bad_file_is_refused_with_its_reason[uneven angles]",),
+    ),
+    Fault(
+        "files: a file is written in place, and left half written after an error",
+        "_util.whole_files:whole_file",
+        lambda _: in_place,
+        ("_util/test_whole_files.py::test_after_an_error_all_is_as_it_was",),
+    ),
+    Fault(
+        "command: a picture is made again of a volume that has changed",
+        "commands.checksum:checksum",
+        lambda _: lambda path: 64 * "0",
+        ("commands/test_recorded.py::test_the_volume_may_lie_beside_the_picture_and_must_be_the_same",),
+    ),
+    Fault(
+        "command: the light does not reach the image",
+        "commands.scene:_lighting",
+        lambda _: lambda options, mode: None,
+        ("commands/test_render.py::test_options_of_the_look_make_the_scene[an isosurface]",),
+    ),
+    Fault(
+        "display: sRGB without its linear part",
+        "display:to_srgb",
+        lambda _: lambda linear: 1.055 * jnp.clip(jnp.asarray(linear), 0, 1) ** (1 / 2.4) - 0.055,
+        ("test_display.py::test_srgb_and_back",),
+    ),
+    Fault(
+        "viewer: a drag turns what is seen against the pointer",
+        "viewer.orbit:Orbit.turned",
+        lambda turned: lambda self, right, down: turned(self, -right, -down),
+        ("viewer/test_orbit.py::test_the_front_of_what_is_seen_follows_a_drag",),
+    ),
+    Fault(
+        "viewer: a fine image is finished before a newer request is drawn",
+        "viewer.worker:Worker._draw",
+        lambda draw: lambda self, request, asked: [self._coarse(request, asked), *self._fine(request)][:0],
+        ("viewer/test_worker.py::test_a_newer_request_cancels_a_fine_image_between_two_parts",),
+    ),
+    Fault(
+        "viewer: pages of others may connect",
+        "viewer.page:OWN_NAMES",
+        lambda _: Everything(),
+        ("viewer/test_page.py::test_only_its_own_pages_may_connect",),
+    ),
+    Fault(
+        "labels: the node below instead of the nearest",
+        "volume:Volume.label",
+        lambda label: lambda self, coordinate: label(self, tuple(c - 0.5 for c in coordinate)),
+        ("test_volume.py::test_values_are_trilinear_and_voxels_keep_their_type[uint8]",),
+    ),
+    Fault(
+        "labels: hidden ones are not leapt over",
+        "labels:LabelTransferFunction._functions",
+        lambda functions: lambda self: functions(all_shown(self)),
+        ("test_labels.py::test_hidden_labels_are_leapt_over",),
+    ),
+    Fault(
+        "direction: rows are taken for columns",
+        "_util.frame:Frame.of",
+        lambda of: classmethod(lambda cls, origin, direction: of.__func__(cls, origin, direction.T)),
+        ("test_direction.py::test_nodes_lie_where_numpy_puts_them",),
+    ),
+    Fault(
+        "GPU: zeros are added, all to the same place",
+        "_util.row_sums:without_zeros",
+        lambda _: lambda index, rows, end: index,
+        ("_util/test_row_sums.py::test_zeros_are_left_out_and_the_rows_of_one_index_are_dealt_to_copies",),
+    ),
+]

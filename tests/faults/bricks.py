@@ -1,0 +1,78 @@
+"""Faults of volumes in bricks, and several devices."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from . import Fault
+
+
+IMAGE = "bricks/test_images.py::test_bricks_of_a_file_look_like_the_whole_within_the_budget_of_memory"
+CURVED = "bricks/test_images.py::test_bricks_look_like_the_whole_where_rays_leave_them_and_come_back[overlap]"
+GRADIENT = "bricks/test_images.py::test_image_and_gradient_by_bricks_are_those_of_the_whole"
+DEVICES = (
+    "engine/test_devices.py::"
+    "test_work_is_balanced_and_image_gradient_and_owned_bricks_are_those_of_one_device"
+)
+
+
+def _all_of_its_cells(of_brick: Callable[..., Any]) -> Callable[..., Any]:
+    """A device marches from where its brick begins, also where those before it have been."""
+
+    def faulty(self: Any, grid: Any, scene: Any, brick: Any) -> Any:
+        everything = self.own._replace(first=jnp.zeros_like(self.own.first))
+        return of_brick(type(self)(self.underway, everything), grid, scene, brick)
+
+    return faulty
+
+
+def _without_carry(pulled: Any) -> Any:
+    return eqx.tree_at(lambda each: each.carry, pulled, jnp.zeros_like(pulled.carry))
+
+
+FAULTS = [
+    Fault(
+        "devices: gradients are not summed over them",
+        "engine.devices:summed",
+        lambda _: lambda mesh, tree: tree,
+        (DEVICES,),
+    ),
+    Fault(
+        "owned bricks: a device begins where its bricks do, rather than where those before it end",
+        "bricks.owned:Share.of_brick",
+        _all_of_its_cells,
+        (DEVICES,),
+    ),
+    Fault(
+        "bricks: back to front",
+        "bricks.grid:BrickGrid.order",
+        lambda order: lambda *given: order(*given)[::-1],
+        (IMAGE,),
+    ),
+    Fault(
+        "bricks: nothing is read around them but what interpolation needs",
+        "bricks.split:nodes_within",
+        lambda nodes: lambda *given: 0 * nodes(*given),
+        (IMAGE,),
+    ),
+    Fault(
+        "bricks: none takes what rays meet in another one that was read before",
+        "bricks.stream:Stream._found",
+        lambda found: lambda self, brick, _, *given, **more: found(self, brick, {brick}, *given, **more),
+        (CURVED,),
+    ),
+    Fault(
+        "bricks: the second march of a gradient forgets what lies in front",
+        "bricks.render:_pull_part",
+        lambda pull: lambda *given: pull(*given[:5], _without_carry(given[5]), *given[6:]),
+        (GRADIENT,),
+    ),
+    Fault(
+        "bricks: a file that changed after it was opened is read",
+        "bricks.files:FileSource._state_of",
+        lambda _: lambda self, status: (0,),
+        ("bricks/test_sources.py::test_a_file_that_is_cut_or_changed_after_opening_is_an_error[False]",),
+    ),
+]

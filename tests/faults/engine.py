@@ -1,0 +1,135 @@
+"""Faults of the march, its transforms, the fast engine and its gradients."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from . import Fault
+
+
+def shifting_again(move):
+    """`move`, after which the next transparent cell shifts the ray, too."""
+
+    def moved(march, ray, at, transparent, steps):
+        found = move(march, ray, at, transparent, steps)
+        return found if at.shift is None else replace(found, shift=at.shift)
+
+    return moved
+
+
+def whole_at_the_exit(cut):
+    """`cut`, whose cells that end just at the exit do not move with it."""
+
+    def pieces(self, cell, ray, volume):
+        first, *rest = cut(self, cell, ray, volume)
+        ends = cell.front + cell.width == ray.length
+        return eqx.tree_at(lambda c: c.width, first, jnp.where(ends, cell.width, first.width)), *rest
+
+    return pieces
+
+
+def later_by_one(visit):
+    """`visit`, by which the first visible cell is found one too late."""
+
+    def visited(self, *given):
+        found, *rest = visit(self, *given)
+        return found._replace(first=found.first + 1), *rest
+
+    return visited
+
+
+MARCH = "test_march.py::"
+FAULTS: list[Fault] = [
+    Fault(
+        "quadrature: midpoint samples at the front of cells",
+        "march:March.sample",
+        lambda _: lambda self, cell: cell.front,
+        (f"{MARCH}test_midpoint_samples_only_inside",),
+    ),
+    Fault(
+        "start: offsets of transforms are ignored",
+        "march:March.start",
+        lambda _: lambda self, ray: jnp.zeros_like(ray.length),
+        (f"{MARCH}test_cells_reach_past_the_exit_unless_they_are_cut_there",),
+    ),
+    Fault(
+        "shift: at every transparent cell",
+        "reference:move",
+        shifting_again,
+        (f"{MARCH}test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty",),
+    ),
+    Fault(
+        "shift: segments are taken as a whole although rays may still shift",
+        "engine.batch:Job.shifts",
+        lambda _: lambda self, at: jnp.zeros_like(at.finished),
+        (f"{MARCH}test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty",),
+    ),
+    Fault(
+        "stop: rays end while their transmittance is high",
+        "transforms.early_termination:EarlyTermination.stop",
+        lambda _: lambda self, stopped, transmittance: stopped | (transmittance >= self.opacity_left),
+        (f"{MARCH}test_early_termination_stops_where_little_is_left",),
+    ),
+    Fault(
+        "stride: what lies in front does not count",
+        "march:March.strides",
+        lambda f: lambda self, *to: f(self, *to[:4], jnp.ones_like(to[4]), *to[5:]),
+        ("transforms/test_adaptive_sampling.py::test_runs_are_the_same_however_a_ray_comes_to_them",),
+    ),
+    Fault(
+        "adaptive sampling: looked up where a run begins, not in its middle",
+        "march:Run.middle",
+        lambda _: property(lambda run: run.front),
+        ("transforms/test_adaptive_sampling.py::test_the_error_of_a_run_is_that_of_a_window_that_holds_it",),
+    ),
+    Fault(
+        "cut: the last cell reaches past the exit",
+        "transforms.alpha_correction:AlphaCorrection.cut",
+        lambda _: lambda self, cell, ray, volume: (cell,),
+        ("transforms/test_alpha_correction.py::test_a_cell_is_cut_at_the_exit",),
+    ),
+    Fault(
+        "cut: a cell that ends at the exit does not move with it",
+        "transforms.alpha_correction:AlphaCorrection.cut",
+        whole_at_the_exit,
+        ("transforms/test_alpha_correction.py::test_the_gradient_by_an_exit_at_the_end_of_a_cell",),
+    ),
+    Fault(
+        "jitter: pixels of a row have the same number",
+        "transforms.jitter:Noise.__call__",
+        lambda f: lambda self, pixel, dtype: f(self, (0 * pixel[0], pixel[1]), dtype),
+        ("transforms/test_jitter.py::test_numbers_are_uniform_and_depend_on_seed_stream_and_pixel_alone",),
+    ),
+    Fault(
+        "clip: cells whose middle is cut away are taken as empty",
+        "transforms.clip:HalfSpace.over",
+        lambda f: lambda self, grid: (f(self, grid)[0], 0 * f(self, grid)[1]),
+        ("transforms/test_clip.py::test_no_cell_that_holds_anything_seen_is_taken_as_empty",),
+    ),
+    Fault(
+        "NaN: a parameter that is NaN gives a finite image",
+        "engine.image:fault_of",
+        lambda _: lambda scene: jnp.zeros((), bool),
+        ("transforms/test_clip.py::test_nan_in_a_plane_shows",),
+    ),
+    Fault(
+        "leap: one cell too far",
+        "engine.batch:_leap",
+        lambda f: lambda *given: f(*given) + 1,
+        ("transforms/test_space_leaping.py::test_no_ray_misses_what_is_seen",),
+    ),
+    Fault(
+        "leap: the second march begins one cell too late",
+        "engine.batch:VisibleRangeRecorder.visit",
+        later_by_one,
+        ("engine/test_gradients.py::test_leaps_show_in_no_image_and_no_gradient",),
+    ),
+    Fault(
+        "vmap: the batch in reverse order",
+        "_util.xla:_batch",
+        lambda f: lambda *given: jax.tree.map(lambda leaf: leaf[::-1], f(*given)),
+        ("engine/test_gradients.py::test_vmap_is_a_loop_for_image_and_gradient",),
+    ),
+]

@@ -1,0 +1,89 @@
+"""Faults of fits, plans and metrics."""
+
+from dataclasses import replace
+
+from . import Fault
+
+
+def last_is_best(step):
+    def faulty(self, *scene):
+        run = step(self, *scene)
+        return replace(run, best=run.seen)
+
+    return faulty
+
+
+FAULTS: list[Fault] = [
+    Fault(
+        "fit: the last point is given back, not the best",
+        "fitting.driver:_Run.step",
+        last_is_best,
+        ("fitting/test_fit.py::test_what_diverges_gives_back_the_best_seen",),
+    ),
+    Fault(
+        "fit: the covariance is that of the free numbers",
+        "fitting.constraints:Free.moved",
+        lambda moved: lambda self, free: list(free),
+        ("fitting/test_fit.py::test_parameters_and_covariance_are_those_of_scipy",),
+    ),
+    Fault(
+        "fit: checksums are of nothing, so that damaged checkpoints are used",
+        "fitting.checkpoints:_checksum_line",
+        lambda line: lambda content: line(type(content)()),
+        ("fitting/test_fit.py::test_a_damaged_checkpoint_is_named_and_the_one_before_it_used",),
+    ),
+    Fault(
+        "fit: images are not blurred",
+        "fitting.residuals:_blurring",
+        lambda blurring: lambda n, sigma: blurring(n, 0 * sigma),
+        ("fitting/test_fit.py::test_images_are_blurred_as_by_scipy",),
+    ),
+    Fault(
+        "probe geometry: samples lie behind the motor axis",
+        "transforms.toroidal_map:ToroidalMap.nearest_to_axis",
+        lambda nearest: property(lambda self: nearest.fget(self) + self.b),
+        ("fitting/test_probe_geometry.py::test_every_free_number_is_a_valid_probe_with_a_finite_slope",),
+    ),
+    Fault(
+        "choice: the least held-out loss decides",
+        "fitting.held_out:HeldOut.excess",
+        lambda excess: lambda self, *residuals: (excess(self, *residuals)[0], 0.0),
+        ("fitting/test_choice.py::test_the_truth_is_chosen_in_nine_of_ten_noisy_trials",),
+    ),
+    Fault(
+        "choice: larger models start anew",
+        "fitting.candidates:_Split.__call__",
+        lambda split: lambda self, found: split(self, self.coarse.parts),
+        ("fitting/test_choice.py::test_materials_share_what_they_have_in_common",),
+    ),
+    Fault(
+        "plan: an error that is known from a part of the image is taken as it is",
+        "planning.probe:CONFIDENT",
+        lambda errors: 0.0,
+        ("planning/test_probe.py::test_from_a_part_the_error_is_a_bound_in_most_cases",),
+    ),
+    Fault(
+        "plan: rounded voxels are kept whatever they change",
+        "planning.storage:stored",
+        lambda stored: lambda probe, setting, march, allowed: stored(probe, setting, march, 1.0),
+        ("planning/test_storage.py::test_type_of_the_voxels",),
+    ),
+    Fault(
+        "plan: faces that a clip cuts are not looked at",
+        "transforms.clip:_Clipped.visible_at_faces",
+        lambda faces: lambda self, visible: faces(self, visible)[:6],
+        ("planning/test_plan.py::test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible",),
+    ),
+    Fault(
+        "scan conversion: the grid begins at the middle of the sector",
+        "scan_conversion:_grid",
+        lambda grid: lambda probe, *how: (grid(probe, *how)[0], probe.center),
+        ("test_scan_conversion.py::test_the_grid_encloses_the_sector_and_is_centred_on_it",),
+    ),
+    Fault(
+        "wood grain: what noise has by chance counts",
+        "metrics:_share_of_largest",
+        lambda share: lambda m, n: 0.0,
+        ("test_metrics.py::test_white_noise_is_no_structure",),
+    ),
+]

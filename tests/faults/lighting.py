@@ -1,0 +1,90 @@
+"""Faults of light, and path tracing."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from . import Fault
+
+
+PHOTONS, SHADING = "lighting/test_photons.py::", "lighting/test_shading.py::"
+PHONG, PATHS = "lighting/test_phong.py::", "path_tracing/test_path_trace.py::"
+
+
+def without_direction(found):
+    colors, of_sample, total = found
+    return colors, of_sample._replace(direction=jax.tree.map(jnp.zeros_like, of_sample.direction)), total
+
+
+def between_ends(values, extinction, low, high):
+    return jnp.maximum(jnp.interp(low, values, extinction), jnp.interp(high, values, extinction))
+
+
+FAULTS: list[Fault] = [
+    Fault(
+        "light: what lies behind a photon does not hide it",
+        "lighting.photons:TemplateShading._visible",
+        lambda f: (
+            lambda self, offset, extinctions: f(
+                self, offset, [extinctions[0]] + [0 * e for e in extinctions[1:]]
+            )
+        ),
+        (f"{PHOTONS}test_each_step_is_that_of_the_paper",),
+    ),
+    Fault(
+        "light: a material shines by itself at its soft edge",
+        "lighting.photons:_matter",
+        lambda f: sum,
+        (
+            f"{PHOTONS}test_what_is_no_material_keeps_its_colour_and_materials_do_not_shine_by_themselves[soft]",
+        ),
+    ),
+    Fault(
+        "light: the loop over photons ends before the cutoff is reached",
+        "lighting.photons:TemplateShading.thresholds",
+        lambda f: lambda self, **how: 2 * f(self, **how),
+        (f"{SHADING}test_samples_shaded_together_are_shaded_as_each_alone[hard]",),
+    ),
+    Fault(
+        "light: photons fade out where the threshold is on whole levels",
+        "lighting.threshold:Threshold.fades",
+        lambda f: property(lambda self: True),
+        ("lighting/test_template.py::test_a_threshold_on_levels_gives_the_papers_count",),
+    ),
+    Fault(
+        "light: baked while something is traced, it is kept as tracers",
+        "lighting.scatterers:computed_now",
+        lambda f: lambda function, *of: function(*of),
+        ("lighting/test_baked.py::test_light_that_was_baked_inside_a_program_serves_outside",),
+    ),
+    Fault(
+        "shading: directions of samples have no cotangent under replay",
+        "engine.shading_gradient:_chunk_vjp",
+        lambda f: lambda *of: without_direction(f(*of)),
+        (f"{SHADING}test_images_are_those_of_the_reference_and_gradients_those_of_central_differences",),
+    ),
+    Fault(
+        "Phong: samples are shaded where their cells begin",
+        "engine.inline_shading:_sample",
+        lambda f: lambda pipeline, ray, cell: f(pipeline, ray, replace(cell, width=0 * cell.width)),
+        (f"{PHONG}test_images_are_those_of_the_reference",),
+    ),
+    Fault(
+        "path tracing: a majorant overlooks control points between its ends",
+        "_util.piecewise_linear:upper_bound_between",
+        lambda f: between_ends,
+        ("path_tracing/test_tracking.py::test_no_extinction_exceeds_its_majorant",),
+    ),
+    Fault(
+        "path tracing: what survives Russian roulette is not raised",
+        "path_tracing.walks:_after_roulette",
+        lambda f: (
+            lambda throughput, uniform: tuple(
+                jnp.where(jnp.maximum(jnp.maximum(*throughput[:2]), throughput[2]) > 0.25 * uniform, c, 0)
+                for c in throughput
+            )
+        ),
+        (f"{PATHS}test_light_scattered_many_times_is_reflected_as_by_chandrasekhar",),
+    ),
+]

@@ -1,0 +1,107 @@
+"""Faults of volumes, cameras, transfer functions, spaces and compositing."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from . import Fault
+
+
+def _from_base(enter):
+    """`enter`, with distances from where a ray of a far camera is restarted, and not from its origin."""
+
+    def entered(space, origin, direction, pixel):
+        ray = enter(space, origin, direction, pixel)
+        toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
+        return eqx.tree_at(lambda r: r.t_in, ray, ray.t_in - jnp.maximum(toward - space.diagonal / 2, 0))
+
+    return entered
+
+
+def _without_bulge(box_of):
+    """`Box._of`, whose last argument is the bulge."""
+
+    def of(cls, *given: Any):
+        return box_of.__func__(cls, *given[:-1], jnp.zeros_like(given[-1]))
+
+    return classmethod(of)
+
+
+FAULTS: list[Fault] = [
+    Fault(
+        "owned bricks: what is behind is not dimmed",
+        "compositing:Over.joined",
+        lambda _: lambda self, front, back: jax.tree.map(jnp.add, front, back),
+        ("test_compositing.py::test_weightings_sum_cells_as_numpy_does",),
+    ),
+    Fault(
+        "replay: wrong sign of what is behind a sample",
+        "compositing:Over.slope",
+        lambda f: lambda self, alpha, after, worth, behind: f(self, alpha, after, worth, -behind),
+        ("test_compositing.py::test_slopes_are_those_of_jax",),
+    ),
+    Fault(
+        "maximum: leaps over what may win, since it is invisible",
+        "projections:Maximum.occupied",
+        lambda _: lambda self, transfer, blocks: transfer.visible(blocks),
+        ("test_compositing.py::test_leaps_are_over_what_cannot_win_alone",),
+    ),
+    Fault(
+        "average: cells weigh their opacity",
+        "projections:Average.weight",
+        lambda _: lambda self, alpha, before: alpha,
+        ("test_compositing.py::test_weightings_sum_cells_as_numpy_does",),
+    ),
+    Fault(
+        "isosurface: no derivative by its value",
+        "isosurface:Isosurface._implicit",
+        lambda _: lambda self, sampler, root: root,
+        ("test_isosurface.py::test_a_plateau_on_the_value_leaves_its_gradient",),
+    ),
+    Fault(
+        "entry: distances from a ray's base point, and not from its origin",
+        "space:enter",
+        _from_base,
+        ("test_space.py::test_entry_and_length_are_right",),
+    ),
+    Fault(
+        "toroidal map: the first gap of a ray only",
+        "transforms.sector_faces:GAPS",
+        lambda _: 1,
+        ("transforms/test_toroidal_map.py::test_rays_enter_and_leave_where_dense_samples_do[twice]",),
+    ),
+    Fault(
+        "empty space: beam boxes without the bulge between their corner rays",
+        "beams:Box._of",
+        _without_bulge,
+        ("test_beams.py::test_a_box_holds_every_ray_of_its_beam",),
+    ),
+    Fault(
+        "empty space: box queries leave out the last cells",
+        "occupancy:Sums.any_between",
+        lambda f: (
+            lambda self, first, last: f(self, first, tuple(map(jnp.maximum, first, (n - 1 for n in last))))
+        ),
+        ("test_occupancy.py::test_box_queries_agree_with_direct_inspection",),
+    ),
+    Fault(
+        "slopes of blocks: per node, not per world length",
+        "occupancy:SlopeRanges.magnitudes",
+        lambda f: property(lambda self: f.fget(eqx.tree_at(lambda s: s.spacing, self, jnp.ones(3)))),
+        ("test_transfer2d.py::test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block[float32]",),
+    ),
+    Fault(
+        "transfer: a classifier of one's own is not asked",
+        "transfer:TransferFunction._looks_up_rows",
+        lambda _: property(lambda self: True),
+        ("test_transfer.py::test_nothing_is_proven_of_a_classifier_of_ones_own",),
+    ),
+    Fault(
+        "integrated: the mean of colours is not weighted by the extinction",
+        "_util.piecewise_means:_classified",
+        lambda f: lambda means, plain: (plain[:3], f(means, plain)[1]),
+        ("test_preintegration.py::test_means_are_integrals",),
+    ),
+]

@@ -1,0 +1,90 @@
+"""Samples at given points of a scene, shaded without an image around them."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvol as jv
+from jaxvol._util.vec3 import apart
+from jaxvol.lighting.shading import Sample, Shader, Surroundings
+from jaxvol.space import Affine
+
+
+def surroundings(volume, transfer):
+    return Surroundings(volume, transfer, Affine(volume))
+
+
+def sample_at(around, point, transmittance, pixel, direction=(0.0, 0.0, 1.0)):
+    """The sample of a ray in this direction at a world point."""
+    point = apart(point)
+    measured = around.classification.at(around.space.coordinate(point))
+    color, extinction = around.classification.classify(measured)
+    toward = apart(jnp.asarray(direction, extinction.dtype))
+    return Sample(point, toward, measured, color, extinction, transmittance, (pixel[0], pixel[1]))
+
+
+def shaded(lighting, volume, transfer, points, transmittance=None, pixels=None, *, together=False):
+    """The shaded colours of many points, each alone, or `together` as engines shade them, in twice the time
+    to compile."""
+    around = surroundings(volume, transfer)
+    transmittance = jnp.ones(len(points)) if transmittance is None else transmittance
+    pixels = jnp.zeros((len(points), 2), jnp.int32) if pixels is None else pixels
+    shader = Shader(lighting.shading(around), around)
+    samples = jax.vmap(partial(sample_at, around))(points, transmittance, pixels)
+    return jnp.stack((shader if together else jax.vmap(shader))(samples), axis=-1)
+
+
+program = eqx.filter_jit(shaded)
+
+
+def colors_of(lighting, volume, transfer, points, transmittance=1.0, pixels=None):
+    """The same of up to 64 points, by one program."""
+    count = len(points)
+    points = np.resize(np.asarray(points, np.float32), (64, 3))
+    pixels = np.resize(np.asarray([(0, 0)] if pixels is None else pixels, np.int32), (64, 2))
+    transmittance = np.resize(np.float32(transmittance), 64)
+    given = (jnp.asarray(each) for each in (points, transmittance, pixels))
+    return np.asarray(program(lighting, volume, transfer, *given))[:count]
+
+
+def central_difference(value, scene, where, direction, step):
+    """Slope of a function of a scene along a direction of one of its leaves."""
+    ends = [value(eqx.tree_at(where, scene, where(scene) + sign * step * direction)) for sign in (1, -1)]
+    return float(ends[0] - ends[1]) / (2 * step)
+
+
+def check_gradient(value_and_gradient, scene, leaves, *, step, rtol, atol=0.0, least=0.0):
+    """The gradient by each leaf is the central difference along a random direction of it; the function's
+    value comes from the same program. `least`: slopes are at least so large, so that something is
+    compared."""
+    random, gradient = np.random.default_rng(0), value_and_gradient(scene)[1]
+    for name, where in leaves.items():
+        along = jnp.asarray(random.normal(size=where(scene).shape), where(scene).dtype)
+        expected = central_difference(lambda s: value_and_gradient(s)[0], scene, where, along, step)
+        assert abs(expected) > least, (name, expected)
+        slope = float(jnp.vdot(where(gradient), along))
+        np.testing.assert_allclose(slope, expected, rtol=rtol, atol=atol, err_msg=name)
+
+
+def image_of_reference(volume, transfer, camera, march, lighting):
+    """The image by the reference engine, ray by ray."""
+    origins, directions = camera.rays()
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, 0))
+    @partial(jax.vmap, in_axes=(0, None))
+    def image(column, row):
+        line = volume, transfer, origins[row, column], directions[row, column], march
+        return jv.render_ray_reference(*line, pixel=(column, row), lighting=lighting).rgba
+
+    return np.asarray(image(*(np.arange(n) for n in camera.size)))
+
+
+def in_double(scene):
+    """With float64 leaves, voxels among them. Made where 64-bit types are enabled."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float64) if eqx.is_inexact_array(leaf) else leaf, scene
+    )

@@ -1,0 +1,165 @@
+"""Is a bad argument of a light, a material, a template or a lighting named, and what would do?"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.lighting import (
+    ConstantLight,
+    Deferred,
+    DirectionalLight,
+    HeadLight,
+    Material,
+    Phong,
+    PointLight,
+    ScattererTemplate,
+    ScattererTemplates,
+    material,
+    scatterer_template,
+    scatterer_templates,
+    template_capacity,
+)
+from jaxvol.lighting.lights import lights_of
+from jaxvol.lighting.materials import materials_of
+from jaxvol.lighting.threshold import Threshold
+
+from .samples import shaded
+
+
+HALF, FAINT, SUN = Material(0.5, 1.0), Material(0.031, 1.0), DirectionalLight((0, 0, -1.0))
+VOLUME, TRANSFER = jv.Volume(np.zeros((9, 9, 9), np.float32)), jv.colormap("gray", (0.0, 1.0))
+PAIR = ScattererTemplate(jnp.zeros((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
+
+
+def grown(material=HALF, **how):
+    return lambda: scatterer_template(material, 0, **how)
+
+
+def lit(materials: Any = HALF, lights: Any = SUN, **how):
+    return lambda: ScattererTemplates(materials, lights, **how)
+
+
+BAD = {
+    # templates
+    "packets": (grown(packets=0), "packets must be an integer of at least 1"),
+    "threshold 0": (grown(threshold=0.0), "threshold must be"),
+    "threshold 1": (grown(threshold=1.0), "threshold must be"),
+    "threshold on": (grown(threshold_on="tree"), "threshold_on must be one of photon, level; got 'tree'"),
+    "energy": (grown(energy="lost"), "energy must be one of conserving, print"),
+    "flights": (grown(flights=False), 'flights=False requires energy="print'),
+    "no angle": (grown(critical_angle=0.0), "critical_angle must be"),
+    "wide angle": (grown(critical_angle=91.0), "critical_angle must be"),
+    "opacity too low": (
+        grown(FAINT),
+        "opacity 0.031 leaves no photon above threshold=0.01.*packets=4.*a threshold of at most 0.00775",
+    ),
+    "opacity too low, levels given": (grown(FAINT, levels=3), "opacity 0.031 leaves no photon"),
+    "one opacity too low": (
+        lambda: scatterer_templates([HALF, Material(0.2, 1.0)], 0, threshold=0.1, levels=2),
+        "opacity 0.2 leaves no photon above threshold=0.1",
+    ),
+    "opacity 0": (grown(Material(0.0, 1.0)), "opacity must be above 0"),
+    "endless": (grown(Material(1.0, 1.0), energy="printed"), "opacity must be below 1"),
+    "traced": (
+        lambda: jax.eval_shape(lambda a: scatterer_template(Material(a, 1.0), 0).intensity, 0.5),
+        "levels must be given where opacity is traced",
+    ),
+    "a tree too large": (
+        grown(threshold=1e-9, levels=40),
+        "templates.*levels=40.*threshold.*asks for .* GiB of memory, and the device has",
+    ),
+    "too many templates": (lambda: scatterer_templates(HALF, 0, count=10**9), "1000000000 templates.*asks"),
+    "count": (lambda: scatterer_templates(HALF, 0, count=0), "count must be an integer of at least 1"),
+    "capacity": (lambda: template_capacity(FAINT, threshold_on="tree"), "threshold_on must be one of"),
+    "photons kept": (lambda: PAIR.brightest(0), "photons must be an integer"),
+    # materials
+    "opacity below 0": (lambda: Material(-0.1, 1.0), r"opacity must be in \[0, 1\]; got -0.1"),
+    "opacity above 1": (lambda: Material(1.1, 1.0), r"opacity must be in \[0, 1\]"),
+    "no path": (lambda: Material(0.5, 0.0), "mean_free_path must be greater than 0"),
+    "an endless path": (lambda: Material(0.5, np.inf), "mean_free_path must be finite"),
+    "no index": (lambda: Material(0.5, 1.0, 0.0), "refractive_index must be greater than 0"),
+    "values": (lambda: Material(0.5, 1.0, values=(2, 2)), "values must be .* low < high"),
+    "label": (lambda: Material(0.5, 1.0, label=-1), "label must be an integer of at least 0"),
+    "both": (lambda: Material(0.5, 1.0, values=(0, 1), label=1), "values and label must not both be given"),
+    "density": (lambda: Material.from_scatterers(0.5, 0.0, 1.0), "density must be greater than 0"),
+    "cross_section": (lambda: Material.from_scatterers(0.5, 1.0, 0.0), "cross_section must be greater than"),
+    "preset": (lambda: material("fat"), "name must be one of skin, muscle, bone; got 'fat'"),
+    "millimetre": (lambda: material("skin", millimetre=0.0), "millimetre must be greater than 0"),
+    "no materials": (lambda: materials_of([]), "materials must hold at least one Material"),
+    "no material": (lambda: materials_of([HALF, "skin"]), "materials must hold jaxvol materials; got 'skin'"),
+    # lights
+    "direction": (lambda: DirectionalLight((0, 0, 0)), "direction must not have length 0"),
+    "direction's shape": (lambda: DirectionalLight((0, 1)), "direction must have shape"),
+    "irradiance": (lambda: DirectionalLight((0, 0, 1), (1, 1, -1)), "irradiance must not be negative"),
+    "irradiance of a head light": (lambda: HeadLight((1, -1, 1)), "irradiance must not be negative"),
+    "position": (lambda: PointLight((0, 0, np.nan)), "position must be finite"),
+    "intensity": (lambda: PointLight((0, 0, 0), (-1, 1, 1)), "intensity must not be negative"),
+    "radiance": (lambda: ConstantLight((1, 1)), "radiance must have shape"),
+    "dark radiance": (lambda: ConstantLight((1, -1, 1)), "radiance must not be negative"),
+    "no lights": (lambda: lights_of(()), "lights must be a light or a tuple"),
+    "no light": (lambda: lights_of((ConstantLight(), 3)), "lights must hold jaxvol lights.*got 3"),
+    # lighting by templates
+    "templates": (lit(templates=0), "templates must be an integer"),
+    "photons": (lit(photons=0), "photons must be an integer"),
+    "choice": (lit(choice="sample"), "choice must be one of pixel, material; got 'sample'"),
+    "occlusion": (lit(occlusion="some"), "occlusion must be one of soft, h"),
+    "reach": (lit(reach=(1.0, 2.0)), "reach must be multiples above 1"),
+    "reach's order": (lit(reach=(4.0, 2.0)), "reach must be multiples"),
+    "cutoff": (lit(cutoff=1.0), "cutoff must be"),
+    "seed": (lit(seed=-1), "seed must be an integer"),
+    "baked": (lit(baked=1), "baked must be an integer of at least 2"),
+    "a fine grid": (
+        lambda: lit(baked=10**5)().prepared(VOLUME, TRANSFER, jv.March(0.1)),
+        "nodes for baked=100000.*asks for .* GiB",
+    ),
+    "many templates": (lambda: lit(templates=10**9)().grown(blend=False), "1000000000 templates.*asks for"),
+    "faint": (lit(FAINT), "opacity 0.031 leaves no photon"),
+    "given": (lit([HALF, HALF], given=PAIR), "templates of 2 materials"),
+    "lights": (lit(lights=()), "lights must be a light"),
+    "materials": (lit(()), "materials must hold at least one Material"),
+    "labels": (
+        lambda: jax.eval_shape(
+            lambda points: shaded(lit(Material(0.5, 1.0, label=1), given=PAIR)(), VOLUME, TRANSFER, points),
+            jnp.zeros((1, 3)),
+        ),
+        "labels are needed here",
+    ),
+    # other lightings
+    "lighting": (
+        lambda: jv.render(VOLUME, TRANSFER, jv.Camera.looking_at(VOLUME), jv.March(0.1), lighting=3),
+        "lighting must be None or a Lighting; got 3",
+    ),
+    "deferred": (lambda: Deferred(3), "lighting must be a Lighting, such as ScattererTemplates; got 3"),
+    "constant light": (lambda: Phong(ConstantLight()), "lights must hold jaxvol lights.*HeadLight"),
+    "Phong without lights": (lambda: Phong(()), "lights must be"),
+    "Phong by a name": (lambda: Phong("sun"), "lights must be"),
+    "ambient": (lambda: Phong(ambient=-0.1), "ambient must not be negative"),
+    "diffuse": (lambda: Phong(diffuse=np.nan), "diffuse must be finite"),
+    "specular": (lambda: Phong(specular=(1, 2)), "specular must have shape"),
+    "specular power": (lambda: Phong(specular_power=0), "specular_power must be positive"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_the_threshold_that_is_advised_leaves_photons():
+    assert Threshold(value=0.00775).levels(FAINT) > 1
+
+
+def test_defaults():
+    """Of Phong VTK's. By templates, faint photons are left out under hard occlusion alone, as published."""
+    phong = Phong()
+    values = phong.ambient, phong.diffuse, phong.specular, phong.specular_power
+    assert [float(value) for value in values] == pytest.approx([0.1, 0.7, 0.2, 10])
+    assert isinstance(phong.lights[0], HeadLight)
+    assert lit(occlusion="hard")().cutoff == np.float32(0.02)
+    assert lit()().cutoff is None

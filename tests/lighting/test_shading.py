@@ -1,0 +1,252 @@
+"""Are samples shaded as a lighting says: in groups, in images, once per ray; and with which gradient?
+
+By a lighting with all that the interface has, which compiles in less time than those that users have.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol._util.vec3 import along, apart, plus, scaled
+from jaxvol.lighting import (
+    ConstantLight,
+    Deferred,
+    DirectionalLight,
+    Lighting,
+    Material,
+    ScattererTemplate,
+    ScattererTemplates,
+)
+from jaxvol.lighting.shading import TOGETHER, Shader, Shading, terms_above
+
+from ..scenes import around, in_float64, scaled_phantom, slow, soft_transfer
+from .samples import check_gradient, image_of_reference, in_double, program, sample_at, shaded, surroundings
+
+
+class Fog(Lighting):
+    """What lies at nine places toward the light weakens it, and adds its colour, the less of it the less is
+    seen of the sample."""
+
+    toward: Any
+    density: Any
+
+    def shading(self, around):
+        return FogShading(self)
+
+
+class FogShading(Shading):
+    how: Fog
+
+    @property
+    def terms(self):
+        return TOGETHER + 1
+
+    @property
+    def has_dark_samples(self):
+        return True
+
+    def thresholds(self, *, derivative=False):
+        return 0.05 + jnp.arange(self.terms) / 20
+
+    def about(self, around, sample):
+        return plus(
+            apart(self.how.toward), scaled(sample.direction, -0.02 * jnp.ones_like(sample.extinction))
+        )
+
+    def term(self, around, sample, shared, number) -> Any:
+        weight = jnp.maximum(sample.transmittance - self.thresholds()[number], 0) ** 2
+        point = along(sample.point, shared, 1 + number.astype(weight.dtype))
+        [read] = around.fetched([point])
+        color, _ = around.classification.classify(read)
+        return weight * around.classified(point, read).extinction, scaled(color, weight)
+
+    def color(self, sample, shared, sums):
+        depth, inner = sums
+        return plus(scaled(sample.color, jnp.exp(-self.how.density * depth)), scaled(inner, depth / 5))
+
+
+# ---------------------------------------------------------------- images
+
+LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)
+FOG = Fog(np.float32([0.03, 0.06, 0.05]), np.float32(0.7))
+
+
+def scene_of():
+    """With empty space that is leapt over, and samples behind little transmittance."""
+    volume = scaled_phantom("sphere")
+    return volume, soft_transfer(0.1), around(volume), jv.March(0.07, LEAPING)
+
+
+def test_images_are_those_of_the_reference():
+    scene = scene_of()
+    found = np.asarray(jv.render(*scene, lighting=FOG).rgba)
+    opacity = found[..., 3]
+    assert np.mean(opacity == 0) > 0.2
+    assert np.sum(opacity > 0.9) > 5  # their last samples are dark
+    np.testing.assert_allclose(found, image_of_reference(*scene, FOG), atol=2e-5)
+
+
+def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
+    """Of the ray's mean colour, which nothing hides."""
+    scene = volume, transfer, camera, _ = scene_of()
+    found, unlit = (jv.render(*scene, lighting=lighting) for lighting in (Deferred(FOG), None))
+    opacity = np.asarray(unlit.rgba[..., 3:])
+    rows, columns = np.nonzero(opacity[..., 0])
+    assert 0 < len(rows) < opacity.size
+    origins, directions = (np.asarray(each)[rows, columns] for each in camera.rays())
+
+    @jax.jit
+    def once(points, directions, colors):
+        around, zero = surroundings(volume, transfer), jnp.zeros(2, jnp.int32)
+
+        def sample(point, direction, color):
+            of_point = sample_at(around, point, jnp.ones(()), zero, direction)
+            return of_point._replace(color=apart(color))
+
+        shader = Shader(FOG.shading(around), around)
+        return jnp.stack(shader(jax.vmap(sample)(points, directions, colors)), axis=-1)
+
+    points = origins + np.asarray(unlit.depth)[rows, columns][:, None] * directions
+    colors = np.asarray(unlit.rgba[..., :3])[rows, columns] / opacity[rows, columns]
+    expected = np.asarray(unlit.rgba).copy()
+    expected[rows, columns, :3] = opacity[rows, columns] * once(points, directions, colors)
+    assert np.abs(expected - unlit.rgba).max() > 0.1
+    np.testing.assert_allclose(found.rgba, expected, atol=5e-5)
+
+
+@pytest.mark.parametrize("lighting", [FOG, Deferred(FOG)])
+def test_there_is_a_gradient_of_a_lit_image(lighting):
+    """Its values are checked by slow tests, here and of templates, since it takes a minute to compile."""
+
+    def loss(scene):
+        return jnp.sum(jv.render(*scene[:4], lighting=scene[4]).rgba)
+
+    scene = (*scene_of(), lighting)
+    gradient = eqx.filter_eval_shape(eqx.filter_grad(loss), scene)
+    expected = eqx.filter(scene, eqx.is_inexact_array)
+    assert jax.tree.map(jnp.shape, gradient) == jax.tree.map(jnp.shape, expected)
+
+
+LEAVES = {
+    "direction of the light": lambda s: s[4].lighting.toward,
+    "density": lambda s: s[4].lighting.density,
+    "colors": lambda s: s[1].colors,
+    "extinction": lambda s: s[1].extinction,
+    "voxels": lambda s: s[0].data,
+    "position": lambda s: s[2].position,
+    "step": lambda s: s[3].step,
+}
+
+
+@pytest.mark.slow
+def test_gradients_of_deferred_light_match_central_differences():
+    """Also where rays see nothing."""
+    with in_float64():
+        volume, transfer, camera, _ = scene_of()
+        # no voxel at a control point, where there would be a kink, and no extinction that could fall below 0
+        volume = eqx.tree_at(lambda v: v.data, volume, 0.02 + 0.93 * np.asarray(volume.data))
+        transfer = jv.TransferFunction(
+            transfer.values, transfer.colors, np.asarray(transfer.extinction) + 0.1
+        )
+        scene = in_double((volume, transfer, camera, jv.March(0.07, LEAPING[:2]), Deferred(FOG)))
+        weights = jnp.asarray(np.random.default_rng(5).normal(size=(16, 20, 4)))
+
+        def loss(scene):
+            return jnp.sum(jv.render(*scene[:4], lighting=scene[4]).rgba * weights)
+
+        program = eqx.filter_jit(eqx.filter_value_and_grad(loss))
+        check_gradient(program, scene, LEAVES, step=2e-8, rtol=1e-5, atol=1e-6, least=1e-3)
+
+
+# ---------------------------------------------------------------- many samples together
+
+RANDOM = np.random.default_rng(0)
+PHOTONS = ScattererTemplate(
+    jnp.asarray(RANDOM.normal(0, 0.15, (1, 2, 11, 3)), jnp.float32),
+    jnp.asarray(np.append(RANDOM.uniform(0.02, 0.5, (1, 2, 10)), np.zeros((1, 2, 1)), axis=-1), jnp.float32),
+)
+"""Two templates, which are not sorted, with room for a photon that neither holds."""
+
+
+def templates(cutoff, **how):
+    lights = DirectionalLight((0.6, 0.8, -1.0)), ConstantLight()
+    how = {"reach": (), "given": PHOTONS, **how}
+    return ScattererTemplates(Material(0.5, 0.15, 1.4), lights, cutoff=cutoff, **how)
+
+
+def inside(volume, count=32):
+    """Points inside the sphere, and a pixel for each."""
+    low, high = (np.asarray(end) for end in volume.corners)
+    points = np.random.default_rng(1).uniform(0.3, 0.7, (count, 3)) * (high - low) + low
+    return jnp.asarray(points, jnp.float32), jnp.asarray(np.arange(2 * count, dtype=np.int32).reshape(-1, 2))
+
+
+@pytest.mark.parametrize("occlusion", ["hard", *slow("soft")])
+def test_samples_shaded_together_are_shaded_as_each_alone(occlusion):
+    """In groups that need all photons, some of them, and none."""
+    volume, lighting = scaled_phantom("sphere"), templates(0.03, occlusion=occlusion)
+    points, pixels = inside(volume)
+
+    @jax.jit
+    def both(transmittance):
+        rest = volume, soft_transfer(0.1), points, transmittance, pixels
+        return [shaded(lighting, *rest, together=together) for together in (True, False)]
+
+    for bright in (1.0, 0.3, 0.1, 0.05):
+        found, expected = both(jnp.asarray(bright * np.linspace(0.2, 1, 32), jnp.float32))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert (np.max(found) > 0.01) == (bright > 0.05)
+
+
+class Counting(FogShading):
+    """Terms of 1 each."""
+
+    def term(self, around, sample, shared, number):
+        return jnp.ones_like(sample.extinction)
+
+    def color(self, sample, shared, sums):
+        return sums, sums, sums
+
+
+class CountedTerms(Lighting):
+    def shading(self, around):
+        return Counting(FOG)
+
+
+def test_the_loop_ends_where_none_of_the_samples_needs_more():
+    """Of nine terms, which are computed by five and four: the second group is not filled up."""
+    volume, transfer = scaled_phantom("sphere"), soft_transfer(0.1)
+    points, pixels = inside(volume)
+    for most, expected in ((0.04, 0), (0.06, 5), (0.24, 5), (0.33, 9), (np.nan, 9)):
+        transmittance = jnp.asarray(np.linspace(0, most, 32), jnp.float32)
+        found = program(CountedTerms(), volume, transfer, points, transmittance, pixels, together=True)
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("blend", [False, True])
+def test_the_photons_that_are_needed_are_those_above_the_cutoff(blend):
+    """The last one that is bright enough in any template, and all before it. Blended, each holds half of its
+    intensity, and is skipped as it would be alone."""
+    volume = scaled_phantom("sphere")
+
+    @eqx.filter_jit
+    def needed(lighting, transmittance, derivative):
+        shading = lighting.shading(surroundings(volume, soft_transfer()))
+        thresholds = shading.thresholds(derivative=derivative)
+        return terms_above(thresholds, transmittance), shading.templates.intensity
+
+    for transmittance in (1.0, 0.5, 0.1, 0.05):
+        several = jnp.asarray([0.0, transmittance], jnp.float32)
+        count, intensity = needed(templates(0.03, blend=blend), several, False)
+        shown = transmittance * np.asarray(intensity) * (2 if blend else 1) >= 0.03
+        assert count == max(np.nonzero(shown)[-1], default=-1) + 1
+    every = PHOTONS.intensity.size if blend else 11
+    assert needed(templates(0.03, blend=blend), jnp.asarray([0.0, jnp.nan]), False)[0] == every
+    if not blend:
+        assert needed(templates(0.0), several, False)[0] == 10
+        assert needed(templates(0.0), several, True)[0] == 11  # as its intensity may be differentiated

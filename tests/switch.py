@@ -1,0 +1,197 @@
+"""A transform that a traced number turns on or off, so that all subsets of transforms share one program.
+
+`switch(transform, on)` answers the seams that the transform overrides: as it does where `on` is true, and by
+the defaults elsewhere. Programs of a march with it contain the transform whether it is on or not: that a
+transform which is not asked for costs nothing is for static tests to show.
+"""
+
+from functools import cache, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from hypothesis import strategies as st
+from jaxtyping import Array, Bool
+
+import jaxvol as jv
+from jaxvol.march import EmptySpaceIndex
+from jaxvol.space import Space
+
+from .scenes import BOX, PLANE
+
+
+def either(on, new, old):
+    """`new` where `on` is true, leaf by leaf."""
+    return jax.tree.map(partial(jnp.where, on), new, old)
+
+
+class _Switch(jv.Transform):
+    inner: jv.Transform
+    on: Bool[Array, ""]
+
+
+class _Index(EmptySpaceIndex):
+    """Another index, or one to which nothing is empty."""
+
+    inner: EmptySpaceIndex
+    on: Bool[Array, ""]
+
+    def prepare(self, box, stretch):
+        return self.inner.prepare(box, stretch)
+
+    def any_visible(self, prepared):
+        return self.inner.any_visible(prepared) | ~self.on
+
+    def skip_to(self, prepared, beam, rays, depth):
+        return jnp.where(self.on, self.inner.skip_to(prepared, beam, rays, depth), depth)
+
+    def within_ranges(self):
+        return _Index(self.inner.within_ranges(), self.on)
+
+
+class _Space(Space):
+    """A space of which a part is left out, or all of it. What does not differ is that of the whole."""
+
+    clipped: Space
+    whole: Space
+    on: Bool[Array, ""]
+
+    searches = property(lambda self: self.whole.searches)
+    diagonal = property(lambda self: self.whole.diagonal)
+    middle = property(lambda self: self.whole.middle)
+
+    def coordinate(self, point):
+        return self.whole.coordinate(point)
+
+    def point(self, coordinate):
+        return self.whole.point(coordinate)
+
+    def least_distances(self, low, high):
+        return self.whole.least_distances(low, high)
+
+    def path(self, entry, direction):
+        return self.whole.path(entry, direction)
+
+    def interval(self, origin, direction):
+        return either(self.on, *(s.interval(origin, direction) for s in (self.clipped, self.whole)))
+
+    def gaps(self, entry, direction, length):
+        nowhere = jnp.full_like(length, jnp.inf)
+        return tuple(
+            either(self.on, gap, (nowhere, nowhere)) for gap in self.clipped.gaps(entry, direction, length)
+        )
+
+    def occupancy(self, visible, first=None):
+        return either(self.on, *(s.occupancy(visible, first) for s in (self.clipped, self.whole)))
+
+    def visible_at_faces(self, visible):
+        faces = self.whole.visible_at_faces(visible)
+        cut = self.clipped.visible_at_faces(visible)
+        return *faces, *(seen & self.on for seen in cut[len(faces) :])
+
+
+def _clip(self, space):
+    return _Space(self.inner.clip(space), space, self.on)
+
+
+def _start(self, steps, ray):
+    return jnp.where(self.on, self.inner.start(steps, ray), steps)
+
+
+def _shift(self, ray):
+    return jnp.where(self.on, self.inner.shift(ray), 0)
+
+
+def _empty_space(self, occupancy, view):
+    return _Index(self.inner.empty_space(occupancy, view), self.on)
+
+
+def _prepared(self, march, space, windows, variation):
+    inner = self.inner.prepared(march, space, windows, variation)
+    return eqx.tree_at(lambda switch: switch.inner, self, inner)
+
+
+def _stride_error(self, ray, run):
+    error, tolerated = self.inner.stride_error(ray, run)
+    # what is known is allowed for strides of 1 alone
+    return either(self.on, (error, tolerated), (jnp.full_like(error, jnp.inf), jnp.zeros_like(error)))
+
+
+def _cut(self, cell, ray, volume):
+    first, *others = self.inner.cut(cell, ray, volume)
+    end = cell.front + cell.width
+    none = type(cell)(end, jnp.zeros_like(end), cell.cut)
+    return either(self.on, first, cell), *(either(self.on, piece, none) for piece in others)
+
+
+def _stop(self, stopped, transmittance):
+    return jnp.where(self.on, self.inner.stop(stopped, transmittance), stopped)
+
+
+SEAMS = {
+    "clip": _clip,
+    "start": _start,
+    "shift": _shift,
+    "empty_space": _empty_space,
+    "prepared": _prepared,
+    "stride_error": _stride_error,
+    "cut": _cut,
+    "stop": _stop,
+}
+
+
+@cache
+def _class(kind: type[jv.Transform], part: str) -> type[_Switch]:
+    members = {
+        name: seam for name, seam in SEAMS.items() if getattr(kind, name) is not getattr(jv.Transform, name)
+    }
+    for name in ("longest_stride", "subdivision"):
+        if getattr(kind, name) is not getattr(jv.Transform, name):
+            members[name] = property(lambda self, name=name: getattr(self.inner, name))
+    # off, it cuts nothing, and so leaves joined what is; but it does not end cells at the exit
+    members |= {"joins": kind.joins, "__annotations__": {}}
+    return type(f"Switched{kind.__name__}{part}", (_Switch,), members)
+
+
+def switch(transform: jv.Transform, on, part: str = "") -> jv.Transform:
+    """The transform, if `on`; it may be traced. `part`: tells two switches of one class apart, since a march
+    takes each class of transforms once."""
+    if type(transform).locate is not jv.Transform.locate:
+        raise ValueError("a space is static: compare marches with and without it.")
+    return _class(type(transform), part)(transform, jnp.asarray(on, bool))
+
+
+ALONE = ("jitter", "residual"), ("clip", "hollow")
+"""Of each of these, a subset has one at most."""
+
+NAMES = ("jitter", "residual", "shift", "clip", "hollow", "alignment", "leaping", "termination")
+
+SUBSETS = st.frozensets(st.sampled_from(NAMES)).filter(
+    lambda on: all(not on.issuperset(pair) for pair in ALONE)
+)
+"""Names of transforms that are on, drawn by hypothesis."""
+
+
+def transforms(seed=3, left=0.05, box=BOX, planes=(PLANE,)) -> dict[str, jv.Transform]:
+    """Every transform but those with a space of their own, and those that change the length of cells."""
+    return {
+        "jitter": jv.Jitter(seed),
+        "residual": jv.Jitter(seed, "blue", front_residual=True),
+        "shift": jv.EmptySpaceJitter(seed),
+        "clip": jv.Clip(box, planes),
+        "hollow": jv.Clip(box, planes, inside_out=True),
+        "alignment": jv.AlphaCorrection(),
+        "leaping": jv.SpaceLeaping(),
+        "termination": jv.EarlyTermination(left),
+    }
+
+
+def switched(on, without=(), **values) -> tuple[jv.Transform, ...]:
+    """All of `transforms(**values)`, of which those named in `on` are on; some may be left out."""
+    every = transforms(**values).items()
+    return tuple(switch(each, name in on, name.title()) for name, each in every if name not in without)
+
+
+def plain(on, **values) -> tuple[jv.Transform, ...]:
+    """The same as users give them: those that are on."""
+    return tuple(each for name, each in transforms(**values).items() if name in on)

@@ -1,0 +1,145 @@
+"""Do the scripts of experiments/ run, at tiny sizes, and write what it takes to run them again?"""
+
+import importlib
+from itertools import product
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from skimage.io import imread
+
+import jaxvol as jv
+from experiments import (
+    again,
+    elevation_angle,
+    fit_transfer,
+    gradient_errors,
+    minimum_distance,
+    record,
+    redraw,
+    tomography,
+)
+from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
+from experiments.voxel_distances import distances
+
+from .scenes import slow
+
+
+ROOT = Path(__file__).parent.parent
+RECORDS = sorted(path.stem for path in record.RESULTS.glob("*.json"))
+EXPERIMENTS = [name for name in RECORDS if (ROOT / "experiments" / f"{name}.py").is_file()]
+"""Those whose record has their name."""
+
+
+def jitter_spares_the_face(result):
+    for rows in (rows for name, rows in result.items() if name.startswith("cut block")):
+        for step in {row["step"] for row in rows}:
+            at = {row["march"]: row for row in rows if row["step"] == step}
+            for march in (JITTER, EMPTY, BOTH):
+                assert at[march]["wood grain"] < at[PLAIN]["wood grain"] / 10
+            assert at[EMPTY]["boundary noise"] <= at[PLAIN]["boundary noise"] + 1e-12
+            assert at[JITTER]["boundary noise"] > 1e-7
+
+
+def only_published_starts_spoil_a_pixel(result):
+    for rows in result["scenes"].values():
+        for method, row in rows.items():
+            assert row["rmse"] > 0
+            assert row["wrong"] == 0 or method.startswith(minimum_distance.PUBLISHED)
+
+
+def gradients_miss_jumps_at_the_exit_alone(result):
+    rows = result["relative errors"]["left"]
+    plain, aligned = rows["ray casting"], rows["ray casting" + gradient_errors.CUT]
+    assert plain["position"][0] < 1e-6  # a short difference crosses no jump
+    assert aligned["position"][-1] < 0.05 < 0.5 < plain["position"][-1]
+    assert plain["colours"][-1] < 1e-6
+
+
+def fits_recover_what_was_hidden(result):
+    for rows in result["scenes"].values():
+        for points in (fit_transfer.KNOWN, fit_transfer.EVEN):
+            held_out, start = rows[points]["psnr held out"], rows[points]["psnr at the start"]
+            assert min(held_out) > fit_transfer.GOAL > max(start)
+            assert rows[points]["steps"] <= fit_transfer.STEPS
+
+
+def a_density_is_recovered(result):
+    for rows in result["photons"].values():
+        errors = [row["rmse"] for row in rows[tomography.OURS]["all"]]
+        assert min(errors) < errors[0] / 4
+    clean = result["photons"]["no noise"]
+    assert clean[tomography.OURS]["rmse"] < clean[tomography.FBP]["rmse"]
+
+
+CHECKS = {
+    "jitter_accuracy": jitter_spares_the_face,
+    "minimum_distance": only_published_starts_spoil_a_pixel,
+    "gradient_errors": gradients_miss_jumps_at_the_exit_alone,
+    "fit_transfer": fits_recover_what_was_hidden,
+    "tomography": a_density_is_recovered,
+    "elevation_angle": lambda result: None,
+}
+"""Experiments that are run, and what their results must show."""
+
+
+@pytest.mark.parametrize("name", ["elevation_angle", *slow(*(n for n in CHECKS if n != "elevation_angle"))])
+def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(name, tmp_path):
+    importlib.import_module(f"experiments.{name}").main(["--quick", "--output", str(tmp_path)])
+    jax.clear_caches()
+    found = record.read(tmp_path / f"{name}.json")
+    assert found["command"].startswith(f"python -m experiments.{name} --quick")
+    assert found["question"].endswith("?")
+    assert found["seed"] == 0
+    assert found["versions"]["jaxvol"]
+    assert found["device"]["platform"]
+    assert found["result"]
+    assert imread(tmp_path / f"{name}.png").std() > 10
+    CHECKS[name](found["result"])
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_takes_its_options(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"experiments.{name}").main(["--help"])
+    assert ended.value.code == 0
+    assert "--quick" in capsys.readouterr().out
+
+
+def test_every_record_has_a_chart_that_can_be_drawn_and_can_be_made_again(tmp_path, capsys):
+    images = {"elevation_angle", "path_traced", "tomography"}  # which no record holds
+    assert set(redraw.DRAWN) == set(RECORDS) - images
+    redraw.main(["--only", "overhead", "--output", str(tmp_path)])
+    assert imread(tmp_path / "overhead.png").shape == imread(record.RESULTS / "overhead.png").shape
+    assert all((record.RESULTS / f"{name}.png").is_file() for name in EXPERIMENTS)
+    assert set(again.NAMES) == {*EXPERIMENTS, *again.ARGUMENTS}
+    again.main(["--list", "--only", "speed"])
+    assert "speed" in capsys.readouterr().out
+
+
+# -- what experiments compute themselves ------------------------------------------------------------------
+
+
+def test_perfect_shells_tell_under_which_angle_they_were_made_unless_they_shift():
+    """Planes shifted at random by a fifth of a sample: the readings differ by a hundredth."""
+    rng, sample = np.random.default_rng(0), np.arange(elevation_angle.SHAPE[2])
+    for reading, half in elevation_angle.READINGS.items():
+        echo = elevation_angle.made(half, elevation_angle.SHAPE)
+        found = elevation_angle.measure(echo)
+        assert found["shape that leaves least"] == elevation_angle.COSINE
+        assert found["reading"] == reading
+        for plane in echo[1:]:
+            plane[:] = np.interp(sample + 0.2 * rng.normal(), sample, plane[0])
+        assert elevation_angle.measure(echo)["reading"] == "not settled"
+
+
+def test_distances_of_voxels_are_those_to_the_nearest_cell_that_shows_anything():
+    """Two small bright things, one of them at a corner."""
+    data = np.zeros((14, 11, 9), np.float32)
+    data[0, 0, 0], data[9:11, 5, 6] = 1, 0.4
+    grid = distances(jv.Volume(data), jv.TransferFunction([0.1, 1], np.ones((2, 3)), [0, 2]))
+    cells = list(product(*(range(n - 1) for n in data.shape)))
+    shown = [c for c in cells if data[tuple(slice(i, i + 2) for i in c)].max() > 0.1]
+    nearest = [np.abs(np.asarray(c) - shown).max(axis=1).min() for c in cells]
+    np.testing.assert_array_equal(grid.distance(), nearest)
