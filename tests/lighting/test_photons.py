@@ -93,7 +93,7 @@ def lights(*, sun=None, lamp=None, sky=False):
 
 def lighting_of(occlusion, photons=PAIR, *, cutoff=1e-6, materials=MATERIALS, **of_lights):
     templates = photons if isinstance(photons, ScattererTemplate) else given(photons)
-    how: Any = {"occlusion": occlusion, "reach": (2.0,), "cutoff": cutoff, "given": templates}
+    how: Any = {"occlusion": occlusion, "cutoff": cutoff, "given": templates}
     return ScattererTemplates(materials, lights(**of_lights), **how)
 
 

@@ -73,7 +73,7 @@ class FogShading(Shading):
 # ---------------------------------------------------------------- images
 
 LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)
-FOG = Fog(np.float32([0.03, 0.06, 0.05]), np.float32(0.7))
+FOG = Fog(np.array([0.03, 0.06, 0.05], np.float32), np.float32(0.7))
 
 
 def scene_of():
@@ -148,11 +148,10 @@ def test_gradients_of_deferred_light_match_central_differences():
     """Also where rays see nothing."""
     with in_float64():
         volume, transfer, camera, _ = scene_of()
-        # no voxel at a control point, where there would be a kink, and no extinction that could fall below 0
+        # no voxel at a control point, where there would be a kink, and no extinction of 0
         volume = eqx.tree_at(lambda v: v.data, volume, 0.02 + 0.93 * np.asarray(volume.data))
-        transfer = jv.TransferFunction(
-            transfer.values, transfer.colors, np.asarray(transfer.extinction) + 0.1
-        )
+        visible = np.asarray(transfer.extinction) + 0.1
+        transfer = jv.TransferFunction(transfer.values, transfer.colors, visible)
         scene = in_double((volume, transfer, camera, jv.March(0.07, LEAPING[:2]), Deferred(FOG)))
         weights = jnp.asarray(np.random.default_rng(5).normal(size=(16, 20, 4)))
 
