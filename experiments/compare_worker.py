@@ -20,9 +20,11 @@ def programs(folder, names, kinds, size):
     import jaxvol as jv
 
     path = Path(__file__).with_name("scenes.py")
-    module = importlib.util.spec_from_file_location("scenes", path)
-    scenes = importlib.util.module_from_spec(module)
-    module.loader.exec_module(scenes)
+    found = importlib.util.spec_from_file_location("scenes", path)
+    assert found is not None
+    assert found.loader is not None
+    scenes = importlib.util.module_from_spec(found)
+    found.loader.exec_module(scenes)
 
     def image(scene, march, transfer, **options):
         return jv.render(scene.volume, transfer, scene.camera, march, outputs="rgba", **options).rgba

@@ -5,7 +5,7 @@ it. Counted are the new entries of the compilation cache that all processes of a
 kernels and subprocesses among them.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import jax
@@ -22,7 +22,7 @@ class Programs:
     def __init__(self, folder: Path, most: int | None):
         self.folder, self.most = folder, most
         self.before = self.in_folder()
-        self.compiled, self.seconds, self.file = Counter[str](), Counter[str](), "collection"
+        self.compiled, self.seconds, self.file = Counter[str](), defaultdict[str, float](float), "collection"
         jax.monitoring.register_event_listener(self.on_event)
         jax.monitoring.register_event_duration_secs_listener(self.on_duration)
 
@@ -33,10 +33,10 @@ class Programs:
         if event == "/jax/compilation_cache/cache_misses":
             self.compiled[self.file] += 1
 
-    def on_duration(self, event: str, seconds: float, **_) -> None:
+    def on_duration(self, event: str, duration_secs: float, **_) -> None:
         # also the time to find a program in the cache folder
         if event == "/jax/core/compile/backend_compile_duration":
-            self.seconds[self.file] += seconds
+            self.seconds[self.file] += duration_secs
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):
@@ -54,7 +54,8 @@ class Programs:
     def pytest_testnodedown(self, node):
         compiled, seconds = getattr(node, "workeroutput", {}).get("programs", ({}, {}))
         self.compiled.update(compiled)
-        self.seconds.update(seconds)
+        for file, each in seconds.items():
+            self.seconds[file] += each
 
     @property
     def total(self) -> int:

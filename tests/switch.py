@@ -56,9 +56,17 @@ class _Space(Space):
     whole: Space
     on: Bool[Array, ""]
 
-    searches = property(lambda self: self.whole.searches)
-    diagonal = property(lambda self: self.whole.diagonal)
-    middle = property(lambda self: self.whole.middle)
+    @property
+    def searches(self):
+        return self.whole.searches
+
+    @property
+    def diagonal(self):
+        return self.whole.diagonal
+
+    @property
+    def middle(self):
+        return self.whole.middle
 
     def coordinate(self, point):
         return self.whole.coordinate(point)

@@ -31,8 +31,8 @@ def test_a_fault_is_replaced_wherever_it_was_imported(monkeypatch):
 
     monkeypatch.setattr(metrics, "rmse", metrics.rmse)  # put back afterwards, here and where it is public
     fault = Fault("none", "metrics:rmse", lambda rmse: lambda *images: 2 * rmse(*images), ())
+    original = metrics.rmse
     try:
-        original = metrics.rmse
         fault.inject()
         assert metrics.rmse(np.ones((2, 2)), np.zeros((2, 2))) == 2
         assert inspect.getattr_static(jaxvol.metrics, "rmse") is not original

@@ -94,8 +94,8 @@ def test_the_error_falls_with_the_order_claimed_for_image_and_gradient(quadratur
                 transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), density)
                 march = jv.March(step, (jv.AlphaCorrection(),), quadrature, max_samples=200)
 
-                def one(*ray):
-                    return jv.render_ray_reference(volume, transfer, *ray, march).rgba[3]
+                def one(origin, direction):
+                    return jv.render_ray_reference(volume, transfer, origin, direction, march).rgba[3]
 
                 return jax.vmap(one)(origins, directions)
 

@@ -175,8 +175,9 @@ def test_stride_lengthens_cells(on, length, samples):
 
 
 def test_a_run_may_reach_past_the_exit_where_cells_are_cut_there():
-    transforms, ray = (jv.AlphaCorrection(), Long(4.0)), [jnp.asarray(end[0]) for end in RAY]
-    found = jv.render_ray_reference(BOX, uniform_transfer(1.0), *ray, jv.March(0.06, transforms))
+    origin, direction = (jnp.asarray(end[0]) for end in RAY)
+    march = jv.March(0.06, (jv.AlphaCorrection(), Long(4.0)))
+    found = jv.render_ray_reference(BOX, uniform_transfer(1.0), origin, direction, march)
     assert float(found.rgba[3]) == seen(2)
     assert int(found.samples) == 9
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,7 +66,7 @@ def raw_file(folder: Path) -> Path:
 
 @cache
 def whole() -> jv.Rendering:
-    return jv.render(jv.Volume(balls(), **PLACE), TRANSFER, CAMERA, LEAPING)
+    return of_volume(TRANSFER, CAMERA, LEAPING)
 
 
 # ---- gradients ----
@@ -74,30 +75,33 @@ PLAIN = jv.March(0.5, (jv.Jitter(5),))
 """Without leaps, so that what has no extinction has a gradient, too."""
 
 
-def loss(parts, render):
-    """A number of a rendering, and the rendering."""
-    rendering = render(*parts)
+def weighted(rendering):
+    """A number that depends on colours and depths."""
     height, width = rendering.rgba.shape[:2]
     weights = np.random.default_rng(1).normal(size=(height, width, 4)).astype(np.float32)
     seen = jnp.where(jnp.isfinite(rendering.depth), rendering.depth, 0)
-    return jnp.sum(weights * rendering.rgba) + 1e-2 * jnp.sum(weights[..., 0] * seen), rendering
+    return jnp.sum(weights * rendering.rgba) + 1e-2 * jnp.sum(weights[..., 0] * seen)
 
 
-@cache
-def parts():
-    """Spacing, transfer function, camera and march."""
-    return jnp.asarray(PLACE["spacing"]), TRANSFER, WIDE, PLAIN
+def loss(extinction, position, render):
+    """Of an image from this position, and the image. Gradients to more take twice as long to compile."""
+    transfer = eqx.tree_at(lambda transfer: transfer.extinction, TRANSFER, extinction)
+    camera = eqx.tree_at(lambda camera: camera.position, WIDE, position)
+    rendering = render(transfer, camera, PLAIN)
+    return weighted(rendering), rendering
+
+
+AT = TRANSFER.extinction, WIDE.position
+gradient_of = jax.grad(loss, (0, 1), has_aux=True)
 
 
 @cache
 def whole_gradient() -> tuple[Any, jv.Rendering]:
-    """Gradient to these parts, and the image."""
-
-    return eqx.filter_grad(loss, has_aux=True)(parts(), of_volume)
+    return gradient_of(*AT, of_volume)
 
 
-def of_volume(spacing, *others, **more):
-    return jv.render(jv.Volume(balls(), spacing, PLACE["origin"]), *others, **more)
+def of_volume(*parts, **more):
+    return jv.render(jv.Volume(balls(), **PLACE), *parts, **more)
 
 
 # ---- curved ----

@@ -16,6 +16,7 @@ from jaxvol.bricks.sources import ArraySource
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 
 from .scenes import (
+    AT,
     CAMERA,
     CURVED,
     FROM_THE_SIDE,
@@ -29,9 +30,10 @@ from .scenes import (
     assert_same,
     balls,
     fog,
+    gradient_of,
     loss,
-    parts,
     raw_file,
+    weighted,
     whole,
     whole_fog,
     whole_gradient,
@@ -112,10 +114,9 @@ def test_what_nobody_sees_is_not_read(image, file):
 # ---- gradients ----
 
 
-def by_bricks(spacing, *others):
+def by_bricks(*parts):
     """Not in a file, and of another order in memory."""
-    data = np.ascontiguousarray(balls())
-    return jv.render_bricks(data, *others, spacing=spacing, origin=PLACE["origin"], bricks=(2, 1, 3))
+    return jv.render_bricks(np.ascontiguousarray(balls()), *parts, **PLACE, bricks=(2, 1, 3))
 
 
 @pytest.fixture(scope="module")
@@ -124,36 +125,33 @@ def gradient():
     passes, scan = [], summary_files.scan
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(summary_files, "scan", lambda *given, **more: passes.append(1) or scan(*given, **more))
-        return *eqx.filter_grad(loss, has_aux=True)(parts(), by_bricks), len(passes)
+        return *gradient_of(*AT, by_bricks), len(passes)
+
+
+def assert_same_gradient(found, expected):
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
 
 
 def test_image_and_gradient_by_bricks_are_those_of_the_whole(gradient):
     (expected, one), (found, every, passes) = whole_gradient(), gradient
     assert_same(every, one, fields=("exhausted", "samples"))
-    leaves = jax.tree.leaves(expected)
-    assert all(np.any(leaf) for leaf in (expected[0], expected[1].colors, expected[2].position))
-    assert expected[1].extinction[0] != 0  # of what no brick shows
-    for own, other in zip(jax.tree.leaves(found), leaves, strict=True):
-        assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
+    assert np.all(expected[0])  # also of what has no extinction, and is in no brick that shows anything
+    assert np.all(expected[1])
+    assert_same_gradient(found, expected)
     assert passes == 1  # the second march has the ranges of the first
 
 
-def changed(extinction):
-    """The parts with other extinctions."""
-    spacing, transfer, *others = parts()
-    return spacing, eqx.tree_at(lambda t: t.extinction, transfer, extinction), *others
-
-
 def test_the_gradient_agrees_with_differences(gradient):
-    at = TRANSFER.extinction
+    at, position = AT
     for i, change in ((1, 2e-3), (2, 1e-2)):
-        more, less = (loss(changed(at.at[i].add(sign * change)), by_bricks)[0] for sign in (1, -1))
-        np.testing.assert_allclose(gradient[0][1].extinction[i], (more - less) / (2 * change), rtol=2e-3)
+        more, less = (loss(at.at[i].add(sign * change), position, by_bricks)[0] for sign in (1, -1))
+        np.testing.assert_allclose(gradient[0][0][i], (more - less) / (2 * change), rtol=2e-3)
 
 
 def test_other_transformations_say_what_to_do():
     def opacity(extinction):
-        return by_bricks(*changed(extinction)).rgba[..., 3]
+        return loss(extinction, AT[1], by_bricks)[1].rgba[..., 3]
 
     at = TRANSFER.extinction
     seen, pull = jax.vjp(opacity, at)
@@ -321,6 +319,27 @@ def test_random_splits_and_cameras_look_like_the_whole(engine):
         bricks = tuple(int(n) for n in rng.integers(1, 5, 3))
         one = jv.render(engine, TRANSFER, camera, march)
         assert_same(jv.render_bricks(engine, TRANSFER, camera, march, bricks=bricks), one)
+
+
+@pytest.mark.slow
+def test_gradients_to_all_parts_of_a_lit_scene_are_those_of_the_whole():
+    """Of a transfer function without extinction 0, of which a leap would miss the gradient."""
+    least = eqx.tree_at(lambda t: t.extinction, TRANSFER, jnp.maximum(TRANSFER.extinction, 1e-3))
+    march = jv.March(0.5, (jv.SpaceLeaping(), jv.EmptySpaceJitter(1), jv.AlphaCorrection()))
+    parts = jnp.asarray(PLACE["spacing"]), least, CAMERA, march, Phong()
+
+    def by_bricks(spacing, *parts, lighting):
+        return jv.render_bricks(balls(), *parts, spacing=spacing, lighting=lighting, bricks=(2, 1, 3))
+
+    def whole(spacing, *parts, lighting):
+        return jv.render(jv.Volume(balls(), spacing), *parts, lighting=lighting)
+
+    found, expected = (
+        eqx.filter_grad(lambda parts, f=f: weighted(f(*parts[:-1], lighting=parts[-1])))(parts)
+        for f in (by_bricks, whole)
+    )
+    assert len(jax.tree.leaves(expected)) > 8
+    assert_same_gradient(found, expected)
 
 
 HALF = math.pi / 2

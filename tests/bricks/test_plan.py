@@ -14,6 +14,7 @@ from ..scenes import around, scaled_phantom, soft_transfer
 
 
 TOLERANCE = 0.02
+PARTS = (jv.planning.Part("SpaceLeaping", False, "nothing is empty"),)
 PLANNING = sys.modules["jaxvol.bricks.plan"]  # the name is that of a function, too
 VOLUME = scaled_phantom("sphere", 48)
 
@@ -35,7 +36,7 @@ def test_bricks_are_planned_where_the_volume_does_not_fit(path, monkeypatch):
     monkeypatch.setattr(
         PLANNING,
         "plan_in_memory",
-        lambda copy, *_, **__: jv.Plan(march, copy, None, TOLERANCE, 0.01, 0.1, 9.0, (), 0.0),
+        lambda copy, *_, **__: jv.Plan(march, copy, None, TOLERANCE, 0.01, 0.1, 9.0, PARTS, 0.0),
     )
     found = planned(path, IN_MEMORY * VOLUME.data.nbytes)
     assert (found.counts, found.stride) == (None, 1)
@@ -48,6 +49,7 @@ def test_bricks_are_planned_where_the_volume_does_not_fit(path, monkeypatch):
     assert {type(each) for each in found.march.transforms} == {jv.Jitter, jv.AlphaCorrection, jv.SpaceLeaping}
     assert float(found.march.step) <= float(march.step) / 2
     assert f"at most {found.loads} are read" in str(found)
+    assert found.plan.parts[0].kept  # a copy does not prove that nothing is empty
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def image_and_gradient(known: dict[str, np.ndarray]):
     """On eight devices, of a volume that is so large that it is copied to them once."""
     assert scenes.balls().nbytes > devices.LARGE
     render = partial(scenes.of_volume, devices=all_devices())
-    gradient, every = eqx.filter_grad(scenes.loss, has_aux=True)(scenes.parts(), render)
+    gradient, every = scenes.gradient_of(*scenes.AT, render)
     for name in ("rgba", "depth", "samples"):
         np.testing.assert_allclose(getattr(every, name), known[name], atol=1e-6, rtol=1e-6, err_msg=name)
     assert every.rgba.sharding.is_fully_replicated

@@ -129,6 +129,10 @@ def at(tree, name):
     return next(leaf for path, leaf in jax.tree.leaves_with_path(tree) if jax.tree_util.keystr(path) == name)
 
 
+def chosen(found, names):
+    return {name: found[name] for name in names}
+
+
 def assert_same(found, expected, tolerance, context="", rounding=0.0):
     """Each leaf's gradient agrees to `tolerance` times its norm."""
     assert found.keys() == expected.keys()
@@ -157,7 +161,7 @@ def test_leaps_show_in_no_image_and_no_gradient(on, seed, camera, step, dense, l
         found[leaping] = gradient(scene)
     np.testing.assert_allclose(found[True][0], found[False][0], atol=1e-6)
     # rounding in float32 of sums with strong cancellation
-    rounding = 1e-6 * np.linalg.norm(found[False][1]["[2].focal_point"])
+    rounding = 1e-6 * float(np.linalg.norm(found[False][1]["[2].focal_point"]))
     assert_same(found[True][1], found[False][1], 1e-4, rounding=rounding)
 
 
@@ -171,7 +175,7 @@ def test_the_usual_march_is_that_of_switches_and_float32_that_of_an_independent_
     usual, expected = gradient(given)
     np.testing.assert_allclose(image, usual, atol=1e-6)
     shared = {name for name in expected if "transforms" not in name}
-    assert_same(*({name: each[name] for name in shared} for each in (found, expected)), 1e-5)
+    assert_same(chosen(found, shared), chosen(expected, shared), 1e-5)
     rgba, _ = oracle_image(*given)
     # where rounding decides of a sample, a ray ends or shifts at another one
     off = np.abs(image - rgba).max(axis=-1) > 2e-5
@@ -404,7 +408,7 @@ def test_linearized_as_solvers_of_least_squares_do_it():
 def test_leaps_do_not_show_in_gradients_of_other_voxels(dtype):
     leapt, whole = (gradient(scene_of(t, dtype)) for t in (USUAL, (*USUAL[:2], USUAL[3])))
     shared = leapt[1].keys() & whole[1].keys() - {name for name in leapt[1] if "transforms" in name}
-    assert_same(*({name: found[name] for name in shared} for _, found in (leapt, whole)), 1e-4)
+    assert_same(chosen(leapt[1], shared), chosen(whole[1], shared), 1e-4)
 
 
 @slow_test
@@ -421,7 +425,7 @@ def test_forward_and_replay_gradients_agree_under_every_method(method):
             dot = np.vdot(found[name], at(way, name))
             assert abs(slope - dot) <= 1e-4 * np.linalg.norm(found[name]), (camera, name)
         if camera == "outside" and method != "min_distance":
-            assert_same({name: found[name] for name in whole}, whole, 1e-4)
+            assert_same(chosen(found, whole), whole, 1e-4)
 
 
 @slow_test
@@ -435,7 +439,7 @@ def test_other_quadratures_long_cells_and_gaps(quadrature, more):
         gradient(scene_of((*transforms, *leaps), quadrature=quadrature))[1]
         for leaps in ((), (jv.SpaceLeaping(),))
     )
-    assert_same({name: leapt[name] for name in whole}, whole, 1e-4)
+    assert_same(chosen(leapt, whole), whole, 1e-4)
 
 
 @slow_test
@@ -453,7 +457,7 @@ def test_tiles_and_batches_of_rays_do_not_show():
         volume, transfer, camera, march = scene_of(transforms)
         large = jv.Camera(camera.position, camera.focal_point, camera.view_up, 30.0, size=(1040, 1030))
         found.append(gradient((volume, transfer, large, march))[1])
-    assert_same({name: found[0][name] for name in found[1]}, found[1], 1e-4)
+    assert_same(chosen(found[0], found[1]), found[1], 1e-4)
 
 
 @slow_test
@@ -520,7 +524,7 @@ def test_leaps_do_not_show_in_gradients_of_the_scenes_of_the_experiments(name, r
         for leaps in ((jv.SpaceLeaping(),), ())
     ]
     shared = {path for path in found[1] if "transforms" not in path}
-    assert_same(*({path: each[path] for path in shared} for each in found), 1e-4)
+    assert_same(chosen(found[0], shared), chosen(found[1], shared), 1e-4)
 
 
 def workspace(samples, size=512, resolution=256):

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 
 from . import Fault
@@ -10,11 +9,6 @@ from . import Fault
 
 PHOTONS, SHADING = "lighting/test_photons.py::", "lighting/test_shading.py::"
 PHONG, PATHS = "lighting/test_phong.py::", "path_tracing/test_path_trace.py::"
-
-
-def without_direction(found):
-    colors, of_sample, total = found
-    return colors, of_sample._replace(direction=jax.tree.map(jnp.zeros_like, of_sample.direction)), total
 
 
 def between_ends(values, extinction, low, high):
@@ -57,12 +51,6 @@ FAULTS: list[Fault] = [
         "lighting.scatterers:computed_now",
         lambda f: lambda function, *of: function(*of),
         ("lighting/test_baked.py::test_light_that_was_baked_inside_a_program_serves_outside",),
-    ),
-    Fault(
-        "shading: directions of samples have no cotangent under replay",
-        "engine.shading_gradient:_chunk_vjp",
-        lambda f: lambda *of: without_direction(f(*of)),
-        (f"{SHADING}test_images_are_those_of_the_reference_and_gradients_those_of_central_differences",),
     ),
     Fault(
         "Phong: samples are shaded where their cells begin",

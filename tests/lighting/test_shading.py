@@ -73,7 +73,7 @@ class FogShading(Shading):
 # ---------------------------------------------------------------- images
 
 LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05)
-FOG = Fog(np.array([0.03, 0.06, 0.05], np.float32), np.float32(0.7))
+FOG = Fog(jnp.asarray([0.03, 0.06, 0.05]), jnp.asarray(0.7))
 
 
 def scene_of():

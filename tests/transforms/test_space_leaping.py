@@ -61,7 +61,7 @@ def bytes_of(values):
     return np.round(255 * np.asarray(values)).astype(np.uint8)
 
 
-def table(seed, top=255):
+def table(seed, top=255.0):
     """Eight control points, some runs of them transparent, and none at a likely voxel value. Where the last
     one is, too, air may lie beyond it: there, the extinction must be exactly 0."""
     rng = np.random.default_rng(seed)
