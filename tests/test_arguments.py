@@ -30,6 +30,11 @@ class Denser(jv.Volume):
 
 
 BAD = {
+    "a class": (lambda: jv.render(VOLUME, TRANSFER, CAMERA, jv.March), "got the class March"),
+    "lights": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting=(LIGHT, LIGHT)),
+        "got a tuple of length 2. " + LIGHTINGS,
+    ),
     "a volume of another class": (
         lambda: jv.render(cast(Any, Denser)(VOLUME.data), TRANSFER, CAMERA, MARCH),
         r"volume must be a jaxvol Volume itself; got its subclass Denser, .*field=",

@@ -146,6 +146,10 @@ def test_specks_far_away_do_not_count_and_parts_that_are_near_do():
     data[12:19:2, 16, 16] = 200  # with one voxel between them, like leaves
     _, longer = extent(visible_points(jv.Volume(data), transfer))
     assert longer[0] >= size[0] + 5
+    flat = np.full((9, 9, 9), 10, np.uint8)
+    flat[4] = 200  # in a plane, of which there is no hull of three dimensions
+    shown = jv.TransferFunction([10, 200], np.ones((2, 3)), [0, 99])
+    np.testing.assert_array_equal(extent(visible_points(jv.Volume(flat), shown))[1], (2, 8, 8))
     hidden = jv.TransferFunction([0, 1], np.zeros((2, 3)), np.zeros(2))
     np.testing.assert_array_equal(extent(visible_points(volume, hidden))[1], (31, 31, 31))
 

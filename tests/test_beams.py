@@ -56,7 +56,8 @@ def occupancy(occupied):
 @jax.jit
 def box_of(origins, directions):
     """The box of a beam, and its two corners at each of many distances."""
-    box = Box.within(occupancy(jnp.zeros(BLOCKS, bool)), apart(origins), apart(directions))
+    corners = tuple(origins.T), tuple(directions.T)
+    box = Box.within(occupancy(jnp.zeros(BLOCKS, bool)), *corners)
     at = jnp.linspace(0, 1, 9) * (box.far - box.near)
     return box, at, jax.vmap(lambda u: tuple(jnp.stack(corner) for corner in box.between(u, u)))(at)
 

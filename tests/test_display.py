@@ -6,6 +6,7 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
+from jaxvol import display
 
 
 def test_srgb_and_back():
@@ -101,6 +102,31 @@ def test_image_over_a_background():
     ):
         with pytest.raises(ValueError, match=message):
             rendering.image(wrong)
+
+
+def test_images_are_shown_side_by_side_pixel_by_pixel(monkeypatch):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    monkeypatch.setattr(plt, "show", lambda: None)
+    ramp = np.linspace(0, 1, 20 * 30 * 3, dtype=np.float32).reshape(20, 30, 3)
+    grey = np.random.default_rng(0).random((16, 24), np.float32)
+    jv.show_images({"ramp": ramp, "grey": grey, "again": ramp[::-1]}, columns=2)
+    canvas = FigureCanvasAgg(plt.gcf())
+    canvas.draw()
+    page = np.asarray(canvas.buffer_rgba())[..., :3]
+    plt.close()
+
+    row = 20 + display.TITLE + display.GAP
+    assert page.shape == (2 * row, 2 * (30 + display.GAP) + display.GAP, 3)
+    for image, left, top in ((ramp, 0, 0), (grey[..., None], 1, 0), (ramp[::-1], 0, 1)):
+        height, width = image.shape[:2]
+        left, top = display.GAP + left * (30 + display.GAP), display.TITLE + top * row
+        found = page[top : top + height, left : left + width].astype(int)
+        assert np.abs(found - np.asarray(jv.to_srgb(image)) * 255).max() < 2
 
 
 def test_images_that_cannot_be_shown_are_refused():

@@ -3,10 +3,11 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 
-from jaxvol.programs import default_programs, keep_programs_by_default
+from jaxvol.programs import default_programs, keep_programs, keep_programs_by_default
 
 
 SCRIPT = """
@@ -38,6 +39,7 @@ def test_the_default_folder_is_jaxs_own_or_the_users(tmp_path, monkeypatch):
     chosen = getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009 (pyright does not know it)
     assert chosen  # the tests' own, which a viewer leaves
     keep_programs_by_default()
+    assert keep_programs(chosen) == Path(chosen)
     assert getattr(jax.config, "jax_compilation_cache_dir") == chosen  # noqa: B009
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -138,6 +138,8 @@ def test_a_file_that_is_mapped_and_read_only_is_taken(tmp_path):
 
 ZEROS = np.zeros(SHAPE, np.uint8)
 BAD = {
+    "a mask": ((np.ma.zeros(SHAPE),), {}, "data must be an array without a mask"),
+    "ragged": (([[[1, 2], [3]]],), {}, "data must be an array; got a list"),
     "2-D": ((np.zeros((4, 4), np.uint8),), {}, r"data\[x, y, z\].*shape \(4, 4\).*stack"),
     "objects": ((np.full(SHAPE, None),), {}, "data must be of type.*got object"),
     "beyond 2**24": (

@@ -9,16 +9,16 @@ from jaxvol.rendering import Details
 
 
 class Drawn:
-    """Stands in for `jaxvol.render`. `scenes`, `how`: what it was called with. `empty`: it shows nothing."""
+    """Stands in for `jaxvol.render`. `scenes`, `how`: what it was called with. `level`: of all opacities."""
 
     def __init__(self):
-        self.scenes, self.how, self.empty = [], [], False
+        self.scenes, self.how, self.level = [], [], 1.0
 
     def __call__(self, volume, transfer, camera, march, **how):
         self.scenes.append((volume, transfer, camera, march))
         self.how.append(how)
         width, height = camera.size
-        level = 0 if self.empty else 0.5 + 0.3 * np.sin(np.sum(np.asarray(camera.position)))
+        level = self.level * (0.5 + 0.3 * np.sin(np.sum(np.asarray(camera.position))))
         alpha = np.linspace(0, level, width * height, dtype=np.float32).reshape(height, width, 1)
         rgba = alpha * np.array([0.9, 0.5, 0.1, 1], np.float32)
         depth = np.full((height, width), 7.5, np.float32)

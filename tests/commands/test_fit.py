@@ -66,6 +66,8 @@ def test_an_interrupted_fit_resumes_and_finds_what_makes_the_pictures(volume_fil
 
 
 BAD = {
+    "no cameras": ({"--cameras": ["nowhere.json"]}, "nowhere.json"),
+    "too deep": ({"--cameras": ["deep.json"]}, "deep.json is not JSON"),
     "no picture": ({"--images": ["nowhere.png", "1.png"]}, "there is no file nowhere.png"),
     "no picture's file": ({"--images": ["cameras.json"] * 2}, "cannot be read as a picture"),
     "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),

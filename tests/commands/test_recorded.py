@@ -159,6 +159,8 @@ def volume(name):
 
 
 BAD = {
+    "no object": ("[]", "jaxvol, command, settings are needed"),
+    "checksum": (said(file={"name": "a", "sha256": "b"}), "file must have a name"),
     "foreign": (lambda p: Image.new("RGB", (8, 8)).save(p), "holds no settings of jaxvol"),
     "a JPEG": (lambda p: Image.new("RGB", (8, 8)).save(p, "JPEG"), "cannot be read as a PNG"),
     "unpacks to much": (unpacks_to_much, "a.png"),

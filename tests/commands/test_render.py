@@ -154,12 +154,12 @@ def test_a_clip_is_that_of_the_library(volume_file, tmp_path, drawn):
 
 @pytest.fixture
 def plans(monkeypatch):
-    """What was planned, and the plan that was made: with a step of 0.7, not proven to be good enough."""
+    """What was planned: plans of a step of 0.7, with an error of 0.02 less what is asked for."""
     made = []
 
     def plan(volume, transfer, camera, tolerance, **how):
         march, parts = jv.March(0.7, how["transforms"]), (Part("leaps", False, "nothing is empty"),)
-        found = Plan(march, volume, how["lighting"], tolerance, 2 * tolerance, 0.1, 9.0, parts, 1.0)
+        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 0.1, 9.0, parts, 1.0)
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
@@ -174,9 +174,11 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
     printed = capsys.readouterr().out
     assert "(reading and planning " in printed
     assert "not proven to be within an RMSE of 0.0039; jaxvol plan tells more" in printed
+    assert render(volume_file, *words, "--tolerance", "0.01", "-o", tmp_path / "x.png", step=None) == 0
+    assert "not proven" not in capsys.readouterr().out
     assert main(["plan", str(volume_file), *map(str, words), "--tolerance", "0.01"]) == 0
     assert "step 0.7, left, Clip" in capsys.readouterr().out
-    assert [tolerance for *_, tolerance, _ in plans] == [1 / 255, 0.01]
+    assert [tolerance for *_, tolerance, _ in plans] == [1 / 255, 0.01, 0.01]
     for *_, how in plans:
         assert same(how["transforms"], (jv.Clip(CLIP, PLANES, inside_out=True),))
         assert isinstance(how["lighting"], Phong)
@@ -191,7 +193,7 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
         )
         == 0
     )
-    assert len(plans) == 2 + 4
+    assert len(plans) == 3 + 4
     assert not plans[-1][-1]["once"]
 
 
@@ -216,10 +218,23 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
     bone = ["--preset", "ct_bone", "-o", str(tmp_path / "x.png")]
     assert render(tmp_path / "v.npy", *bone) == 0
     assert "nothing" not in capsys.readouterr().out
-    drawn.empty = True
+    drawn.level = 0.0
     assert render(tmp_path / "v.npy", *bone) == 0
     why = r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values from 130 on\. A clim from"
     assert re.search(why, capsys.readouterr().out)
+    away = ["--camera", *["90"] * 3, *["200"] * 3]
+    for words, why in (
+        (["--clip-plane", *["20"] * 3, *"100"], "what the clip leaves of the volume"),
+        (away, "nothing is seen: no ray of the camera meets the volume"),
+        (["--compositing", "isosurface", "--isovalue", "999"], "and none crosses .* 999"),
+    ):
+        assert render(tmp_path / "v.npy", *bone, *words) == 0
+        assert re.search(why, capsys.readouterr().out), why
+    drawn.level = 1e-4
+    assert render(tmp_path / "v.npy", *bone) == 0
+    assert re.search(
+        r"nothing is seen: the opacity is at most .*\. Use a shorter unit", capsys.readouterr().out
+    )
 
 
 def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monkeypatch, capsys, drawn):

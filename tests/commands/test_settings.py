@@ -115,6 +115,7 @@ def test_parts_of_the_demo_may_stand_in_a_file(config, capsys):
 
 
 BAD = {
+    "no list of lists": ("clip-plane = 1", "clip-plane must be a list of lists; got 1"),
     "unknown": ("sise = [1, 2]", "settings.toml: jaxvol render has no option 'sise'. Did you mean size?"),
     "of another command": ('solver = "adam"', "jaxvol render has no option 'solver'"),
     "itself": ('config = "a.toml"', "has no option 'config'"),

@@ -56,7 +56,7 @@ def test_starts_on_the_edge_begin_a_margin_away_from_it():
     ):
         free = np.resize(inverse(bijection, np.array(edges, np.float32)), 32)
         value = with_slopes(bijection, free)[0][:5]
-        np.testing.assert_allclose(np.abs(value - np.array(edges)), begun, rtol=1e-4)
+        np.testing.assert_allclose(np.abs(np.asarray(value) - edges), begun, rtol=1e-4)
 
 
 BAD = {

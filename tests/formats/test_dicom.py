@@ -139,6 +139,11 @@ def test_a_sagittal_series_is_brought_along_the_axes_of_the_patient(tmp_path):
     np.testing.assert_allclose(volume.origin, (ORIGIN[0], ORIGIN[1], ORIGIN[2] - 5 * SPACING[1]), rtol=1e-6)
 
 
+def tilted(folder, paths):
+    for z, path in enumerate(paths):
+        write_slice(path, DATA[:, :, z], np.array(ORIGIN) + np.array([0, 0.5 * z, z * SPACING[2]]))
+
+
 def unreadable(folder, paths):
     uid = b"1.2.840.10008.1.2.4.201\x00"
     head = paths[3].read_bytes()
@@ -163,6 +168,7 @@ def huge(folder, paths):
 
 OTHER = {"0020|000e": "9.9", "0008|103e": "head"}
 BAD = {
+    "a tilted gantry": (tilted, r"shifted sideways by up to 2.*tilted gantry"),
     "a slice is missing": (
         lambda folder, paths: paths[2].unlink(),
         r"unevenly spaced slices, or some are missing: the median distance is 2\.5, .* are 5",

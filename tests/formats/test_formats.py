@@ -157,6 +157,8 @@ HUGE = (2000, 1000, 1000)
 NOT_FINITE = np.array([1, np.nan, 2, np.inf, 3, -np.inf, 4, 5], "float32").tobytes()
 
 BAD_FILES = {
+    "npy empty": ("a.npy", b"", r"empty \(0 bytes\)"),
+    "npy cut short": ("a.npy", NPY[:-1], "cut short: it holds 59 .*says 60"),
     "unknown ending": ("a.vti", b"II*", r"unknown ending; .*\.npy.*\.raw\.gz"),
     "empty": (RAW, b"", r"empty \(0 bytes\)"),
     "no header": ("a.raw", b"12", r"shape=.*name_XxYxZ_dtype\.raw.*a\.raw\.json"),

@@ -66,7 +66,7 @@ def shown(side):
     made.model.close()
 
 
-def test_a_coarse_image_is_followed_by_the_fine_one_of_render(shown, side):
+def test_a_coarse_image_is_followed_by_the_fine_one_of_render(shown, side, monkeypatch):
     state, content = shown.model.state, shown.model.content
     first, last = shown.frames[0], shown.frames[-1]
     assert (last.stage, last.state, last.pixels.shape) == ("fine", state, (27, 38, 3))
@@ -85,6 +85,10 @@ def test_a_coarse_image_is_followed_by_the_fine_one_of_render(shown, side):
     assert np.abs(stretched - last.pixels).mean() < 12  # the same view
     assert shown.told[0].startswith("compiling …")
     assert "RMSE" in shown.told[-1]
+    assert first.quality < last.quality
+    monkeypatch.setattr("jaxvol.viewer.model.EVERY", 0.0)  # seconds until a part of it is shown
+    shown.after(lambda s: s)
+    assert shown.frames[-2].stage == "drawing"
 
 
 def test_changes_need_no_other_program(shown, side):
@@ -226,6 +230,7 @@ def test_every_kind_of_transfer_function_is_drawn_as_it_is_changed():
     look = state.look
     assert isinstance(look, Table)
     assert look.count == "3 x 2 points"
+    assert content.histogram.plot(look).count("<line") == 2  # the ends of its range
     moved = replace(state, look=look.over(look.window, look.level + 300))
     assert equal_arrays(look.transfer(), given)
     assert equal_arrays(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.viewer.model import Frame
 
 from .test_model import BALL, LABELS, LOOK, MARCH
 
@@ -62,6 +63,20 @@ def test_a_drag_orbits_and_with_shift_or_the_right_button_it_moves(shown):
     assert shown.model.state.orbit.distance == pytest.approx(first.distance / 1.2)
     shown._reset()
     assert shown.model.state.orbit is first
+
+
+def test_what_is_drawn_and_told_is_shown(shown, monkeypatch):
+    images = []
+    monkeypatch.setattr(shown.canvas, "show", lambda *image: images.append(image))
+    frame = Frame(np.zeros((210, 300, 3), np.uint8), "coarse", shown.model.state, 0.1, 0.1, 0.4)
+    shown.model._show(frame)
+    shown.model._tell("one\ntwo")
+    assert images == [(frame.pixels, 85)]
+    assert shown._status.value == "one<br>two"
+    shown.model.close()
+    shown.model._show(frame)
+    shown.model._tell("nothing more")
+    assert (len(images), shown._status.value) == (1, "one<br>two")
 
 
 def test_what_is_shown_can_be_rendered(shown):
