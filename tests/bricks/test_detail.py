@@ -106,7 +106,7 @@ def test_a_tolerance_chooses_the_coarsest_level_that_loses_and_adds_no_more():
     assert found_there == pytest.approx(1 - np.exp(-0.5 * 4), rel=1e-5)
     by_gradient = jv.TransferFunction2D([0, 255], [0, 300], jnp.ones((2, 2, 3)), jnp.ones((2, 2)))
     for unknown in (Unknown(), by_gradient):
-        assert range_error(found, summaries, 1, unknown) == 1
+        assert range_error(found, summaries, 2, unknown) == 1
 
 
 def test_arguments_that_miss_are_named():
