@@ -18,7 +18,7 @@ from .scenes import RESOLUTION, soft_transfer
 
 
 RAYS = 64
-STRAIGHT, STEEP = [1.0, 0.0, 0.0], [0.8, 0.0, 0.6]
+STRAIGHT, STEEP = [1.0, 0.0, 0.0], [0.6, 0.0, 0.8]
 
 
 def seen(volume, origins, directions, step, value):

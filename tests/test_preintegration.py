@@ -224,7 +224,7 @@ def test_types_of_voxels_leaps_and_tiles_do_not_show(dtype):
     """Small types are fetched from their packed copy; three tiles of two beams."""
     ball, top = ball_in_a_corner(), 1 if dtype == "float32" else 200
     volume = jv.Volume((np.asarray(ball.data) * top).astype(dtype), ball.spacing)
-    transfer, camera, jitter = scaled_transfer(top), around(volume), jv.EmptySpaceJitter(4)
+    transfer, camera, jitter = scaled_transfer(top), around(volume).zoom(2.0), jv.EmptySpaceJitter(4)
     march = jv.March(0.11, (jitter, jv.AlphaCorrection(), jv.SpaceLeaping()), "preintegrated")
     scene = Scene(volume, transfer, camera, march, jv.Over())
     rgba = render_scene(scene, "all", "replay", Tiling(batch=4, tile=2)).rgba

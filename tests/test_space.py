@@ -60,6 +60,7 @@ def rays():
     random = np.random.default_rng(0)
     origins = random.uniform(-4, 6, (RAYS, 3))
     directions = random.normal(size=(RAYS, 3)) * random.choice([0, 1e-3, 1], (RAYS, 3)) + 1e-12
+    directions[::2] = (random.uniform(LOW, HIGH, (RAYS, 3)) - origins)[::2]
     for i, (origin, direction, *_) in enumerate(CASES.values()):
         origins[i], directions[i] = origin, direction
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -91,7 +92,8 @@ def test_entry_and_exit_agree_with_an_independent_clip(rays):
     assert (np.abs(ends - expected) <= tolerance)[hit].all()
     assert (ends[~hit, 1] < 2e-4).all()
     assert ((entries > LOW - 1e-5) & (entries < HIGH + 1e-5))[len(CASES) :][hit[len(CASES) :]].all()
-    plain = hit & (np.abs(directions) > 0.05).all(axis=1) & (expected[:, 0] > 1e-3)
+    random = np.arange(RAYS) >= len(CASES)  # at corners there are several slopes
+    plain = random & hit & (np.abs(directions) > 0.05).all(axis=1) & (expected[:, 0] > 1e-3)
     assert plain.sum() > 5
     for axis in range(6):
         nudge = 1e-6 * np.eye(6)[axis]

@@ -18,7 +18,7 @@ from jaxvol.lighting import Phong
 from jaxvol.occupancy import BLOCK, Blocks
 
 from .modes import Rays, check_gradients, numbers, scaled_transfer
-from .scenes import RESOLUTION, around, in_float64, slow, to_float64
+from .scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64
 
 
 def random_table(n: int, m: int, seed: int = 0) -> jv.TransferFunction2D:
@@ -86,7 +86,7 @@ def test_two_equal_lines_make_a_step():
 
 def soft() -> jv.TransferFunction:
     """For values from 0 to 255."""
-    return scaled_transfer(255)
+    return scaled_transfer(255, soft_transfer(0.1))
 
 
 def test_emphasis_scales_the_extinction_by_the_magnitude():
@@ -240,7 +240,7 @@ JITTER = jv.EmptySpaceJitter(4)
 def test_an_image_is_that_of_numpy(kind):
     """Over leaps, by slopes that are stored of small types. Magnitudes are per world length."""
     volume, transfer = shells(kind), emphasised()
-    camera, step = around(volume), 0.11
+    camera, step = around(volume).zoom(3.0), 0.11
     found = jv.render(
         volume, transfer, camera, jv.March(step, (JITTER, jv.AlphaCorrection(), jv.SpaceLeaping()))
     )
@@ -308,7 +308,7 @@ def test_gradients_match_central_differences(make, adjoint, lit):
     with in_float64():
         volume, transfer = to_float64(make())
         march = jv.March(0.23, (jv.AlphaCorrection(), jv.SpaceLeaping()), max_samples=32)
-        scene = volume, transfer, around(volume), march, jv.Over()
+        scene = volume, transfer, around(volume).zoom(3.0), march, jv.Over()
         check_gradients(scene, {}, adjoint, lighting=to_float64(Phong()) if lit else None, jit=make is smooth)
 
 

@@ -157,6 +157,7 @@ HUGE = (2000, 1000, 1000)
 NOT_FINITE = np.array([1, np.nan, 2, np.inf, 3, -np.inf, 4, 5], "float32").tobytes()
 
 BAD_FILES = {
+    "npz with a flipped byte": ("a.npz", flipped(zipped(data=NPY), 170), r"a\.npz cannot be read.*CRC"),
     "npy empty": ("a.npy", b"", r"empty \(0 bytes\)"),
     "npy cut short": ("a.npy", NPY[:-1], "cut short: it holds 59 .*says 60"),
     "unknown ending": ("a.vti", b"II*", r"unknown ending; .*\.npy.*\.raw\.gz"),

@@ -227,10 +227,14 @@ def test_rays_enter_and_leave_where_dense_samples_do(name):
         if np.diff(pieces.ravel()).min() < 0.01 * size:
             continue  # a grazing ray
         found, within, most = found + 1, within + (pieces[0, 0] == 0), max(most, len(pieces) - 1)
-        atol = 1e-4 * size / 4
-        np.testing.assert_allclose([t_in[i], t_in[i] + length[i]], [pieces[0, 0], pieces[-1, 1]], atol=atol)
+        atol, start = 1e-4 * size / 4, t_in[i]
         known = gaps[i][np.isfinite(gaps[i, :, 0])]
-        known = known[known[:, 1] > 0]  # a ray that grazes the sector first may begin outside
+        known = known[known[:, 1] > 0]
+        if (
+            len(known) and known[0, 0] == 0
+        ):  # a ray that grazes the sector first, or leaves it just behind its
+            start, known = start + known[0, 1], known[1:]  # origin, begins with a gap
+        np.testing.assert_allclose([start, t_in[i] + length[i]], [pieces[0, 0], pieces[-1, 1]], atol=atol)
         between = np.stack([pieces[:-1, 1], pieces[1:, 0]], -1)
         np.testing.assert_allclose(known + t_in[i], between, atol=atol)
     assert found > 60
@@ -364,7 +368,7 @@ def test_an_independent_marcher_sees_the_same(align, quadrature):
         expected, most = independent_march(
             volume, MIDDLE, transfer, camera, 5.3, quadrature == "midpoint", align
         )
-    assert most == 2
+    assert most > 2  # some rays have two gaps
     np.testing.assert_allclose(rgba, expected, atol=2e-6)
 
 
