@@ -250,4 +250,4 @@ def check_gradients(
     assert {name for name, slope in slopes.items() if abs(slope) < 1e-9} == set(constant)
     away = {**given, "focal_point": 2 * given["position"] - given["focal_point"]}
     _, slope, hit = along(away, ways)
-    assert hit == slope == 0
+    assert float(hit) == float(slope) == 0
