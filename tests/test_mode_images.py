@@ -71,28 +71,27 @@ def march_of(name, *transforms, step=STEP):
     ("name", "method", "dtype"),
     [
         *((name, "hierarchy", TYPES.get(name, "float32")) for name in MODES),
-        *slow(
-            ("maximum", "distance", "float32"), ("isosurface", "beam", "uint8"), ("minimum", "beam", "int16")
-        ),
+        *slow(("maximum", "distance", "float32"), ("isosurface", "beam", "uint8")),
     ],
 )
 def test_an_image_is_that_of_numpy(name, method, dtype):
     """Where rays leap, samples shift and cells are cut: of noise and, in empty space, of a ball."""
-    for each, step in ((anisotropic_noise(), STEP), (ball_in_a_corner(), 0.05)):
+    for each, step, most in ((anisotropic_noise(), STEP, 1.001), (ball_in_a_corner(), 0.05, 0.7)):
         march = march_of(name, jv.SpaceLeaping(method), step=step)
         volume, transfer, mode = scene_of(name, each, dtype)
-        for camera in (around(volume).zoom(2.0), inside(volume)):
+        for camera, rest in ((around(volume).zoom(2.0), 0), (inside(volume), 0.2)):
             found = jv.render(volume, transfer, camera, march, compositing=mode)
             value = float(mode.value) if isinstance(mode, jv.Isosurface) else 0
             rgba, depth, samples = shown(name, volume, transfer, camera, step, JITTER, value)
             assert np.mean(rgba[..., 3] > 0) > 0.05
             same_image(found, rgba, depth)
             taken = np.sum(found.samples) / samples
-            assert taken == 1 if name == "average" else taken < 1.001
+            assert taken == 1 if name == "average" else taken < most + rest
 
 
 def test_the_reference_shows_the_same():
-    """All modes in one program, of rays that shift."""
+    """Modes of each kind in one program, of rays that shift."""
+    names = "additive", "average", "maximum", "isosurface"
     volume, camera = anisotropic_noise(), around(anisotropic_noise())
     width, height = camera.size
     column, row = (
@@ -107,13 +106,13 @@ def test_the_reference_shows_the_same():
             name: jv.render_ray_reference(
                 *(volume, soft_transfer(), origin, direction, march_of(name)),
                 pixel=(column, row),
-                compositing=mode,
+                compositing=MODES[name],
             )
-            for name, mode in MODES.items()
+            for name in names
         }
 
     found = reference(*camera.rays(), column, row)
-    for name in MODES:
+    for name in names:
         same_image(found[name], *shown(name, volume, soft_transfer(), camera, STEP, JITTER)[:2])
 
 
@@ -146,7 +145,6 @@ THICKNESS, LEVEL = {"thickness": lambda scene: scene[4].thickness}, {"value": la
 GRADIENTS = {
     "surface": (FoggedSurface, LEVEL, {"normals": True}),
     "average": (jv.Average, THICKNESS, {}),
-    "maximum": (jv.Maximum, THICKNESS, {}),
     "additive": (lambda part: Additive(part), {}, {}),
 }
 
@@ -154,9 +152,8 @@ GRADIENTS = {
 @pytest.mark.parametrize(
     ("name", "adjoint"),
     [
-        ("surface", "replay"),
-        ("average", "replay"),
-        *slow(("surface", "forward"), ("average", "direct"), ("maximum", "replay"), ("additive", "replay")),
+        *(("surface", "replay"), ("average", "replay")),
+        *slow(("surface", "forward"), ("average", "direct"), ("additive", "replay")),
     ],
 )
 def test_gradients_are_central_differences(name, adjoint):
@@ -196,11 +193,10 @@ def test_what_is_selected_is_lit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["isosurface", "average"])
-def test_more_tiles_than_one_show_nothing(name):
-    volume = anisotropic_noise()
+def test_more_tiles_than_one_show_nothing():
+    volume, mode = anisotropic_noise(), MODES["isosurface"]
     scene = volume, soft_transfer(), around(volume, (37, 50)), jv.March(STEP, (jv.SpaceLeaping(),))
-    whole = jv.render(*scene, compositing=MODES[name])
-    small = render_scene(Scene(*scene, MODES[name]), "all", "replay", Tiling(tile=6, batch=5))
-    for part in ("rgba", "depth", *(["normal"] if name == "isosurface" else [])):
+    whole = jv.render(*scene, compositing=mode)
+    small = render_scene(Scene(*scene, mode), "all", "replay", Tiling(tile=6, batch=5))
+    for part in ("rgba", "depth", "normal"):
         np.testing.assert_array_equal(getattr(whole, part), getattr(small, part))

@@ -225,11 +225,11 @@ def emphasised() -> jv.TransferFunction2D:
 
 
 def shells(kind: str) -> jv.Volume:
-    """Two nested balls with empty space around them, in values of 0 to 255, on a grid of three spacings."""
+    """Two nested balls in a corner of empty space, in values of 0 to 255, on a grid of three spacings."""
     axis = np.linspace(-1.4, 1.4, RESOLUTION)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    away, beside = np.linalg.norm(points, axis=-1), np.linalg.norm(points - [0.3, 0.2, -0.1], axis=-1)
-    data = np.clip(160 * (1.1 - away), 0, 80) + np.clip(400 * (0.6 - beside), 0, 170)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1) - [0.7, -0.6, 0.6]
+    away, beside = np.linalg.norm(points, axis=-1), np.linalg.norm(points - [0.1, 0.1, -0.1], axis=-1)
+    data = np.clip(300 * (0.7 - away), 0, 80) + np.clip(700 * (0.4 - beside), 0, 170)
     return jv.Volume(np.round(data).astype(kind), (0.12, 0.13, 0.11), (-1.4, -1.4, -1.4))
 
 
@@ -240,7 +240,7 @@ JITTER = jv.EmptySpaceJitter(4)
 def test_an_image_is_that_of_numpy(kind):
     """Over leaps, by slopes that are stored of small types. Magnitudes are per world length."""
     volume, transfer = shells(kind), emphasised()
-    camera, step = around(volume).zoom(3.0), 0.05
+    camera, step = around(volume).zoom(2.0), 0.05
     found = jv.render(
         volume, transfer, camera, jv.March(step, (JITTER, jv.AlphaCorrection(), jv.SpaceLeaping()))
     )
@@ -264,7 +264,7 @@ def test_an_image_is_that_of_numpy(kind):
     expected = np.stack([np.sum(weight * part, axis=1) for part in (*color, np.ones_like(weight))], axis=-1)
     assert 0.1 < np.mean(expected[:, 3] > 0.3) < 0.9
     np.testing.assert_allclose(np.asarray(found.rgba).reshape(-1, 4), expected, atol=4e-5)
-    assert np.sum(np.asarray(found.samples)) < np.sum(width > 0)
+    assert np.sum(np.asarray(found.samples)) < 0.8 * np.sum(width > 0)
 
 
 def test_slopes_are_stored_for_a_transfer_function_that_reads_them():
@@ -292,24 +292,18 @@ def smooth() -> Any:
 def leapt() -> Any:
     """8-bit voxels, whose slopes are stored, and blocks that are empty because nothing is steep there."""
     volume = shells("uint8")
-    assert 0.2 < np.mean(bounds(emphasised(), Blocks.of(volume, slopes=True))[1]) < 0.8
+    assert 0.1 < np.mean(bounds(emphasised(), Blocks.of(volume, slopes=True))[1]) < 0.8
     return volume, emphasised()
 
 
-@pytest.mark.parametrize(
-    ("make", "adjoint", "lit"),
-    [
-        (leapt, "replay", False),
-        *slow((leapt, "forward", False), (smooth, "replay", True), (smooth, "direct", False)),
-    ],
-)
-def test_gradients_match_central_differences(make, adjoint, lit):
+@pytest.mark.parametrize(("make", "lit"), [(leapt, False), *slow((smooth, True))])
+def test_gradients_match_central_differences(make, lit):
     """Of the transfer function, of the voxels through value and magnitude, of camera and spacing."""
     with in_float64():
         volume, transfer = to_float64(make())
         march = jv.March(0.23, (jv.AlphaCorrection(), jv.SpaceLeaping()), max_samples=32)
-        scene = volume, transfer, around(volume).zoom(3.0), march, jv.Over()
-        check_gradients(scene, {}, adjoint, lighting=to_float64(Phong()) if lit else None, jit=make is smooth)
+        scene = volume, transfer, around(volume).zoom(2.5), march, jv.Over()
+        check_gradients(scene, {}, lighting=to_float64(Phong()) if lit else None, jit=make is smooth)
 
 
 def test_nothing_that_is_steep_has_no_gradient_by_its_magnitude():

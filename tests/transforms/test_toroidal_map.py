@@ -27,7 +27,7 @@ PROBES = {
     "across the middle": (20.0, 30.0, (0.9, 2.3), (0.8, 2.4), (0.0, 60.0)),
     "apex behind the axis": (-15.0, 40.0, (HALF - 0.5, HALF + 0.6), (HALF - 0.6, HALF + 0.4), (5.0, 55.0)),
     "above the middle": (20.0, 30.0, (1.9, 2.6), (1.75, 2.5), (10.0, 60.0)),
-    "below the middle": (8.0, 12.0, (0.4, 1.2), (0.5, 1.3), (-4.0, 60.0)),
+    "below the middle": (8.0, -12.0, (0.4, 1.2), (0.5, 1.3), (20.0, 84.0)),  # b < 0
     "half a turn": (20.0, 15.0, (0.0, np.pi), (0.3, 2.9), (0.0, 60.0)),
     "apex on the axis": (0.0, 25.0, (1.0, 2.0), (0.9, 2.4), (0.0, 40.0)),
 }
@@ -117,7 +117,8 @@ def entered(probe, origins, directions):
 
 @eqx.filter_jit
 def mapped(probe, points, toroidal):
-    return probe.to_toroidal(points), probe.to_world(toroidal), probe.corners, probe.bounds, probe.center
+    extent = *probe.corners, probe.bounds, probe.center
+    return probe.to_toroidal(points), probe.to_world(toroidal), extent, probe.nearest_to_axis
 
 
 @pytest.mark.parametrize("name", PROBES)
@@ -126,18 +127,21 @@ def test_map_inverse_and_bounds_are_those_of_the_printed_formula(name):
     swept = nodes(probe, (17, 18, 19))[1:-1, 1:-1, 1:-1]
     points = world_of(swept, a, b)
     with in_float64():
-        found, world, corners, bounds, center = mapped(jv.ToroidalMap(*probe), points, swept)
+        found, world, (low, high, bounds, center), nearest = mapped(jv.ToroidalMap(*probe), points, swept)
         np.testing.assert_allclose(found, printed_map(points, a, b), atol=1e-11)
         np.testing.assert_allclose(found, swept, atol=1e-11)
         np.testing.assert_allclose(world, points, atol=1e-11)
     outer = world_of(nodes(probe, (301, 301, 2)), a, b).reshape(-1, 3)  # extremes lie on the γ faces
     size = np.ptp(outer, axis=0).max()
-    low, high = (np.asarray(corner) for corner in corners)
+    low, high = np.asarray(low), np.asarray(high)
     assert (outer.min(axis=0) >= low - 1e-6 * size).all()
     assert (outer.max(axis=0) <= high + 1e-6 * size).all()
     np.testing.assert_allclose([low, high], [outer.min(axis=0), outer.max(axis=0)], atol=1e-4 * size)
     np.testing.assert_allclose(bounds, np.stack([low, high], -1).ravel())
     np.testing.assert_allclose(center, (low + high) / 2)
+    # ρ = a + (b + γ) cos(σ - π/2), least of all samples; negative if the axis lies beyond
+    _, angle, depth = np.moveaxis(nodes(probe, (2, 40, 40)), -1, 0)
+    np.testing.assert_allclose(nearest, np.min(a + (b + depth) * np.cos(angle - HALF)), atol=1e-4)
 
 
 def singular_points(probe):
@@ -319,10 +323,9 @@ def ramp_transfer(top=0.06):
     return jv.TransferFunction([0.0, 0.3, 1.0], np.array(colors, float), [0.0, 0.0, top])
 
 
-def view(probe):
+def view():
     """A camera at the side, several of whose rays cross the hollow."""
-    position, target = (40.0, -190.0, 20.0), probe.center - jnp.asarray([0.0, 0.0, 18.0])
-    return jv.Camera(position, target, (0, 0, -1), 30.0, size=SIZE)
+    return jv.Camera((40.0, -190.0, 20.0), (1.83, 2.46, 52.0), (0, 0, -1), 30.0, size=SIZE)
 
 
 def independent_march(volume, probe, transfer, camera, step, midpoint, align):
@@ -356,14 +359,12 @@ def independent_march(volume, probe, transfer, camera, step, midpoint, align):
     return np.stack([np.sum(weight * c, axis=1) for c in (*colors, 1 + 0 * value)], -1), most
 
 
-@pytest.mark.parametrize(
-    ("align", "quadrature"), [(True, "midpoint"), *slow((False, "left"), (False, "midpoint"))]
-)
+@pytest.mark.parametrize(("align", "quadrature"), [(True, "midpoint"), *slow((False, "left"))])
 def test_an_independent_marcher_sees_the_same(align, quadrature):
     with in_float64():
         probe, transfer, volume = jv.ToroidalMap(*MIDDLE), ramp_transfer(), noise_volume()
         march = jv.March(5.3, (*(jv.AlphaCorrection(),) * align, probe), quadrature)
-        camera = view(probe)
+        camera = view()
         rgba = jv.render(volume, transfer, camera, march).rgba.reshape(-1, 4)
         expected, most = independent_march(
             volume, MIDDLE, transfer, camera, 5.3, quadrature == "midpoint", align
@@ -375,7 +376,6 @@ def test_an_independent_marcher_sees_the_same(align, quadrature):
 EVERYTHING = jv.Jitter(1, "blue"), jv.EmptySpaceJitter(2), jv.AlphaCorrection(), jv.EarlyTermination(0.1)
 COMBINED = {
     "integrated": ("preintegrated", (jv.AlphaCorrection(), jv.SpaceLeaping())),
-    "jittered": ("left", (jv.Jitter(3), jv.AlphaCorrection(), jv.EarlyTermination(0.1))),
     "all": ("midpoint", EVERYTHING),
 }
 
@@ -385,7 +385,7 @@ def test_it_composes_with_other_transforms(name):
     """At any place among them, and in the reference."""
     quadrature, others = COMBINED[name]
     probe = jv.ToroidalMap(*MIDDLE)
-    volume, transfer, camera = noise_volume(), ramp_transfer(), view(probe)
+    volume, transfer, camera = noise_volume(), ramp_transfer(), view()
     rendering = jv.render(volume, transfer, camera, jv.March(5.3, (*others, probe), quadrature))
     np.testing.assert_allclose(rendering.rgba[..., 0], rendering.rgba[..., 3], atol=1e-6)
     assert float(rendering.rgba[..., 3].max()) > 0.5
@@ -406,8 +406,8 @@ def test_it_composes_with_other_transforms(name):
         np.testing.assert_array_equal(rendering.samples, expected.samples)
 
 
-@pytest.mark.parametrize("adjoint", slow("replay", "forward"))
-def test_image_gradients_in_the_probe_match_central_differences(adjoint):
+@pytest.mark.slow
+def test_image_gradients_in_the_probe_match_central_differences():
     """From beside the probe, where rays meet gaps."""
     with in_float64():
         volume = jv.Volume(np.random.default_rng(0).random((6, 5, 7)))
@@ -417,7 +417,7 @@ def test_image_gradients_in_the_probe_match_central_differences(adjoint):
         names = "a", "b", "beta_range", "sigma_range", "gamma_range"
         parameters = {name: lambda scene, name=name: getattr(scene[3].transforms[0], name) for name in names}
         scene = volume, ramp_transfer(), camera, march, jv.Over()
-        check_gradients(scene, parameters, adjoint, constant={"spacing", "origin"})
+        check_gradients(scene, parameters, constant={"spacing", "origin"})
 
 
 # ---- phantoms, a real scan, bad input ----
@@ -463,19 +463,6 @@ def test_the_real_scan_renders(real_volume):
 
 
 GOOD = {"a": 20.0, "b": 30.0, "beta_range": (1, 2), "sigma_range": (1, 2), "gamma_range": (0, 60)}
-
-
-def test_the_sample_nearest_to_the_axis_is_that_of_the_formula():
-    """ρ = a + (b + γ) cos(σ - π/2), least of all samples; negative if the axis lies beyond."""
-    for probe in PROBES.values():
-        _, angle, depth = np.moveaxis(nodes(probe, (2, 40, 40)), -1, 0)
-        for lower in (0.0, 60.0):
-            least = np.min(probe[0] - lower + (probe[1] + depth) * np.cos(angle - HALF))
-            found = jv.ToroidalMap(probe[0] - lower, *probe[1:]).nearest_to_axis
-            np.testing.assert_allclose(found, least, atol=1e-4)
-    # b may be negative, where depths begin beyond the apex
-    one = jv.ToroidalMap(**{**GOOD, "b": -5.0, "gamma_range": (35, 95)})
-    np.testing.assert_allclose(one.bounds, jv.ToroidalMap(**GOOD).bounds, rtol=1e-6)
 
 
 BAD = [
