@@ -131,8 +131,9 @@ class Camera(eqx.Module):
         view_up = finite_array("view_up", view_up, (3,))
         view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
         width, height = _image_size(size)
-        position, center, up, scale = _fitted_view(
-            volume, direction, view_up, view_angle, min(1, width / height)
+        center = volume.center
+        position, up, scale = _fitted_view(
+            volume.corners, center, direction, view_up, view_angle, np.float32(min(1, width / height))
         )
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
@@ -241,24 +242,25 @@ def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
 # Jitted: the first image would have to wait for a program per operation.
 
 
-@eqx.filter_jit
+@jax.jit
 def _fitted_view(
-    volume: Volume,
+    corners: tuple[Float[Array, "3"], Float[Array, "3"]],
+    center: Float[Array, "3"],
     direction: Float[Array, "3"],
     view_up: Float[Array, "3"],
     view_angle: Float[Array, ""],
-    aspect: float,
-) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """Position, focal point, up direction and parallel scale of the view that holds a volume's bounding
-    sphere. `aspect` is width over height, at most 1."""
-    low, high = volume.corners
-    radius = jnp.linalg.norm(high - low) / 2
+    aspect: Float[Array, ""] | np.floating,
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
+    """Position, up direction and parallel scale of the view that holds a volume's bounding sphere. `aspect`
+    is width over height, at most 1."""
+    low, high = corners
+    radius, aspect = jnp.linalg.norm(high - low) / 2, jnp.asarray(aspect, view_angle.dtype)
     half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
-    position = volume.center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
+    position = center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
     y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
     other = jnp.where(_sine(y, direction) > ALONG, y, minus_z)
     up = jnp.where(_sine(view_up, direction) > ALONG, view_up, other)
-    return position, volume.center, up, radius / aspect
+    return position, up, radius / aspect
 
 
 @jax.jit

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
@@ -23,9 +24,7 @@ def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    linear = jnp.clip(jnp.asarray(linear), 0, 1)
-    curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
+    return _to_srgb(linear)
 
 
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
@@ -37,6 +36,21 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
+    return _from_srgb(display)
+
+
+# Jitted: one program for each shape, rather than one for each operation.
+
+
+@jax.jit
+def _to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
+    linear = jnp.clip(jnp.asarray(linear), 0, 1)
+    curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
+
+
+@jax.jit
+def _from_srgb(display: Arrayable) -> Float[Array, "*image"]:
     display = jnp.clip(jnp.asarray(display), 0, 1)
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 

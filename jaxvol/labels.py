@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ._util.checks import described, finite_array, integer, require
@@ -64,9 +65,9 @@ class LabelTransferFunction(Transfer):
         first = _continued(seen[0], points)
         hidden = TransferFunction(first.values, 0 * first.colors, 0 * first.extinction)
         each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
-        self.stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-        self.opacity = jnp.ones(len(each), self.stacked.extinction.dtype)
-        self.shown = jnp.ones(len(each), bool)
+        self.stacked = _stacked(each)
+        self.opacity = jnp.asarray(np.ones(len(each)), self.stacked.extinction.dtype)
+        self.shown = jnp.asarray(np.ones(len(each)), bool)
 
     def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
         """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
@@ -204,3 +205,8 @@ def _continued(function: TransferFunction, points: int) -> TransferFunction:
         jnp.concatenate([function.colors, jnp.repeat(function.colors[-1:], missing, axis=0)]),
         jnp.concatenate([function.extinction, jnp.repeat(function.extinction[-1:], missing)]),
     )
+
+
+@jax.jit
+def _stacked(functions: list[TransferFunction]) -> TransferFunction:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *functions)

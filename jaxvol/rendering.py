@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -123,8 +124,7 @@ class Rendering(eqx.Module):
                 f"background must be one colour (3,) or an image {(*self.rgba.shape[:-1], 3)}; "
                 f"got shape {background.shape}."
             )
-        background = jnp.broadcast_to(background, (*self.rgba.shape[:-1], 3))
-        return self.rgba[..., :3] + (1 - self.rgba[..., 3:]) * background
+        return _over(self.rgba, background)
 
     def _background(self, background: Any) -> Float[Array, "..."]:
         """The background as an array. A traced one may be NaN, which then shows in the image."""
@@ -137,3 +137,9 @@ class Rendering(eqx.Module):
             if not np.all(finite(background)):
                 raise ValueError("background must be finite; got NaN or infinity.")
         return jnp.asarray(background, self.rgba.dtype)
+
+
+@jax.jit
+def _over(rgba: Float[Array, "*rays 4"], background: Float[Array, "..."]) -> Float[Array, "*rays 3"]:
+    background = jnp.broadcast_to(background, (*rgba.shape[:-1], 3))
+    return rgba[..., :3] + (1 - rgba[..., 3:]) * background

@@ -410,6 +410,6 @@ def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[A
     return _extinction(opacity, unit_distance)
 
 
-@jax.jit
+@jax.jit  # one program, rather than one for each operation
 def _extinction(opacity: Float[Array, " n"], unit_distance: Float[Array, ""]) -> Float[Array, " n"]:
     return -jnp.log1p(-jnp.minimum(opacity, 1 - 2.0**-24)) / unit_distance

@@ -96,8 +96,10 @@ def inside(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
 def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
     """An orthographic camera outside the volume, looking along +z."""
     low, high = volume.corners
-    position = volume.center - jnp.asarray([0.0, 0.0, 1.0]) * (high - low)[2]
-    return jv.Camera(position, volume.center, (0, 1, 0), size=size, parallel_scale=0.55 * (high - low)[1])
+    low, high = np.asarray(low), np.asarray(high)
+    center, extent = (low + high) / 2, high - low
+    position = center - np.array([0, 0, extent[2]])
+    return jv.Camera(position, center, (0, 1, 0), size=size, parallel_scale=0.55 * extent[1])
 
 
 LEAVES: dict[str, Callable] = {
@@ -167,7 +169,7 @@ def to_float64(tree):
 
     def double(leaf):
         if eqx.is_inexact_array(leaf) and leaf.ndim < 3:
-            return jnp.asarray(np.asarray(leaf, np.float64))
+            return jax.device_put(np.asarray(leaf, np.float64))
         return leaf
 
     return jax.tree.map(double, tree)

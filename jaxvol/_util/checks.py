@@ -102,7 +102,7 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
     shape_text = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
     given = value if is_traced(value) or isinstance(value, jax.Array) else _numbers(value)
     try:
-        if given is value and not isinstance(value, jax.Array):  # a sequence that holds traced numbers
+        if is_traced(value) and not isinstance(value, jax.Array):  # a sequence that holds traced numbers
             given = jnp.asarray(value)
         if given is None or jnp.issubdtype(given.dtype, jnp.complexfloating):
             raise TypeError

@@ -31,7 +31,7 @@ def seed_word(seed: int | Any) -> UInt32[Array, ""]:
             raise ValueError(f"seed must be an integer, or a key of jax.random; got {described(seed)}.")
         return seed.astype(jnp.uint32)
     word = integer("seed", seed, 0, 2**32 - 1, otherwise=", or a key of jax.random")
-    return jnp.asarray(np.uint32(word))
+    return jnp.asarray(word, jnp.uint32)
 
 
 def is_key(seed: Any) -> bool:

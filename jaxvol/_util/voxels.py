@@ -29,10 +29,10 @@ def voxel_array(data: Arrayable) -> Array:
     if data.size > MOST_VOXELS:
         raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
     if data.dtype.kind in "bui" and str(data.dtype) not in DTYPES:
-        return jnp.asarray(_narrow(data))
+        return on_device(_narrow(data))
     check_type(data.dtype)
     if data.dtype.kind in "ui":
-        return jnp.asarray(data)
+        return on_device(data)
     if is_traced(data):
         message = "data must be finite; got some voxels that are NaN or infinite. Replace them first."
         return require(jnp.asarray(data), finite, message)
@@ -46,7 +46,12 @@ def voxel_array(data: Arrayable) -> Array:
             f"data must be finite{beyond}; got {np.sum(~finite(stored))} of {stored.size} voxels that are "
             "NaN or infinite. Replace them, or rescale all, first."
         )
-    return jnp.asarray(stored if stored.dtype != data.dtype else data)
+    return on_device(stored if stored.dtype != data.dtype else data)
+
+
+def on_device(array: Array | np.ndarray) -> Array:
+    """As an array of JAX, which compiles a program for each shape unless it is told the type."""
+    return jnp.asarray(array, array.dtype)
 
 
 def check_shape(shape: tuple[int, ...]) -> None:
@@ -95,14 +100,14 @@ def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
     if labels.dtype.kind == "b":
         return jnp.asarray(labels, jnp.uint8)
     if labels.dtype.itemsize < 4 or labels.dtype == np.int32 or is_traced(labels):
-        return jnp.asarray(labels)
+        return on_device(labels)
     low, high = int(labels.min()), int(labels.max())
     if low < -(2**31) or high >= 2**31:
         raise ValueError(
             f"labels must lie within int32; got {labels.dtype} from {low} to {high}. Renumber them: "
             "np.unique(labels, return_inverse=True)."
         )
-    return jnp.asarray(np.asarray(labels).astype(np.int32))
+    return on_device(np.asarray(labels).astype(np.int32))
 
 
 def given_array(name: str, value: Arrayable) -> Array | np.ndarray:
@@ -110,7 +115,7 @@ def given_array(name: str, value: Arrayable) -> Array | np.ndarray:
     if isinstance(value, str | os.PathLike):
         raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
     if is_traced(value) or isinstance(value, jax.Array):
-        return jnp.asarray(value)
+        return value if isinstance(value, jax.Array) else jnp.asarray(value)
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(
             f"{name} must be an array without a mask; got a masked one. Fill it: data.filled(0)."

@@ -4,9 +4,9 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,7 +122,7 @@ class Stream:
         overlapping = probe if method == "overlap" else None
         check_part(stored_of(grid, margin, overlapping))
         summary = summary_of()
-        occupied = partial(marched.compositing.occupied, marched.transfer)
+        occupied = eqx.Partial(marched.compositing.occupied, marched.transfer)
         table = counted(summary.where(occupied))
         if counts is None and straight:
             rays = math.prod(marched.source.size)

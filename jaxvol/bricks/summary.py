@@ -8,8 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._util.axes import inverse
 from .._util.checks import integer
@@ -64,14 +66,14 @@ class Summary:
 
     def where(self, holds: Callable[[Blocks], Any]) -> np.ndarray:
         """For each block, whether something holds of it, such as `transfer.visible`: some layers of them at a
-        time, since a transfer function may take a hundred times their memory."""
+        time, since a transfer function may take a hundred times their memory. `holds` is a tree, if its
+        arrays are not to be constants of a program."""
         low, high = self.ranges["low"], self.ranges["high"]
         layers = max(1, AT_ONCE // low[0].size)
         found = []
         for begin in range(0, len(low), layers):
             some = slice(begin, begin + layers)
-            least, most = widened(jnp.asarray(low[some]), jnp.asarray(high[some]))
-            found.append(np.asarray(holds(Blocks(least, most, None))))
+            found.append(np.asarray(_holding(holds, low[some], high[some])))
         return np.concatenate(found)
 
     def blocks(self, low: Corner | None = None, high: Corner | None = None) -> Blocks:
@@ -184,3 +186,9 @@ def _merged(
 def _neutral(dtype: np.dtype, combine: np.ufunc) -> Any:
     limits = jnp.iinfo(dtype) if dtype.kind in "iu" else jnp.finfo(dtype)
     return limits.max if combine is np.minimum else limits.min
+
+
+@eqx.filter_jit
+def _holding(holds: Callable[[Blocks], Any], low: Array | np.ndarray, high: Array | np.ndarray) -> Array:
+    least, most = widened(jnp.asarray(low), jnp.asarray(high))
+    return holds(Blocks(least, most, None))

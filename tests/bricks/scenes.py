@@ -77,10 +77,15 @@ PLAIN = jv.March(0.5, (jv.Jitter(5),))
 
 def weighted(rendering):
     """A number that depends on colours and depths."""
-    height, width = rendering.rgba.shape[:2]
+    return _weighted(rendering.rgba, rendering.depth)
+
+
+@jax.jit
+def _weighted(rgba, depth):
+    height, width = rgba.shape[:2]
     weights = np.random.default_rng(1).normal(size=(height, width, 4)).astype(np.float32)
-    seen = jnp.where(jnp.isfinite(rendering.depth), rendering.depth, 0)
-    return jnp.sum(weights * rendering.rgba) + 1e-2 * jnp.sum(weights[..., 0] * seen)
+    seen = jnp.where(jnp.isfinite(depth), depth, 0)
+    return jnp.sum(weights * rgba) + 1e-2 * jnp.sum(weights[..., 0] * seen)
 
 
 def loss(extinction, position, render):

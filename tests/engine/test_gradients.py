@@ -149,7 +149,7 @@ RANDOM = {
 }
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(**RANDOM, step=st.floats(0.02, 0.2), dense=st.floats(0.5, 2), left=st.floats(0.01, 0.3))
 def test_leaps_show_in_no_image_and_no_gradient(on, seed, camera, step, dense, left):
     """Of 8-bit voxels, in float32."""
@@ -186,7 +186,7 @@ def double_scene(on, camera="inside", **values):
     return scene_of(switched(on, **values), "float64", camera, most=128)
 
 
-@settings(max_examples=4)
+@settings(max_examples=3)
 @given(**RANDOM, left=st.floats(0.01, 0.3))
 def test_every_adjoint_has_the_same_derivatives(on, seed, camera, left):
     """Of every leaf in float64: replay and forward mode of the fast engine, JAX's own of the reference."""
@@ -203,7 +203,7 @@ def test_every_adjoint_has_the_same_derivatives(on, seed, camera, left):
             assert abs(slope - dot) <= 1e-9 * np.linalg.norm(found[name]) + 1e-12, name
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(on=RANDOM["on"], seed=st.integers(0, 2**32 - 1))
 def test_gradients_are_central_differences(on, seed):
     """In a scene without jumps: the last cell is cut at the exit, no ray ends early, and the camera is in
@@ -239,14 +239,13 @@ def test_nan_and_infinity_reach_image_and_gradient():
         whole = {name: where for name, where in LEAVES.items() if name != "voxels"}
         whole["values"] = lambda scene: scene[1].values
         whole["opacity_left"] = lambda scene: scene[3].transforms[-1].inner.opacity_left
-        for adjoint in ("replay", "direct"):
-            for name, where in whole.items():
-                for fault in (np.nan, np.inf):
-                    leaf = where(scene)
-                    broken = eqx.tree_at(where, scene, leaf.at[(0,) * leaf.ndim].set(fault))
-                    image, found = gradient(broken, adjoint)
-                    assert np.isnan(image).all(), (name, fault)
-                    assert np.isnan(found["[1].colors"]).any(), (name, fault)
+        for name, where in whole.items():
+            for fault, adjoint in ((np.nan, "replay"), (np.inf, "replay"), (np.nan, "direct")):
+                leaf = np.array(where(scene))
+                leaf.flat[0] = fault
+                image, found = gradient(eqx.tree_at(where, scene, jax.device_put(leaf)), adjoint)
+                assert np.isnan(image).all(), (name, fault)
+                assert np.isnan(found["[1].colors"]).any(), (name, fault)
         for step in (0.0, -0.1):
             image, found = gradient(eqx.tree_at(LEAVES["step"], scene, jnp.asarray(step)))
             assert np.isnan(image).all()

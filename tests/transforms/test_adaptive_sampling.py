@@ -295,7 +295,8 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share, first):
 # -- what the image becomes ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tolerance", [1e-2, *slow(3e-2, 3e-3)])
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance", [3e-2, 1e-2, 3e-3])
 def test_a_real_volume_is_rendered_within_the_tolerance_by_fewer_samples(real_volume, tolerance):
     folder = real_volume("engine_256x256x128_uint8.raw.gz").parent
     volume, transfer, camera, step = real_scenes.engine(folder, 96)
@@ -432,7 +433,7 @@ def line(n=33):
     return jv.Volume(np.broadcast_to(x[:, None, None], (n, n, n)).copy())
 
 
-@pytest.mark.parametrize("quadrature", ["midpoint", "left", "preintegrated"])
+@pytest.mark.parametrize("quadrature", ["midpoint", *slow("left", "preintegrated")])
 def test_long_cells_do_not_reach_past_the_exit(quadrature):
     """In a constant, where all cells may be long, and which no `AlphaCorrection` cuts."""
     volume = jv.Volume(np.full((33, 33, 33), 0.5, np.float32))

@@ -204,15 +204,15 @@ def random_rays(spacing, data, transfer, seed):
 
 @pytest.mark.parametrize("method", ["hierarchy", *slow("distance")])
 def test_no_ray_misses_what_is_seen(method):
-    for case, (data, transfer) in ADVERSARIAL.items():
-        for seed, spacing in enumerate(SPACINGS):
-            volume, rays = jv.Volume(data, spacing), random_rays(spacing, data, transfer, seed)
-            whole, leapt = (
-                jv.render_rays(volume, transfer, *rays, jv.March(0.23, leaping((), method, on)))
-                for on in (False, True)
-            )
-            assert np.sum(whole.rgba[:, 3] > 0.05) > 40, case
-            assert_same(leapt, whole)
+    for seed, (case, (data, transfer)) in enumerate(ADVERSARIAL.items()):
+        spacing = SPACINGS[seed % 2]
+        volume, rays = jv.Volume(data, spacing), random_rays(spacing, data, transfer, seed)
+        whole, leapt = (
+            jv.render_rays(volume, transfer, *rays, jv.March(0.23, leaping((), method, on)))
+            for on in (False, True)
+        )
+        assert np.sum(whole.rgba[:, 3] > 0.05) > 40, case
+        assert_same(leapt, whole)
 
 
 @pytest.mark.slow
