@@ -45,7 +45,6 @@ def pytest_configure(config):
     The cache folder is new in each session and removed at its end, unless JAX_COMPILATION_CACHE_DIR names one
     to keep, with which a second session takes less than half the time."""
     fast = config.option.markexpr == "not slow"
-    typechecker.InnerFunctions.checked = not fast
     gc.set_threshold(100_000)  # what is traced is no garbage: to look through it takes a tenth of the time
     worker = hasattr(config, "workerinput")  # of pytest-xdist; it inherits the environment variables
     if not worker:

@@ -134,12 +134,11 @@ def test_rays_are_differentiable_in_the_camera():
 
 
 @pytest.mark.slow  # the fast tests compile other programs than users do
-@pytest.mark.parametrize("parallel_scale", [None, 2.1])
-def test_rays_round_alike_whether_or_not_they_are_differentiated(parallel_scale):
+def test_rays_round_alike_whether_or_not_they_are_differentiated():
     """Otherwise image, replay and forward mode would sample different positions, 1e-4 voxels apart."""
     # numbers that are not exact in float32
     place = (5.1, -6.2, 4.3), (0.53, 1.07, 0.9), (0.1, 0.2, 1.0)
-    camera = jv.Camera(*place, 33.3, size=(64, 64), parallel_scale=parallel_scale)
+    camera = jv.Camera(*place, 33.3, size=(64, 64), parallel_scale=None)
     volume = jv.Volume(np.ones((9, 9, 9), np.float32), (0.31, 0.37, 0.29))
     tiles = RayTiles.of(camera, Tiling())
 

@@ -87,7 +87,7 @@ SPARSE = jv.TransferFunction.from_points(
     ("name", "inside"),
     [
         ("hierarchy", False),
-        *slow(("jittered", False), ("clipped, distance", False), ("hollowed", True), ("beam", True)),
+        *slow(("clipped, distance", False), ("hollowed", True)),
     ],
 )
 def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):

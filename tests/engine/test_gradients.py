@@ -44,9 +44,6 @@ CAMERAS = {
 }
 """Position, focal point and view angle."""
 
-EXACT = ["hierarchy", "distance", "beam"]
-"""Methods that never leap over anything visible."""
-
 
 def blobs(dtype, seed=0):
     """Two blobs far from each other, and a third one cut by a corner of the volume."""
@@ -304,7 +301,7 @@ def test_rays_that_are_not_finite_fail_when_the_program_runs():
 USUAL = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05))
 
 
-@pytest.mark.parametrize("asked", ["voxels", *slow("extinction position", "step")])
+@pytest.mark.parametrize("asked", ["voxels", *slow("step")])
 def test_only_what_is_asked_for_is_computed_and_it_is_the_same(asked):
     """A program of its own for each set of leaves. In float64, to share that of all leaves."""
     with in_float64():
@@ -367,14 +364,13 @@ def test_vmap_is_a_loop_for_image_and_gradient():
 
 
 @slow_test
-@pytest.mark.parametrize("adjoint", ["forward", "direct"])
-def test_vmap_of_other_adjoints(adjoint):
+def test_vmap_of_forward_mode():
     volume, transfer, camera, march = scene_of(USUAL, most=128)
 
     def along_(view_angle):
         def of(angle):
             moved = eqx.tree_at(LEAVES["view_angle"], (volume, transfer, camera, march), angle)
-            return loss(moved, adjoint)[0]
+            return loss(moved, "forward")[0]
 
         return jax.jvp(of, (view_angle,), (jnp.ones_like(view_angle),))
 
@@ -403,7 +399,7 @@ def test_linearized_as_solvers_of_least_squares_do_it():
 
 
 @slow_test
-@pytest.mark.parametrize("dtype", ["uint16", "int16", "float32"])
+@pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_leaps_do_not_show_in_gradients_of_other_voxels(dtype):
     leapt, whole = (gradient(scene_of(t, dtype)) for t in (USUAL, (*USUAL[:2], USUAL[3])))
     shared = leapt[1].keys() & whole[1].keys() - {name for name in leapt[1] if "transforms" in name}
@@ -411,7 +407,7 @@ def test_leaps_do_not_show_in_gradients_of_other_voxels(dtype):
 
 
 @slow_test
-@pytest.mark.parametrize("method", [*EXACT, "min_distance"])
+@pytest.mark.parametrize("method", ["beam", "min_distance"])
 def test_forward_and_replay_gradients_agree_under_every_method(method):
     """Also for `"min_distance"`, whose image differs from that of the other methods."""
     transforms = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(method, 4))
@@ -428,9 +424,13 @@ def test_forward_and_replay_gradients_agree_under_every_method(method):
 
 
 @slow_test
-@pytest.mark.parametrize("quadrature", ["midpoint", "preintegrated"])
 @pytest.mark.parametrize(
-    "more", [(jv.AdaptiveSampling(0.03),), (jv.Clip(BOX, [PLANE], inside_out=True),)], ids=repr
+    ("quadrature", "more"),
+    [
+        ("preintegrated", (jv.AdaptiveSampling(0.03),)),
+        ("midpoint", (jv.Clip(BOX, [PLANE], inside_out=True),)),
+    ],
+    ids=["adaptive", "hollowed"],
 )
 def test_other_quadratures_long_cells_and_gaps(quadrature, more):
     transforms = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), *more)
@@ -512,7 +512,7 @@ FILES = {
 
 
 @slow_test
-@pytest.mark.parametrize("name", real_scenes.SCENES)
+@pytest.mark.parametrize("name", [real_scenes.PHANTOM, "engine", "lidc0314_airway"])
 def test_leaps_do_not_show_in_gradients_of_the_scenes_of_the_experiments(name, real_volume):
     folder = None if name == real_scenes.PHANTOM else real_volume(FILES[name]).parent
     scene = real_scenes.SCENES[name](folder, 128)

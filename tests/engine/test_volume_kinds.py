@@ -41,10 +41,9 @@ def test_a_custom_field_is_used_for_the_image():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_a_custom_field_is_used_for_image_and_gradient(dtype):
+def test_a_custom_field_is_used_for_image_and_gradient():
     """Compare the fast engine and its gradient with the reference on a volume of the field's values."""
-    volume = inverted(dtype)
+    volume = inverted("uint8")
     plain = jv.Volume(1 - np.asarray(volume.data, np.float32) / 255, volume.spacing)
     camera, transfer = around(volume), soft_transfer(1.0)
     # method "distance", since the beams of such a small image are as wide as the volume
@@ -62,25 +61,19 @@ def test_a_custom_field_is_used_for_image_and_gradient(dtype):
         (_, image), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
         return image, gradient
 
-    (image, (of_data, of_position)), (truth, (of_values, expected)) = (
+    (image, (_, of_position)), (truth, (_, expected)) = (
         of(volume, "replay"),
         of(plain, "direct"),
     )
     assert float(truth[..., 3].max()) > 0.3
     np.testing.assert_allclose(image, truth, atol=2e-5, rtol=0)
     np.testing.assert_allclose(of_position, expected, atol=2e-4 * float(np.linalg.norm(expected)), rtol=0)
-    if dtype == "float32":
-        expected = -of_values / 255
-        np.testing.assert_allclose(
-            of_data, expected, atol=2e-4 * float(np.linalg.norm(expected)) + 1e-6, rtol=0
-        )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
-def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype):
+def test_gradients_of_voxels_in_16_bits_are_summed_in_32():
     """Each voxel sums the gradients of thousands of samples, which 16 bits cannot hold."""
-    data = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.9, (4, 4, 4)), dtype)
+    data = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.9, (4, 4, 4)), "bfloat16")
     transfer, whole = soft_transfer(0.2), jv.Volume(data.astype(jnp.float32))
     camera, march = around(whole, (48, 48)), jv.March(0.07, (jv.AlphaCorrection(),))
 
@@ -92,7 +85,7 @@ def test_gradients_of_voxels_in_16_bits_are_summed_in_32(dtype):
 
     expected = gradient(data.astype(jnp.float32))
     error = np.abs(gradient(data) - expected).max() / np.abs(expected).max()
-    assert error < 2 * float(jnp.finfo(dtype).eps)
+    assert error < 2 * float(jnp.finfo("bfloat16").eps)
 
 
 class Nearest(jv.Field):

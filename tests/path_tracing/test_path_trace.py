@@ -143,9 +143,8 @@ def once_scattered(volume, transfer, camera, lights, anisotropy, samples=256, to
     return gathered.reshape(*np.asarray(camera.rays()[0]).shape)
 
 
-@pytest.mark.parametrize("view", [inside, *slow(around)])
-def test_opacity_is_that_of_absorption(view):
-    camera = view(NOISE)
+def test_opacity_is_that_of_absorption():
+    camera = inside(NOISE)
     traced = np.asarray(trace(NOISE, spiky(), camera, FURNACE).opacity)
     _, extinction, exits = matter(NOISE, spiky())
     points, _, width = middles_of(camera, exits, samples=2048)
@@ -193,7 +192,7 @@ def test_the_opacity_of_a_constant_volume_is_its_closed_form():
     assert np.max(nothing.opacity) == np.max(nothing.radiance) == np.max(nothing.standard_error) == 0
 
 
-@pytest.mark.parametrize("anisotropy", [0.8, *slow(0.0, -0.5)])
+@pytest.mark.parametrize("anisotropy", [0.8, *slow(-0.5)])
 def test_in_a_white_furnace_nothing_is_to_be_seen(anisotropy):
     white = spiky(10, np.ones((8, 3)))
     traced = trace(NOISE, white, around(NOISE), FURNACE, anisotropy=anisotropy)
@@ -373,17 +372,16 @@ def test_how_many_paths_go_on_side_by_side_does_not_show():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["uint8", "int16"])
-def test_the_type_of_voxels_does_not_show(kind):
+def test_the_type_of_voxels_does_not_show():
     whole = np.random.default_rng(0).integers(0, 100, (24,) * 3)
     transfer = jv.TransferFunction(np.linspace(0, 100, 40), np.full((40, 3), 0.8), np.linspace(0, 9, 40) ** 2)
     single, other = (
         trace(jv.Volume(whole.astype(dtype), (1 / 23,) * 3), transfer, far(cube(), 1.2), lit(SUN, LAMP, SKY))
-        for dtype in ("float32", kind)
+        for dtype in ("float32", "uint8")
     )
     np.testing.assert_allclose(single.radiance, other.radiance, rtol=1e-3, atol=1e-4)
     with in_float64():
-        volume = jv.Volume(whole.astype(kind), (1 / 23,) * 3)
+        volume = jv.Volume(whole.astype("uint8"), (1 / 23,) * 3)
         double = trace(volume, transfer, far(cube(), 1.2), lit(SUN, LAMP, SKY))
     assert double.radiance.dtype == jnp.float32
     np.testing.assert_allclose(single.radiance.mean(), double.radiance.mean(), rtol=0.01)

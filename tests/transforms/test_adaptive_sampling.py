@@ -296,7 +296,7 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share, first):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance", [3e-2, 1e-2, 3e-3])
+@pytest.mark.parametrize("tolerance", [1e-2, 3e-3])
 def test_a_real_volume_is_rendered_within_the_tolerance_by_fewer_samples(real_volume, tolerance):
     folder = real_volume("engine_256x256x128_uint8.raw.gz").parent
     volume, transfer, camera, step = real_scenes.engine(folder, 96)
@@ -344,9 +344,8 @@ def smooth_march(adaptive=True, leaps=True, jitter=True, step=0.02, **how):
     return jv.March(step, transforms, "midpoint", **how)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", *slow("int16")])
-def test_both_engines_choose_the_same_cells_and_estimate_the_same_error(dtype):
-    volume, transfer = smooth(dtype)
+def test_both_engines_choose_the_same_cells_and_estimate_the_same_error():
+    volume, transfer = smooth("uint8")
     for inside in (False, True):
         camera = smooth_camera(inside)
         leapt, plain, unleapt, fine = (

@@ -119,8 +119,7 @@ def test_leaping_does_not_show(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("quadrature", ["midpoint", "preintegrated"])
+@pytest.mark.parametrize(("quadrature", "method"), [("midpoint", "distance"), ("preintegrated", "beam")])
 @settings(max_examples=25)
 @given(kind=KINDS, seed=SEEDS, step=st.floats(0.01, 0.3))
 def test_leaping_does_not_show_in_parallel_views_of_floats(quadrature, method, kind, seed, step):
@@ -216,19 +215,17 @@ def test_no_ray_misses_what_is_seen(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["hierarchy", "beam"])
-@pytest.mark.parametrize("cell", [5, 32])
+@pytest.mark.parametrize(("method", "cell"), [("hierarchy", 8), ("beam", 5), ("beam", 32)])
 def test_no_beam_misses_what_is_seen(cell, method):
-    for data, transfer in ADVERSARIAL.values():
-        for spacing in SPACINGS:
-            volume = jv.Volume(data, spacing)
-            for view in PERSPECTIVE.values():
-                camera = view(volume, (100, 100))
-                whole, leapt = (
-                    jv.render(volume, transfer, camera, jv.March(0.23, leaping((), method, on, cell)))
-                    for on in (False, True)
-                )
-                assert_same(leapt, whole)
+    for number, (data, transfer) in enumerate(ADVERSARIAL.values()):
+        volume = jv.Volume(data, SPACINGS[number % 2])
+        for view in PERSPECTIVE.values():
+            camera = view(volume, (100, 100))
+            whole, leapt = (
+                jv.render(volume, transfer, camera, jv.March(0.23, leaping((), method, on, cell)))
+                for on in (False, True)
+            )
+            assert_same(leapt, whole)
 
 
 # ---- what the published method misses, and invalid arguments ----
@@ -275,7 +272,7 @@ def test_bad_arguments_are_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["hierarchy", "beam"])
 def test_leaping_does_not_show_under_a_toroidal_map(method):
     seen = 0
     for name in ("spheres", "shells"):
@@ -296,9 +293,8 @@ def test_leaping_does_not_show_under_a_toroidal_map(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cut", [False, True])
-def test_labels_that_are_hidden_are_leapt_over(cut):
-    transforms = (jv.AlphaCorrection(labels=True),) if cut else ()
+def test_labels_that_are_hidden_are_leapt_over():
+    transforms = (jv.AlphaCorrection(labels=True),)
     data = np.random.default_rng(0).integers(60, 200, SHAPE).astype(np.uint8)
     labels = (X > 3).astype(int) + (X > 8) + 34 * (X + Y > 35)  # includes 35 and 36, which are invisible
     volume = jv.Volume(data, SPACING, labels=labels.astype(np.int32))

@@ -380,7 +380,7 @@ COMBINED = {
 }
 
 
-@pytest.mark.parametrize("name", slow(*COMBINED))
+@pytest.mark.parametrize("name", slow("all"))
 def test_it_composes_with_other_transforms(name):
     """At any place among them, and in the reference."""
     quadrature, others = COMBINED[name]
