@@ -94,7 +94,9 @@ SCENES = {
 
 @pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_independent_marcher(quadrature):
-    """In float64, where rounding decides of no sample."""
+    """In float64, where rounding decides of no sample. A clip that is inside out, which doubles the time to
+    compile, is among them under one quadrature."""
+    without = () if quadrature == "midpoint" else ("hollow",)
 
     @settings(max_examples=12)
     @given(on=switch.SUBSETS, **SCENES)
@@ -107,8 +109,9 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
                 return to_float64(jv.March(step, transforms, quadrature, max_samples=most))
 
             scene = volume, transfer, camera
+            on = on.difference(without)
             rgba, samples = oracle_image(*scene, march(switch.plain(on, **values)))
-            switched = switch.switched(on, **values)
+            switched = switch.switched(on, without, **values)
             fast = jv.render(*scene, march(switched))
             assert fast.rgba.dtype == jnp.float64
             np.testing.assert_allclose(fast.rgba, rgba, atol=1e-10, rtol=0)

@@ -273,15 +273,11 @@ WAYS: dict[str, tuple[jv.March, dict[str, Any]]] = {
     ),
     "templates": (
         jv.March(0.5, (jv.SpaceLeaping("distance"),)),
-        {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), SUN)},
+        {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), SUN, templates=1, photons=4)},
     ),
     "isosurface": (
         jv.March(0.5, (jv.SpaceLeaping(),)),
         {"compositing": jv.Isosurface(100), "lighting": Phong()},
-    ),
-    "maximum by two dimensions": (
-        jv.March(0.5, (jv.SpaceLeaping(),)),
-        {"compositing": "maximum", "transfer": jv.TransferFunction2D.from_transfer(TRANSFER, (0.0, 60.0))},
     ),
 }
 
@@ -312,7 +308,7 @@ def test_random_splits_and_cameras_look_like_the_whole(engine):
         jv.Camera(
             center + rng.normal(size=3) * far, center + rng.normal(size=3), (0, 1, 0.1), 60.0, size=(32, 32)
         )
-        for far in (5, 60, 400)
+        for far in (5, 400)
     ]
     cameras += [jv.Camera((400, 300, 500), center, (0, 1, 0), parallel_scale=100.0, size=(32, 32))]
     for camera in cameras:

@@ -91,7 +91,7 @@ KINDS = st.sampled_from(["noise", "sparse", "half", "blobs"])
 SEEDS = st.integers(0, 10**6)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["hierarchy", "beam", *slow("distance")])
 def test_leaping_does_not_show(method):
     """In random scenes, each volume after another one, so that nothing stale is used; and saves samples."""
     transforms = MOVING if method == "hierarchy" else MOVING[:1]
@@ -177,7 +177,7 @@ ADVERSARIAL = {
     "vessel, only slopes visible": (vessel((23, 0, 27), (1, 19, 3)), BETWEEN),
 }
 SPACINGS = [(1.0, 1.0, 1.0), (0.5, 1.3, 2.0)]
-RAYS = 4096
+RAYS = 2048
 
 
 def visible_places(data, transfer, count, rng):
@@ -210,7 +210,7 @@ def test_no_ray_misses_what_is_seen(method):
             jv.render_rays(volume, transfer, *rays, jv.March(0.23, leaping((), method, on)))
             for on in (False, True)
         )
-        assert np.sum(whole.rgba[:, 3] > 0.05) > 40, case
+        assert np.sum(whole.rgba[:, 3] > 0.05) > 20, case
         assert_same(leapt, whole)
 
 
