@@ -3,12 +3,12 @@
     python -m experiments.compare 77f9c25 HEAD
     python -m experiments.compare HEAD~3 HEAD~2 HEAD~1 HEAD --kinds image --only engine bonsai
 
-The first commit is the baseline. Processes stay alive while frames are taken, so that a machine that becomes
-slower meanwhile slows all of them alike. Printed are, for each scene, each kind of frame and each commit, the
+The first commit is the baseline. Frames are taken in turn, so that a machine that becomes slower
+meanwhile slows all commits alike. Printed are, for each scene, each kind of frame and each commit, the
 median of the paired ratios to the baseline, with its 95 % interval; and their geometric means. Kinds:
 "image" (leaps, alignment and early termination, by the midpoint rule, at steps of a voxel), "gradient" (of a
 loss by the transfer function, with the image), "shaded" (Phong), and "first": seconds from the start of a
-process to its first image, compiled anew, of which three are taken in turn.
+process to its first image, compiled anew, three of them in turn.
 
 A commit is checked out into a temporary folder; WORKTREE stands for the files as they are. Run it on a
 machine that does nothing else, before anything lands in the hot path: `engine/`, `march`, `reference`,
@@ -17,6 +17,7 @@ one, only the phantom is measured.
 """
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -47,24 +48,35 @@ class Worker:
     def __init__(self, tree: Path, folder: Path | None, names: list[str], kinds: list[str], size: int):
         given = [None if folder is None else str(folder), names, kinds, size]
         script = str(Path(__file__).with_name("compare_worker.py"))
-        self.command = [sys.executable, script, str(tree), *map(json.dumps, given)]
+        self.command = [sys.executable, "-W", "ignore", script, str(tree), *map(json.dumps, given)]
         self.tree = tree
+        self.process: subprocess.Popen[str] | None = None
 
     def start(self) -> "Worker":
         """Compiles all programs, and waits until they have run."""
+        # without a folder of programs, which would not be compiled
+        environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
         self.process = subprocess.Popen(
-            self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1, cwd=self.tree
+            self.command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            cwd=self.tree,
+            env=environment,
         )
         self.programs: list[str] = json.loads(self._line())
         return self
 
     def seconds(self, program: str) -> float:
         """Of one frame."""
+        assert self.process is not None
         assert self.process.stdin is not None
         self.process.stdin.write(program + "\n")
         return float(self._line())
 
     def _line(self) -> str:
+        assert self.process is not None
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
@@ -72,8 +84,9 @@ class Worker:
         return line
 
     def stop(self) -> None:
-        self.process.kill()
-        self.process.wait()
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
 
 
 def checked_out(commit: str, folder: Path) -> Path:
@@ -143,7 +156,9 @@ def draw(found: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     figure, panel = plt.subplots(figsize=(7, 0.28 * len(found) + 1.2), layout="constrained")
     base, *others = next(iter(found.values()))
     for y, of in enumerate(found.values()):
-        for number, commit in enumerate(each for each in others if each in of):
+        for number, commit in enumerate(others):
+            if commit not in of:
+                continue
             row, place = of[commit], y + 0.15 * (number - (len(others) - 1) / 2)
             panel.plot((row["low"], row["high"]), (place, place), color=f"C{number}", linewidth=2, alpha=0.5)
             panel.plot(row["median"], place, "o", color=f"C{number}", label=commit if y == 0 else None)
@@ -174,12 +189,14 @@ def main(chosen: Namespace) -> common.Answer:
         taken: dict[str, dict[str, list[float]]] = {}
         if kinds := [kind for kind in chosen.kinds if kind != "first"]:
             made = {c: Worker(tree, folder, names, kinds, chosen.size) for c, tree in trees.items()}
-            with ThreadPoolExecutor(2) as pool:
-                workers = dict(zip(made, pool.map(Worker.start, made.values()), strict=True))
-            print("all programs are compiled", flush=True)
-            taken |= frames(workers, chosen.repetitions)
-            for worker in workers.values():
-                worker.stop()
+            try:
+                with ThreadPoolExecutor(2) as pool:
+                    workers = dict(zip(made, pool.map(Worker.start, made.values()), strict=True))
+                print("all programs are compiled", flush=True)
+                taken |= frames(workers, chosen.repetitions)
+            finally:
+                for worker in made.values():
+                    worker.stop()
         if "first" in chosen.kinds:
             taken[f"{names[0]}: first"] = first_images(trees, folder, names[0], chosen.size)
     found = ratios(taken, chosen.commits[0])

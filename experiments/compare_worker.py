@@ -7,7 +7,6 @@ seconds are printed. The first line printed names the programs, without those th
 
 import importlib.util
 import json
-import os
 import sys
 import time
 from pathlib import Path
@@ -58,7 +57,6 @@ def main():
     made = programs(folder and Path(folder), names, kinds, size)
     for each in made.values():
         jax.block_until_ready(each())
-        jax.block_until_ready(each())
     print(json.dumps(list(made)), flush=True)
     for line in sys.stdin:
         begun = time.perf_counter()
@@ -67,5 +65,4 @@ def main():
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("PYTHONWARNINGS", "ignore")
     main()

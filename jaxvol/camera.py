@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from ._util.checks import Arrayable, described, finite_array, flag, integer, number, require
 from ._util.vec3 import Scalar, Vec3, along, apart
-from .volume import Volume
+from .volume import Volume, corners_of
 
 
 ALONG = 1e-3
@@ -131,9 +131,10 @@ class Camera(eqx.Module):
         view_up = finite_array("view_up", view_up, (3,))
         view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
         width, height = _image_size(size)
-        center = volume.center
-        position, up, scale = _fitted_view(
-            volume.corners, center, direction, view_up, view_angle, np.float32(min(1, width / height))
+        cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
+        place = volume.origin, volume.spacing, volume.direction, cells
+        position, center, up, scale = _fitted_view(
+            place, direction, view_up, view_angle, min(1.0, width / height)
         )
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
@@ -244,23 +245,22 @@ def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
 
 @jax.jit
 def _fitted_view(
-    corners: tuple[Float[Array, "3"], Float[Array, "3"]],
-    center: Float[Array, "3"],
+    place: tuple[Any, Any, Any, Any],
     direction: Float[Array, "3"],
     view_up: Float[Array, "3"],
     view_angle: Float[Array, ""],
-    aspect: Float[Array, ""] | np.floating,
-) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """Position, up direction and parallel scale of the view that holds a volume's bounding sphere. `aspect`
-    is width over height, at most 1."""
-    low, high = corners
-    radius, aspect = jnp.linalg.norm(high - low) / 2, jnp.asarray(aspect, view_angle.dtype)
+    aspect: Any,
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
+    """Position, focal point, up direction and parallel scale of the view that holds a volume's bounding
+    sphere. `place`: what `corners_of` takes. `aspect` is width over height, at most 1."""
+    low, high = corners_of(*place)
+    center, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
     half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
     position = center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
     y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
     other = jnp.where(_sine(y, direction) > ALONG, y, minus_z)
     up = jnp.where(_sine(view_up, direction) > ALONG, view_up, other)
-    return position, up, radius / aspect
+    return position, center, up, radius / aspect
 
 
 @jax.jit

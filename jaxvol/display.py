@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from ._util.checks import Arrayable, described, integer, output_file
+from ._util.checks import Arrayable, described, integer, is_traced, output_file
 from ._util.whole_files import whole_file
 
 
@@ -24,7 +24,7 @@ def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    return _to_srgb(linear)
+    return _to_srgb(_array(linear))
 
 
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
@@ -36,7 +36,13 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    return _from_srgb(display)
+    return _from_srgb(_array(display))
+
+
+def _array(values: Arrayable) -> Array | np.ndarray:
+    if isinstance(values, jax.Array):
+        return values
+    return jnp.asarray(values) if is_traced(values) else np.asarray(values)
 
 
 # Jitted: one program for each shape, rather than one for each operation.
@@ -44,14 +50,14 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
 @jax.jit
 def _to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
-    linear = jnp.clip(jnp.asarray(linear), 0, 1)
+    linear = jnp.clip(linear, 0, 1)
     curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
 @jax.jit
 def _from_srgb(display: Arrayable) -> Float[Array, "*image"]:
-    display = jnp.clip(jnp.asarray(display), 0, 1)
+    display = jnp.clip(display, 0, 1)
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 

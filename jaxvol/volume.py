@@ -140,16 +140,12 @@ class Volume(eqx.Module):
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """World positions of the first and the last node."""
-        if self.direction is not None:
-            # not by a matrix product, which some GPUs round to 10 bits
-            along = self.direction * (self._steps * self.spacing)[None, :]
-            return self.origin, self.origin + jnp.sum(along, axis=1)
-        return self.origin, self.origin + self._steps * self.spacing
+        return corners_of(self.origin, self.spacing, self.direction, self._steps)
 
     @property
-    def _steps(self) -> Float[Array, "3"]:
+    def _steps(self) -> Float[np.ndarray, "3"]:
         """Number of cells along x, y, z."""
-        return jnp.asarray(self.shape, self.spacing.dtype) - 1
+        return np.asarray(self.shape, self.spacing.dtype) - 1
 
     @property
     def center(self) -> Float[Array, "3"]:
@@ -235,6 +231,17 @@ class Volume(eqx.Module):
             return rise / jnp.maximum(after - before, 0.5)
 
         return slope(0), slope(1), slope(2)
+
+
+def corners_of(
+    origin: Float[Array, "3"], spacing: Float[Array, "3"], direction: Float[Array, "3 3"] | None, cells: Any
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """World positions of the first and the last node of a grid of so many cells along x, y, z."""
+    along = cells.astype(spacing.dtype) * spacing
+    if direction is not None:
+        # not by a matrix product, which some GPUs round to 10 bits
+        along = jnp.sum(direction * along[None, :], axis=1)
+    return origin, origin + along
 
 
 def _turn(direction: Arrayable) -> Float[Array, "3 3"] | None:

@@ -1,8 +1,8 @@
 """How many programs does a session compile, which tests need them, and how long does that take?
 
-The number does not depend on the machine, so that it can be a budget: `pytest --most-programs N` fails above
-it. Counted are the new entries of the compilation cache that all processes of a session share, those of
-kernels and subprocesses among them.
+The number does not depend on how fast the machine is, so that it can be a budget: `pytest --most-programs N`
+fails above it. Counted are the new entries of the compilation cache that all processes of a session share,
+those of kernels and subprocesses among them.
 """
 
 from collections import Counter, defaultdict

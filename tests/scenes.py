@@ -3,8 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from itertools import combinations
-from typing import Any, ClassVar, get_args
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -62,19 +61,6 @@ def anisotropic_noise(seed: int = 0) -> jv.Volume:
     return jv.Volume(data, spacing=(0.05, 0.08, 0.11), origin=(0.3, -1.2, 0.4))
 
 
-def counting() -> type[Any]:
-    """A new class of transfer functions whose `traces` counts the programs traced with it."""
-
-    class Counting(jv.TransferFunction):
-        traces: ClassVar[int] = 0
-
-        def classification(self, volume):
-            Counting.traces += 1
-            return super().classification(volume)
-
-    return Counting
-
-
 VOLUMES: dict[str, Callable[[], jv.Volume]] = {
     "sphere": lambda: scaled_phantom("sphere"),
     "cut_block": lambda: scaled_phantom("cut_block"),
@@ -119,40 +105,8 @@ LEAVES: dict[str, Callable] = {
 
 CAMERAS = {"around": around, "inside": inside, "orthographic": orthographic}
 
-KINDS: dict[str, jv.Transform] = {
-    "jittered": jv.Jitter(3),
-    "empty-space jittered": jv.EmptySpaceJitter(4),
-    "aligned": jv.AlphaCorrection(),
-    "terminated": jv.EarlyTermination(0.05),
-}
-
-TRANSFORMS: dict[str, tuple[jv.Transform, ...]] = {
-    ", ".join(names) or "plain": tuple(KINDS[name] for name in names)
-    for count in range(len(KINDS) + 1)
-    for names in combinations(KINDS, count)
-}
-"""Every subset of `KINDS`."""
-
-TRANSFORMS["front residual, aligned"] = (jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection())
-
 # They cut all of `VOLUMES`; the cameras inside of these lie inside the box, two of them before the plane.
 BOX, PLANE = (-0.45, 0.9, -0.9, 0.3, -0.7, 1.9), ((0.6, -0.4, 0.8), (-0.6, 0.8, -0.3))
-TRANSFORMS["clipped, aligned"] = (jv.Clip(BOX, [PLANE]), jv.AlphaCorrection())
-TRANSFORMS["hollowed, empty-space jittered, aligned"] = (
-    jv.Clip(BOX, [PLANE], inside_out=True),
-    jv.EmptySpaceJitter(4),
-    jv.AlphaCorrection(),
-)
-
-FEW = [
-    "plain",
-    "aligned",
-    "empty-space jittered, aligned, terminated",
-    "front residual, aligned",
-    "clipped, aligned",
-    "hollowed, empty-space jittered, aligned",
-]
-"""Names of a few sets that together contain every transform."""
 
 
 @contextmanager

@@ -1,8 +1,9 @@
 """A transform that a traced number turns on or off, so that all subsets of transforms share one program.
 
 `switch(transform, on)` answers the seams that the transform overrides: as it does where `on` is true, and by
-the defaults elsewhere. Programs of a march with it contain the transform whether it is on or not: that a
-transform which is not asked for costs nothing is for static tests to show.
+the defaults elsewhere. (The longest stride and the subdivision of steps are static: as if it were on.)
+Programs of a march with it contain the transform whether it is on or not: that a transform which is not asked
+for costs nothing is for static tests to show.
 """
 
 from functools import cache, partial
@@ -148,8 +149,13 @@ SEAMS = {
 }
 
 
+STATIC = "joins", "longest_stride", "subdivision"
+
+
 @cache
 def _class(kind: type[jv.Transform], part: str) -> type[_Switch]:
+    overridden = {name for name in vars(kind) if not name.startswith("_") and hasattr(jv.Transform, name)}
+    assert overridden <= {*SEAMS, *STATIC}, f"{kind.__name__} overrides what cannot be switched"
     members = {
         name: seam for name, seam in SEAMS.items() if getattr(kind, name) is not getattr(jv.Transform, name)
     }
@@ -178,6 +184,11 @@ SUBSETS = st.frozensets(st.sampled_from(NAMES)).filter(
     lambda on: all(not on.issuperset(pair) for pair in ALONE)
 )
 """Names of transforms that are on, drawn by hypothesis."""
+
+
+MOST = frozenset({"jitter", "shift", "clip", "alignment", "leaping", "termination"})
+OTHERS = frozenset({"residual", "shift", "hollow", "alignment", "leaping"})
+"""Between them, these contain every transform."""
 
 
 def transforms(seed=3, left=0.05, box=BOX, planes=(PLANE,)) -> dict[str, jv.Transform]:

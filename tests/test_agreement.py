@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 import jaxvol as jv
 
@@ -98,8 +98,10 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
     compile, is among them under one quadrature."""
     without = () if quadrature == "midpoint" else ("hollow",)
 
-    @settings(max_examples=12)
+    @settings(max_examples=10)
     @given(on=switch.SUBSETS, **SCENES)
+    @example(on=switch.MOST, seed=1, step=0.1, volume="noise", view="around", left=0.05)
+    @example(on=switch.OTHERS, seed=2, step=0.2, volume="sphere", view="inside", left=0.05)
     def check(on, seed, step, volume, view, left):
         with in_float64():
             volume, transfer = to_float64(VOLUMES[volume]()), to_float64(soft_transfer())
@@ -121,10 +123,6 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
             np.testing.assert_array_equal(reference.samples, samples)
             np.testing.assert_array_equal(fast.aligned, reference.aligned)
             assert "leaping" in on or np.array_equal(fast.samples, samples)
-            # energy: the weights of a ray and its transmittance sum to 1
-            white = jv.TransferFunction(transfer.values, np.ones((8, 3)), transfer.extinction)
-            rgba = np.asarray(jv.render(volume, white, camera, march(switched)).rgba)
-            np.testing.assert_allclose(rgba[..., 0], rgba[..., 3], atol=1e-12)
 
     check()
 
@@ -132,7 +130,12 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
 @pytest.mark.parametrize(
     ("file", "spacing", "points"),
     [
-        ("engine_256x256x128_uint8.raw.gz", (1, 1, 1), [(50, 0.0), (120, 0.05), (255, 0.3)]),
+        pytest.param(
+            "engine_256x256x128_uint8.raw.gz",
+            (1, 1, 1),
+            [(50, 0.0), (120, 0.05), (255, 0.3)],
+            marks=pytest.mark.slow,
+        ),
         (
             "lidc0314_airway_256x192x200_int16le.raw.gz",
             (0.78125, 0.78125, 1),

@@ -296,7 +296,8 @@ def leapt() -> Any:
     return volume, emphasised()
 
 
-@pytest.mark.parametrize(("make", "lit"), [(leapt, False), *slow((smooth, True))])
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "lit"), [(leapt, False), (smooth, True)])
 def test_gradients_match_central_differences(make, lit):
     """Of the transfer function, of the voxels through value and magnitude, of camera and spacing."""
     with in_float64():

@@ -67,6 +67,16 @@ def test_values_are_trilinear_and_voxels_keep_their_type(dtype):
     assert np.isnan(looked_up(jnp.asarray(data), np.full_like(NODES, np.nan))[0]).all()
 
 
+def test_an_array_that_changes_afterwards_does_not_change_the_volume():
+    """JAX shares the memory of an array that lies at a multiple of 64 bytes."""
+    memory = np.zeros(210 + 64, np.uint8)
+    data = memory[-memory.ctypes.data % 64 :][:210].reshape(SHAPE)
+    volume = jv.Volume(data, labels=data)
+    data[:] = 7
+    assert not np.any(volume.data)
+    assert not np.any(volume.labels)
+
+
 def test_gradients_are_derivatives_of_the_value_and_slopes_up_to_the_faces():
     data, inside = random_data("float32"), random_coordinates(-0.1)
     _, _, trilinear, _, slopes = looked_up(data, inside)

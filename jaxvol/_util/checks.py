@@ -100,10 +100,11 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
     """`value` as an array of JAX's default float type and of this shape (None: any length; a leading `...`:
     any axes)."""
     shape_text = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
-    given = value if is_traced(value) or isinstance(value, jax.Array) else _numbers(value)
     try:
-        if is_traced(value) and not isinstance(value, jax.Array):  # a sequence that holds traced numbers
-            given = jnp.asarray(value)
+        if isinstance(value, jax.Array):
+            given = value
+        else:  # a sequence may hold traced numbers
+            given = jnp.asarray(value) if is_traced(value) else _numbers(value)
         if given is None or jnp.issubdtype(given.dtype, jnp.complexfloating):
             raise TypeError
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below

@@ -50,8 +50,12 @@ def voxel_array(data: Arrayable) -> Array:
 
 
 def on_device(array: Array | np.ndarray) -> Array:
-    """As an array of JAX, which compiles a program for each shape unless it is told the type."""
-    return jnp.asarray(array, array.dtype)
+    """As an array of JAX, which does not change with the NumPy array that it was made of."""
+    if isinstance(array, jax.Array):
+        return array
+    # `device_put` shares the memory on a CPU, if it lies at a multiple of 64 bytes; `jnp.asarray` copies, but
+    # compiles a program for each shape
+    return jax.device_put(array.copy())
 
 
 def check_shape(shape: tuple[int, ...]) -> None:
@@ -114,8 +118,10 @@ def given_array(name: str, value: Arrayable) -> Array | np.ndarray:
     """`value` as a JAX array or, in native byte order, a NumPy array."""
     if isinstance(value, str | os.PathLike):
         raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
-    if is_traced(value) or isinstance(value, jax.Array):
-        return value if isinstance(value, jax.Array) else jnp.asarray(value)
+    if isinstance(value, jax.Array):
+        return value
+    if is_traced(value):
+        return jnp.asarray(value)
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(
             f"{name} must be an array without a mask; got a masked one. Fill it: data.filled(0)."

@@ -66,8 +66,8 @@ class Summary:
 
     def where(self, holds: Callable[[Blocks], Any]) -> np.ndarray:
         """For each block, whether something holds of it, such as `transfer.visible`: some layers of them at a
-        time, since a transfer function may take a hundred times their memory. `holds` is a tree, if its
-        arrays are not to be constants of a program."""
+        time, since a transfer function may take a hundred times their memory. `holds` is a
+        tree (`eqx.Partial`): a new lambda would be compiled anew."""
         low, high = self.ranges["low"], self.ranges["high"]
         layers = max(1, AT_ONCE // low[0].size)
         found = []

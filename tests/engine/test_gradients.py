@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 import jaxvol as jv
 from experiments import scenes as real_scenes
@@ -22,9 +22,6 @@ from experiments import scenes as real_scenes
 from .. import switch
 from ..scenes import LEAVES, in_float64, slow, to_float64
 from ..test_agreement import oracle_image
-
-
-slow_test = pytest.mark.slow
 
 
 SHAPE = (26, 21, 31)
@@ -89,7 +86,8 @@ def loss(scene, adjoint="replay"):
 
 def gradient(scene, adjoint="replay"):
     """The image, and the gradients of all leaves by their paths, but for what is constant to `"replay"`: the
-    random numbers of jitters. Those of extinctions of 0, which no march that leaps knows, are set to 0."""
+    random numbers of jitters. Derivatives by extinctions of 0 are set to 0: marches that leap do not compute
+    them."""
     found, image = eqx.filter_grad(functools.partial(loss, adjoint=adjoint), has_aux=True)(scene)
     return image, by_path(found, scene)
 
@@ -183,8 +181,10 @@ def double_scene(on, camera="inside", **values):
     return scene_of(switched(on, **values), "float64", camera, most=128)
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(**RANDOM, left=st.floats(0.01, 0.3))
+@example(on=switch.MOST, seed=1, camera="outside", left=0.05)
+@example(on=switch.OTHERS - {"hollow"}, seed=2, camera="inside", left=0.05)
 def test_every_adjoint_has_the_same_derivatives(on, seed, camera, left):
     """Of every leaf in float64: replay and forward mode of the fast engine, JAX's own of the reference."""
     with in_float64():
@@ -193,20 +193,22 @@ def test_every_adjoint_has_the_same_derivatives(on, seed, camera, left):
         other, expected = gradient(scene, "direct")
         np.testing.assert_allclose(image, other, atol=1e-12)
         assert_same(found, expected, 1e-9, rounding=1e-12)
-        # along a direction in which every leaf moves, by as much as makes all matter alike
-        way, expected = None, 0.0
+        # along one direction, in which every leaf moves, by 1 over the norm of its gradient
+        way, dot = None, 0.0
         for name, only in along(scene):
-            scale = 1 / max(np.linalg.norm(found[name]), 1e-9)
-            moved = jax.tree.map(lambda leaf, scale=scale: np.asarray(leaf) * scale, only)
+            norm = np.linalg.norm(found[name])
+            moved = jax.tree.map(lambda leaf, norm=norm: np.asarray(leaf) / norm if norm else 0 * leaf, only)
             way = moved if way is None else jax.tree.map(np.add, way, moved)
-            expected += np.vdot(found[name], at(moved, name))
+            dot += np.vdot(found[name], at(moved, name))
         forward = functools.partial(loss, adjoint="forward")
         slope = eqx.filter_jvp(lambda scene: forward(scene)[0], (scene,), (way,))[1]
-        assert abs(slope - expected) <= 1e-9 * len(found) + 1e-12
+        assert abs(slope - dot) <= 1e-9 * len(found)
 
 
-@settings(max_examples=2)
+@settings(max_examples=1)
 @given(on=RANDOM["on"], seed=st.integers(0, 2**32 - 1))
+@example(on=switch.MOST, seed=1)
+@example(on=switch.OTHERS - {"hollow"}, seed=2)
 def test_gradients_are_central_differences(on, seed):
     """In a scene without jumps: the last cell is cut at the exit, no ray ends early, and the camera is in
     empty space, so that the first transparent sample of each ray stays the same. Every leaf by itself."""
@@ -307,8 +309,8 @@ USUAL = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ear
 
 
 @pytest.mark.parametrize("asked", ["voxels", *slow("step")])
-def test_only_what_is_asked_for_is_computed_and_it_is_the_same(asked):
-    """A program of its own for each set of leaves. In float64, to share that of all leaves."""
+def test_a_gradient_of_some_leaves_is_that_of_all(asked):
+    """Which is another program. In float64, where that of all is compiled already."""
     with in_float64():
         scene = double_scene({"shift", "alignment", "leaping"})
         where = [LEAVES[name] for name in asked.split()]
@@ -368,7 +370,7 @@ def test_vmap_is_a_loop_for_image_and_gradient():
             assert_same(by_path(own, scene), by_path(found, scene), 1e-9, rounding=1e-12)
 
 
-@slow_test
+@pytest.mark.slow
 def test_vmap_of_forward_mode():
     volume, transfer, camera, march = scene_of(USUAL, most=128)
 
@@ -384,7 +386,7 @@ def test_vmap_of_forward_mode():
         np.testing.assert_allclose(many, each, rtol=1e-5, atol=1e-3)
 
 
-@slow_test
+@pytest.mark.slow
 def test_linearized_as_solvers_of_least_squares_do_it():
     volume, transfer, camera, march = scene_of(USUAL)
 
@@ -403,7 +405,7 @@ def test_linearized_as_solvers_of_least_squares_do_it():
 # Other types of voxels, methods, sizes and scenes.
 
 
-@slow_test
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_leaps_do_not_show_in_gradients_of_other_voxels(dtype):
     leapt, whole = (gradient(scene_of(t, dtype)) for t in (USUAL, (*USUAL[:2], USUAL[3])))
@@ -411,7 +413,7 @@ def test_leaps_do_not_show_in_gradients_of_other_voxels(dtype):
     assert_same(chosen(leapt[1], shared), chosen(whole[1], shared), 1e-4)
 
 
-@slow_test
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["beam", "min_distance"])
 def test_forward_and_replay_gradients_agree_under_every_method(method):
     """Also for `"min_distance"`, whose image differs from that of the other methods."""
@@ -428,7 +430,7 @@ def test_forward_and_replay_gradients_agree_under_every_method(method):
             assert_same(chosen(found, whole), whole, 1e-4)
 
 
-@slow_test
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quadrature", "more"),
     [
@@ -446,14 +448,14 @@ def test_other_quadratures_long_cells_and_gaps(quadrature, more):
     assert_same(chosen(leapt, whole), whole, 1e-4)
 
 
-@slow_test
+@pytest.mark.slow
 def test_float32_gradients_are_those_of_float64():
     single = gradient(scene_of(USUAL[:3]))[1]
     with in_float64():
         assert_same(single, gradient(scene_of(USUAL[:3]))[1], 1e-3)
 
 
-@slow_test
+@pytest.mark.slow
 def test_tiles_and_batches_of_rays_do_not_show():
     """1.07 million pixels: two tiles, and tens of batches."""
     found = []
@@ -464,7 +466,7 @@ def test_tiles_and_batches_of_rays_do_not_show():
     assert_same(chosen(found[0], found[1]), found[1], 1e-4)
 
 
-@slow_test
+@pytest.mark.slow
 @pytest.mark.parametrize("by_label", [True, False])
 def test_functions_by_label_and_rays_of_ones_own(by_label):
     """Replay with and without leaps, forward mode and differences."""
@@ -516,7 +518,7 @@ FILES = {
 }
 
 
-@slow_test
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [real_scenes.PHANTOM, "engine", "lidc0314_airway"])
 def test_leaps_do_not_show_in_gradients_of_the_scenes_of_the_experiments(name, real_volume):
     folder = None if name == real_scenes.PHANTOM else real_volume(FILES[name]).parent
@@ -549,7 +551,7 @@ def workspace(samples, size=512, resolution=256):
     return analysis.temp_size_in_bytes
 
 
-@slow_test
+@pytest.mark.slow
 def test_memory_of_the_gradient_does_not_grow_with_the_number_of_samples():
     few, many = workspace(128), workspace(2048)
     assert many <= 1.05 * few

@@ -2,7 +2,7 @@
 
 `python -m tests.faults` runs the tests that each fault names, with the fault in place: at least one must
 fail; and all of them once without any, which must pass. `--only TEXT` takes the faults whose names contain
-it, `-j 2` runs two at a time, `--list` lists them. Faults are in the files of this folder, by part of the
+it, `-j N` runs N at a time (2), `--list` lists them. Faults are in the files of this folder, by part of the
 library: those that happened, and those that are easy to make. Whoever mends a fault, or adds a seam, adds
 one.
 

@@ -18,7 +18,7 @@ from jaxvol.lighting import Deferred, DirectionalLight, HeadLight, Phong, PointL
 from jaxvol.lighting.shading import shade_sample
 from jaxvol.space import Affine, world_gradient
 
-from ..scenes import RESOLUTION, SIZE, TRANSFORMS, around, in_float64, slow
+from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, slow
 from .samples import check_gradient, image_of_reference, in_double, sample_at, surroundings
 
 
@@ -231,8 +231,8 @@ LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ea
     [
         (LEAPING, "uint8", "head", "midpoint"),
         *slow(
-            (TRANSFORMS["front residual, aligned"], "float32", "sun", "left"),
-            (TRANSFORMS["clipped, aligned"], "uint8", "all", "preintegrated"),
+            ((jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection()), "float32", "sun", "left"),
+            ((jv.Clip(BOX, [PLANE]), jv.AlphaCorrection()), "uint8", "all", "preintegrated"),
             ((*LEAPING, jv.AdaptiveSampling(0.01, longest=4)), "int16", "all", "left"),
         ),
     ],

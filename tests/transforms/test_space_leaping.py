@@ -17,7 +17,6 @@ from ..switch import switch
 SHAPE = (24, 20, 28)
 SPACING = (0.05, 0.06, 0.04)
 SIZE = (20, 16)
-METHODS = ["hierarchy", "distance", "beam"]
 MOVING = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05))
 
 
