@@ -1,14 +1,11 @@
 """Does `experiments.pareto` find the right fronts, resume, and make points again?"""
 
-import json
-import shlex
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from experiments import pareto, pareto_measure, pareto_points, pareto_reference, record
+from experiments import pareto, pareto_measure, pareto_points, pareto_reference
 from experiments.pareto_front import behind, front
 from experiments.pareto_points import BASE, SETTINGS, Setting
 from experiments.pareto_programs import Program
@@ -107,20 +104,3 @@ def test_bad_options_are_named(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             pareto.main(["--quick", *words, "--output", str(tmp_path)])
-
-
-@pytest.mark.slow
-def test_a_point_is_made_again_by_its_command(tmp_path, capsys):
-    pareto.main(["--quick", "--output", str(tmp_path), "--scene", OPAQUE])
-    result = record.read(tmp_path / "pareto.json")["result"]["scenes"][OPAQUE]
-    point = result["points"][BASE]
-    capsys.readouterr()
-    pareto.main([*shlex.split(point["command"])[3:], "--output", str(tmp_path)])
-    again = json.loads(capsys.readouterr().out.partition("\n")[2])
-    assert (again["rmse"], again["ssim"]) == (point["rmse"], point["ssim"])
-    assert (tmp_path / "pareto" / f"head-phantom-opaque, {pareto_measure.slug(BASE)}.png").is_file()
-    page = (tmp_path / "pareto.html").read_text(encoding="utf-8")
-    assert "/*DATA*/" not in page
-    pareto.main(["--quick", "--output", str(tmp_path), "--scene", OPAQUE])
-    assert "kept, " in capsys.readouterr().out
-    assert record.read(tmp_path / "pareto.json")["result"]["scenes"][OPAQUE] == result

@@ -14,7 +14,6 @@ import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.engine.acceleration import VolumeAcceleration
 from jaxvol.fitting.constraints import Free
-from jaxvol.lighting import Phong
 from jaxvol.occupancy import BLOCK, Blocks
 
 from .modes import Rays, check_gradients, numbers, scaled_transfer
@@ -297,14 +296,14 @@ def leapt() -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("make", "lit"), [(leapt, False), (smooth, True)])
-def test_gradients_match_central_differences(make, lit):
+@pytest.mark.parametrize("make", [leapt, smooth])
+def test_gradients_match_central_differences(make):
     """Of the transfer function, of the voxels through value and magnitude, of camera and spacing."""
     with in_float64():
         volume, transfer = to_float64(make())
         march = jv.March(0.23, (jv.AlphaCorrection(), jv.SpaceLeaping()), max_samples=32)
         scene = volume, transfer, around(volume).zoom(2.5), march, jv.Over()
-        check_gradients(scene, {}, lighting=to_float64(Phong()) if lit else None, jit=make is smooth)
+        check_gradients(scene, {}, jit=make is smooth)
 
 
 def test_nothing_that_is_steep_has_no_gradient_by_its_magnitude():

