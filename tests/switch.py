@@ -149,7 +149,7 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "longest_stride", "subdivision"
+STATIC = "joins", "ends_at_exit", "longest_stride", "subdivision"
 
 
 @cache

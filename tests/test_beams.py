@@ -3,6 +3,7 @@ in it?"""
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,8 +107,8 @@ def test_stretches_called_empty_contain_nothing_along_any_ray():
 def test_stretches_are_the_same_all_at_once(monkeypatch):
     seen = occupancy(np.random.default_rng(0).random(BLOCKS) < 0.005)
     boxes = [box_of(*corners)[0] for _, corners in beams(False)[-3:]]
-    box = jax.tree.map(lambda *leaves: jnp.stack(leaves), *boxes)
-    arguments = seen, seen.sums(), box, jnp.float32(0.05)
+    box = jax.tree.map(lambda *leaves: np.stack(leaves), *boxes)
+    arguments = seen, eqx.filter_jit(lambda seen: seen.sums())(seen), box, jnp.float32(0.05)
     in_turn, (looks, _) = counted(stretches, *arguments)
     monkeypatch.setattr(platform, "platform", lambda: "gpu")
     at_once, trips = counted(stretches, *arguments)

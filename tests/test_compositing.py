@@ -163,10 +163,11 @@ def test_leaps_are_over_what_cannot_win_alone():
     ):
         mode = MODES[name]
         transfer, _ = mode.marched(visible, jv.March(0.1), NOISE)
-        np.testing.assert_array_equal(mode.occupied(transfer, blocks)[:, 0, 0], expected, err_msg=name)
+        found = eqx.filter_jit(mode.occupied)(transfer, blocks)[:, 0, 0]
+        np.testing.assert_array_equal(found, expected, err_msg=name)
     labels = jnp.asarray([1, 1, 2], jnp.uint32).reshape(-1, 1, 1)
     transfer = jv.LabelTransferFunction({0: uniform_transfer(0.5), 1: uniform_transfer(0.0)})
-    assert np.all(MODES["maximum"].occupied(transfer, Blocks(low, high, labels)))
+    assert np.all(eqx.filter_jit(MODES["maximum"].occupied)(transfer, Blocks(low, high, labels)))
 
 
 # ---- what is refused, before anything is compiled ----

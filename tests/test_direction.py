@@ -238,7 +238,7 @@ def test_a_swept_sector_takes_no_direction():
     volume = jv.Volume(np.zeros((4, 4, 4), np.float32), direction=R)
     for use in (
         lambda: jv.March(1.0, (probe,)).locate(volume),
-        lambda: jv.scan_convert(volume, probe, shape=(4, 4, 4), spacing=5.0),
+        lambda: jv.scan_convert(volume, probe, shape=(4, 4, 4), spacing=5.0, origin=(0, 0, 0)),
     ):
         with pytest.raises(ValueError, match="volume has a direction, and ToroidalMap places"):
             use()

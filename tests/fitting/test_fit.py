@@ -21,11 +21,10 @@ from jaxvol.fitting.constraints import Free
 from jaxvol.fitting.residuals import Problem
 from jaxvol.metrics import psnr
 
-from ..scenes import RESOLUTION, soft_transfer
+from ..scenes import RESOLUTION, SIZE, soft_transfer
 
 
-SIZE = WIDTH, HEIGHT = 14, 10
-"""A fit renders hundreds of images."""
+WIDTH, HEIGHT = SIZE
 SOFT = soft_transfer(0.3)
 TRUTH = jv.TransferFunction(255 * np.asarray(SOFT.values), SOFT.colors, SOFT.extinction)
 GREY = jv.TransferFunction(TRUTH.values, np.full((8, 3), 0.5), np.full(8, 0.5))

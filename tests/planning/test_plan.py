@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def test_an_empty_image_is_planned():
 
 
 def visible(volume=SPHERE):
-    return soft_transfer().visible(Blocks.of(volume))
+    return eqx.filter_jit(lambda volume: soft_transfer().visible(Blocks.of(volume)))(volume)
 
 
 def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face():
