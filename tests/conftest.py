@@ -11,6 +11,7 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import install_import_hook
 
 from . import faults, programs, typechecker
@@ -90,6 +91,17 @@ def limit_programs_in_memory():
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > 15_000:
         jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def programs_of_this_session():
+    """All programs are kept, and so counted, after tests of the command, too, which keeps only some."""
+    yield
+    folder = os.environ["JAX_COMPILATION_CACHE_DIR"]
+    if getattr(jax.config, "jax_compilation_cache_dir", None) != folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        compilation_cache.reset_cache()
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 @pytest.fixture(autouse=True)

@@ -77,11 +77,16 @@ def switched(on, **values):
 def loss(scene, adjoint="replay"):
     """A scalar function of image and depths, without cancellation; and the image."""
     rendering = jv.render(*scene, adjoint=adjoint)
-    opacity = rendering.rgba[..., 3]
+    return weighed(rendering.rgba, rendering.depth), rendering.rgba
+
+
+@jax.jit
+def weighed(rgba, depth):
+    opacity = rgba[..., 3]
     weights = np.random.default_rng(5).normal(size=(*opacity.shape, 5))
-    depth = jnp.where(opacity > 0, rendering.depth, 0) * opacity
-    seen = jnp.concatenate([rendering.rgba, depth[..., None]], axis=-1)
-    return jnp.sum(seen * jnp.asarray(weights, seen.dtype)), rendering.rgba
+    depth = jnp.where(opacity > 0, depth, 0) * opacity
+    seen = jnp.concatenate([rgba, depth[..., None]], axis=-1)
+    return jnp.sum(seen * jnp.asarray(weights, seen.dtype))
 
 
 def gradient(scene, adjoint="replay"):
@@ -113,7 +118,7 @@ def along(scene, seed=0):
             way = np.where(np.asarray(leaf) > 0, way, 0)
         if not name.endswith((".values", ".tile")):
             ways = [
-                jnp.asarray(way, leaf.dtype) if i == number else jnp.zeros_like(each)
+                way.astype(leaf.dtype) if i == number else np.zeros(each.shape, each.dtype)
                 for i, (_, each) in enumerate(paths)
             ]
             yield name, jax.tree.unflatten(jax.tree.structure(floats), ways)
@@ -223,7 +228,7 @@ def test_gradients_are_central_differences(on, seed):
 
             def moved(by, way=way):
                 return jax.tree.map(
-                    lambda leaf, each: leaf if each is None else leaf + by * each,
+                    lambda leaf, each: leaf if each is None else jax.device_put(np.asarray(leaf) + by * each),
                     scene,
                     way,
                     is_leaf=lambda leaf: leaf is None,
