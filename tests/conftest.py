@@ -46,7 +46,7 @@ def pytest_configure(config):
     The cache folder is new in each session and removed at its end, unless JAX_COMPILATION_CACHE_DIR names one
     to keep, with which a second session takes less than half the time."""
     fast = config.option.markexpr == "not slow"
-    gc.set_threshold(100_000)  # what is traced is no garbage: to look through it takes a tenth of the time
+    gc.set_threshold(100_000)  # what is traced is no garbage, and looking through it takes time
     worker = hasattr(config, "workerinput")  # of pytest-xdist; it inherits the environment variables
     if not worker:
         if fast:

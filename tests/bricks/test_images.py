@@ -128,9 +128,9 @@ def gradient():
         return *gradient_of(*AT, by_bricks), len(passes)
 
 
-def assert_same_gradient(found, expected, tolerance=1e-5):
+def assert_same_gradient(found, expected):
     for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert np.linalg.norm(own - other) <= tolerance * max(np.linalg.norm(other), 1e-3)
+        assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
 
 
 def test_image_and_gradient_by_bricks_are_those_of_the_whole(gradient):
@@ -335,8 +335,7 @@ def test_gradients_to_all_parts_of_a_lit_scene_are_those_of_the_whole():
         for f in (by_bricks, whole)
     )
     assert len(jax.tree.leaves(expected)) > 8
-    # one of the leaves is a sum of terms that cancel each other, in another order
-    assert_same_gradient(found, expected, 5e-5)
+    assert_same_gradient(found, expected)
 
 
 HALF = math.pi / 2
@@ -373,7 +372,7 @@ def test_a_toroidal_volume_is_rendered_within_its_memory_and_wrongly_in_naive_or
     naive = jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 4), method="naive")
     assert naive.bricks.loads == 4
     wrong = np.abs(np.asarray(naive.rgba - one.rgba))
-    assert wrong[..., :3].max() > 0.02
+    assert wrong[..., :3].max() > 0.1
     # only the order is wrong: what is hidden behind what, not how much is
     np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
     with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
