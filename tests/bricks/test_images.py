@@ -335,16 +335,19 @@ def test_gradients_to_all_parts_of_a_lit_scene_are_those_of_the_whole():
         for f in (by_bricks, whole)
     )
     assert len(jax.tree.leaves(expected)) > 8
-    assert_same_gradient(found, expected)
+    # by the step it is a sum over all samples, of which both lie 4e-5 to 7e-5 from its value in float64
+    np.testing.assert_allclose(found[3].step, expected[3].step, rtol=5e-5)
+    assert_same_gradient(*(eqx.tree_at(lambda g: g[3].step, g, jnp.zeros(())) for g in (found, expected)))
 
 
 HALF = math.pi / 2
 SCAN = (40, 48, 64)
 
 
-def probe_fog():
-    """A toroidal volume, red near the probe and blue behind, and a probe at whose apex nodes lie densely."""
-    probe = jv.ToroidalMap(1.0, 2.0, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
+def probe_fog(*radii):
+    """A toroidal volume, red near the probe and blue behind, and its probe. At a small one's apex, nodes lie
+    densely."""
+    probe = jv.ToroidalMap(*radii, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
     points = [
         (v, color, 0.02)
         for v, color in ((0, (1, 0, 0)), (120, (1, 0, 0)), (135, (0, 0, 1)), (255, (0, 0, 1)))
@@ -357,9 +360,9 @@ def probe_fog():
 
 
 @pytest.mark.slow
-def test_a_toroidal_volume_is_rendered_within_its_memory_and_wrongly_in_naive_order():
+def test_a_toroidal_volume_is_rendered_within_its_memory():
     """Where a step covers many more nodes at the apex than in the middle."""
-    data, transfer, probe = probe_fog()
+    data, transfer, probe = probe_fog(1.0, 2.0)
     camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(24, 24))
     march, memory = jv.March(0.5, (probe, jv.Jitter(0))), 254_000
     one = jv.render(jv.Volume(data), transfer, camera, march)
@@ -369,21 +372,30 @@ def test_a_toroidal_volume_is_rendered_within_its_memory_and_wrongly_in_naive_or
         assert np.prod(found.bricks.counts) > 1
         assert found.bricks.bytes_held <= memory
         assert np.any(np.less(found.bricks.stored, SCAN))
-    naive = jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 4), method="naive")
-    assert naive.bricks.loads == 4
-    wrong = np.abs(np.asarray(naive.rgba - one.rgba))
-    assert wrong[..., :3].max() > 0.1
-    # only the order is wrong: what is hidden behind what, not how much is
-    np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
     with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
         jv.render_bricks(data, transfer, camera, jv.March(1.0, (probe,)), memory=150_000)
 
 
 @pytest.mark.slow
+def test_the_naive_order_is_visibly_wrong():
+    """Where rays pass by the probe and come back into a brick."""
+    data, transfer, probe = probe_fog(10.0, 20.0)
+    camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(24, 24))
+    march = jv.March(0.5, (probe, jv.Jitter(0)))
+    one = jv.render(jv.Volume(data), transfer, camera, march)
+    naive = jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 4), method="naive")
+    assert naive.bricks.loads == 4
+    wrong = np.abs(np.asarray(naive.rgba - one.rgba))[..., :3].max(-1)
+    assert wrong.max() > 0.1
+    assert np.mean(wrong > 0.02) > 0.01
+    # only the order is wrong: what is hidden behind what, not how much is
+    np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
+
+
+@pytest.mark.slow
 def test_a_stretch_behind_a_gap_that_is_shorter_than_a_step_is_seen():
     """No sample of equal steps lies in such a stretch; its cell is cut at its two ends."""
-    data, transfer, _ = probe_fog()
-    probe = jv.ToroidalMap(10.0, 20.0, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
+    data, transfer, probe = probe_fog(10.0, 20.0)
     camera = jv.Camera((84, 68, 61), probe.center, (0, 0.3, 1), 40, size=(24, 24))
     march = jv.March(6.0, (probe, jv.AlphaCorrection()))
     one = jv.render(jv.Volume(data), transfer, camera, march)
