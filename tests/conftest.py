@@ -4,6 +4,7 @@ import gc
 import os
 import platform
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -17,9 +18,12 @@ from jaxtyping import install_import_hook
 from . import faults, programs, typechecker
 
 
-typechecker.leave_inner_functions()
-with install_import_hook("jaxvol", "tests.typechecker.check"):
-    import jaxvol
+def import_with_types_checked():
+    """Imports the library so that shapes and types are checked at every call, which takes seven seconds."""
+    typechecker.leave_inner_functions()
+    with install_import_hook("jaxvol", "tests.typechecker.check"):
+        import jaxvol  # noqa: F401
+
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -45,16 +49,19 @@ def pytest_configure(config):
 
     The cache folder is new in each session and removed at its end, unless JAX_COMPILATION_CACHE_DIR names one
     to keep, with which a second session takes less than half the time."""
-    fast = config.option.markexpr == "not slow"
+    chosen = config.option.markexpr in ("not slow", "slow")
     gc.set_threshold(100_000)  # what is traced is no garbage, and looking through it takes time
     worker = hasattr(config, "workerinput")  # of pytest-xdist; it inherits the environment variables
+    if worker or not getattr(config.option, "numprocesses", None):
+        import_with_types_checked()
     if not worker:
-        if fast:
-            # The fast tests spend most of their time compiling. Without LLVM's optimizations, and by XLA's
-            # older emitter of fused kernels, it is half as long, and programs run somewhat slower. LLVM would
-            # then fuse multiplications and additions in some programs and not in others, which round
-            # differently: an instruction set without them rounds all alike. The slow tests, and any other
-            # selection, compile as users do.
+        os.environ["FLAGS_OF_USERS"] = os.environ.get("XLA_FLAGS", "")
+        if chosen:
+            # Tests spend most of their time compiling. Without LLVM's optimizations, and by XLA's older
+            # emitter of fused kernels, it is half as long, and programs run somewhat slower. LLVM would then
+            # fuse multiplications and additions in some programs and not in others, which round differently:
+            # an instruction set without them rounds all alike. Notebooks and commands in processes of their
+            # own, and any other selection of tests (`-m ""`), compile as users do.
             flags = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
             if platform.machine() in ("x86_64", "AMD64"):
                 flags.append("--xla_cpu_max_isa=AVX")
@@ -73,7 +80,7 @@ def pytest_configure(config):
     for name, value in settings.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
-    if config.option.fault is not None:
+    if config.option.fault is not None and "jaxvol" in sys.modules:
         faults.all_faults()[config.option.fault].inject()
     config.pluginmanager.register(programs.Programs(Path(folder), config.option.most_programs), "programs")
 
@@ -113,6 +120,8 @@ def no_progress(monkeypatch):
 @pytest.fixture
 def volume_file(tmp_path):
     """A raw file of a small volume, whose name tells its shape and type."""
+    import jaxvol
+
     volume = jaxvol.phantom("engine", 24)
     path = tmp_path / "engine_24x24x24_uint8.raw"
     path.write_bytes(np.asarray(volume.data).transpose(2, 1, 0).tobytes())

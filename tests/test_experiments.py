@@ -13,7 +13,6 @@ import jaxvol as jv
 from experiments import (
     again,
     elevation_angle,
-    fit_transfer,
     gradient_errors,
     record,
     redraw,
@@ -39,23 +38,14 @@ def gradients_miss_jumps_at_the_exit_alone(result):
     assert plain["colours"][-1] < 1e-6
 
 
-def fits_recover_what_was_hidden(result):
-    for rows in result["scenes"].values():
-        for points in (fit_transfer.KNOWN, fit_transfer.EVEN):
-            held_out, start = rows[points]["psnr held out"], rows[points]["psnr at the start"]
-            assert min(held_out) > fit_transfer.GOAL > max(start)
-            assert rows[points]["steps"] <= fit_transfer.STEPS
-
-
 CHECKS = {
     "gradient_errors": gradients_miss_jumps_at_the_exit_alone,
-    "fit_transfer": fits_recover_what_was_hidden,
     "elevation_angle": lambda result: None,
 }
 """Experiments that are run, and what their results must show."""
 
 
-@pytest.mark.parametrize("name", ["elevation_angle", *slow(*(n for n in CHECKS if n != "elevation_angle"))])
+@pytest.mark.parametrize("name", ["elevation_angle", *slow("gradient_errors")])
 def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(name, tmp_path):
     importlib.import_module(f"experiments.{name}").main(["--quick", "--output", str(tmp_path)])
     jax.clear_caches()

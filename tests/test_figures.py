@@ -69,7 +69,7 @@ def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_pat
 
 @pytest.mark.slow
 def test_figures_are_measured_and_rendered_anew(tmp_path):
-    only = ["fig13", "lee_tables"]
+    only = ["fig13", "table1", "lee_tables"]
     page = index.make(tmp_path, run=True, quick=True, only=only, say=lambda text: None)
     result = record.read(tmp_path / "results" / "overhead.json")["result"]
     for condition in result["conditions"].values():

@@ -1,6 +1,7 @@
 """Do the notebooks run from the first cell to the last, and are their pictures large enough?"""
 
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ def this_python(tmp_path, monkeypatch):
     monkeypatch.setattr(KernelSpecManager, "get_kernel_spec", lambda self, name: spec)
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    monkeypatch.setenv("XLA_FLAGS", os.environ["FLAGS_OF_USERS"])
     for scheme in ("http_proxy", "https_proxy"):  # data that are not here are not fetched
         monkeypatch.setenv(scheme, "http://127.0.0.1:9")
 

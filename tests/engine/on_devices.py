@@ -142,14 +142,8 @@ def numbers_of_devices(_: Any):
 
 
 def modes(_: Any):
-    """Transforms whose cells depend on what lies before; and pixels computed after it, with a gradient."""
+    """Pixels that are computed after the march, with a gradient."""
     camera = around(blocks(), SIZE)
-    march = jv.March(0.05, SHIFTED)
-    one, every = (
-        jv.render(blocks(), thin(), camera, march, lighting=Phong(), devices=given)
-        for given in (None, all_devices())
-    )
-    assert_same(every, one)
 
     def loss(mode: Any, given: Any) -> Any:
         how = {"compositing": mode, "devices": given}

@@ -13,7 +13,7 @@ from jaxvol._util import platform
 from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import GPU, Tiling
-from jaxvol.lighting import DirectionalLight, Material, Phong, ScattererTemplates
+from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
 
 from ..round_trips import counted
 from ..scenes import slow
@@ -62,25 +62,21 @@ ADAPTIVE = jv.AdaptiveSampling(0.02), jv.Jitter(3), jv.AlphaCorrection(), jv.Spa
 
 SCENES = {
     "defaults": engine,
-    "shifted, no leaps": lambda: engine(transforms=(jv.EmptySpaceJitter(5), jv.EarlyTermination(0.05))),
-    "few samples": lambda: engine(more={"max_samples": 37}),
     "adaptive": lambda: engine(transforms=ADAPTIVE, quadrature="preintegrated"),
     "toroidal": toroidal,
     "scatterers": lambda: engine(lighting=SCATTERERS),
-    "isosurface": lambda: engine(compositing=jv.Isosurface(120.0), lighting=Phong()),
 }
 
 
-@pytest.mark.parametrize("name", ["defaults", *slow("shifted, no leaps", "few samples", "scatterers")])
+@pytest.mark.parametrize("name", ["defaults", *slow("scatterers")])
 def test_images_are_those_of_the_tiling_for_cpus(name):
     scene = SCENES[name]()
     assert_same(*(render_scene(scene, "all", "replay", tiling) for tiling in (SMALL, Tiling())))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["adaptive", "isosurface"])
-def test_images_and_gradients_are_those_of_the_tiling_for_cpus(name):
-    scene = SCENES[name]()
+def test_images_and_gradients_are_those_of_the_tiling_for_cpus():
+    scene = SCENES["adaptive"]()
     weights = np.random.default_rng(0).normal(size=(38, 45, 4)).astype(np.float32)
 
     def differentiated(tiling):
@@ -96,12 +92,6 @@ def test_images_and_gradients_are_those_of_the_tiling_for_cpus(name):
     assert_same(other, image)
     assert any(np.any(leaf != 0) for leaf in jax.tree.leaves(expected))
     scales = jax.tree.map(lambda leaf: float(np.linalg.norm(leaf)), expected)
-    if scene.compositing.resolves:
-        # A surface stays where it is if steps grow. The derivative by them is a sum of two that cancel: of as
-        # many longer steps, and of where the root lies among them. Each is as large as if the camera moved by
-        # the depth for each step; so that, and not what their rounding leaves of the sum, is its scale.
-        steps = float(scene.march.locate(scene.volume).diagonal / scene.march.step)
-        scales = eqx.tree_at(lambda of: of[2].step, scales, scales[1].position * steps)
     leaves = (jax.tree.leaves(each) for each in (found, expected, scales))
     for a, b, scale in zip(*leaves, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * scale + 1e-9)
@@ -180,16 +170,12 @@ def test_a_program_for_cuda_has_no_branch(on_a_gpu):
     assert "stablehlo.if" not in text
 
 
-OF_PROGRAMS = "adaptive", "toroidal"
-
-
-@pytest.mark.parametrize("name", slow(*OF_PROGRAMS))
-def test_programs_for_gpus_wait_at_most_40_times_and_show_the_same(name, on_a_gpu):
+@pytest.mark.slow
+def test_programs_for_gpus_wait_at_most_40_times_and_show_the_same(on_a_gpu):
     """Where XLA fuses otherwise, as it does here without branches, positions are rounded otherwise; and the
     few pixels that are seen along faces of these parts are steep in them."""
-    scene = SCENES[name]()
+    scene = SCENES["toroidal"]()
     found, trips = counted(*moving(scene, render))
-    print(name, trips)
     assert 1 < trips.number <= 40
     with pytest.MonkeyPatch.context() as of_cpu:
         of_cpu.setattr(platform, "platform", lambda: "cpu")

@@ -28,7 +28,7 @@ WIDTH, HEIGHT = SIZE
 SOFT = soft_transfer(0.3)
 TRUTH = jv.TransferFunction(255 * np.asarray(SOFT.values), SOFT.colors, SOFT.extinction)
 GREY = jv.TransferFunction(TRUTH.values, np.full((8, 3), 0.5), np.full(8, 0.5))
-MARCH = jv.March(0.1, quadrature="midpoint")
+MARCH = jv.March(0.2, quadrature="midpoint")
 DIRECTIONS = (0.5, -1, 0.4), (-1, 0.2, 0.1)
 
 

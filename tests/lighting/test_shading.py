@@ -82,6 +82,7 @@ def scene_of():
     return volume, soft_transfer(0.1), around(volume), jv.March(0.07, LEAPING)
 
 
+@pytest.mark.slow
 def test_images_are_those_of_the_reference():
     scene = scene_of()
     found = np.asarray(jv.render(*scene, lighting=FOG).rgba)
@@ -117,18 +118,6 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
     expected[rows, columns, :3] = opacity[rows, columns] * once(points, directions, colors)
     assert np.abs(expected - unlit.rgba).max() > 0.1
     np.testing.assert_allclose(found.rgba, expected, rtol=2e-5, atol=2e-5)
-
-
-def test_there_is_a_gradient_of_a_lit_image():
-    """Its values are checked by slow tests, here and of templates, since it takes a minute to compile."""
-
-    def loss(scene):
-        return jnp.sum(jv.render(*scene[:4], lighting=scene[4]).rgba)
-
-    scene = (*scene_of(), FOG)
-    gradient = eqx.filter_eval_shape(eqx.filter_grad(loss), scene)
-    expected = eqx.filter(scene, eqx.is_inexact_array)
-    assert jax.tree.map(jnp.shape, gradient) == jax.tree.map(jnp.shape, expected)
 
 
 LEAVES = {

@@ -291,20 +291,18 @@ def test_its_place_among_other_transforms_does_not_show():
 
 
 @pytest.mark.slow
-def test_with_a_toroidal_map_engines_agree_and_leaping_does_not_show():
+def test_with_a_toroidal_map_engines_agree():
     volume, probe = jv.toroidal_phantom("spheres", (17, 21, 33), speckle=False)
     transfer = jv.TransferFunction.from_points([(20, (1, 0.7, 0.5), 0.0), (200, (1, 1, 1), 0.5)], 5.0)
     low, high = (np.asarray(corner) for corner in probe.corners)
     camera = jv.Camera(low - 1.5 * (high - low), (low + high) / 2, (1.0, 0, 0), 35.0, size=(20, 16)).zoom(1.5)
-    clip = jv.Clip(planes=[((low + high) / 2, (0.2, 1.0, 0.3))], inside_out=True)
+    clip = jv.Clip(planes=[((low + high) / 2, (0.2, 1.0, 0.3))])
     transforms = clip, probe, jv.EmptySpaceJitter(4), ALIGNED
     rendering = jv.render(volume, transfer, camera, jv.March(5.3, transforms))
     assert float(rendering.rgba[..., 3].max()) > 0.1
     reference = reference_image(volume, transfer, camera, jv.March(5.3, transforms, max_samples=64))
     assert not np.any(reference.exhausted)
     np.testing.assert_allclose(rendering.rgba, reference.rgba, atol=2e-5)
-    leapt = jv.render(volume, transfer, camera, jv.March(5.3, (*transforms, jv.SpaceLeaping())))
-    np.testing.assert_allclose(leapt.rgba, rendering.rgba, atol=1e-6)
 
 
 # ---- parameters ----

@@ -90,7 +90,7 @@ KINDS = st.sampled_from(["noise", "sparse", "half", "blobs"])
 SEEDS = st.integers(0, 10**6)
 
 
-@pytest.mark.parametrize("method", ["hierarchy", "beam", *slow("distance")])
+@pytest.mark.parametrize("method", ["hierarchy", *slow("beam", "distance")])
 def test_leaping_does_not_show(method):
     """In random scenes, each volume after another one, so that nothing stale is used; and saves samples."""
     transforms = MOVING if method == "hierarchy" else MOVING[:1]
@@ -104,7 +104,7 @@ def test_leaping_does_not_show(method):
         assert_same(leapt, whole)
         return int(whole.samples.sum()), int(leapt.samples.sum())
 
-    @settings(max_examples=25)
+    @settings(max_examples=15)
     @given(kind=KINDS, seed=SEEDS, view=st.sampled_from(list(PERSPECTIVE)), step=st.floats(0.01, 0.3))
     def check(kind, seed, view, step):
         volume = jv.Volume(bytes_of(contents(kind, seed)), SPACING, origin=(0.3, -0.2, 0.1))
