@@ -25,7 +25,7 @@ from .command import command
 ARGUMENTS = {
     "accuracy": "accuracy --repetitions 3",
     "bricks": "bricks --size 40 --repetitions 3",
-    "compare": "compare 77f9c25 HEAD",
+    "compare": "compare 77f9c25 HEAD --kinds image gradient",
     "fit_transfer": "fit_transfer --size 64 --resolution 64",
     "gradient_agreement": "gradient_agreement --only 'head phantom' tooth engine lidc0314_airway aneurism"
     " --methods none hierarchy min_distance",
