@@ -4,7 +4,6 @@ import gc
 import os
 import platform
 import shutil
-import sys
 import tempfile
 from pathlib import Path
 
@@ -52,7 +51,8 @@ def pytest_configure(config):
     chosen = config.option.markexpr in ("not slow", "slow")
     gc.set_threshold(100_000)  # what is traced is no garbage, and looking through it takes time
     worker = hasattr(config, "workerinput")  # of pytest-xdist; it inherits the environment variables
-    if worker or not getattr(config.option, "numprocesses", None):
+    deals = not worker and getattr(config.option, "numprocesses", None)  # it runs no test itself
+    if not deals and config.option.fault is None:
         import_with_types_checked()
     if not worker:
         os.environ["FLAGS_OF_USERS"] = os.environ.get("XLA_FLAGS", "")
@@ -60,8 +60,8 @@ def pytest_configure(config):
             # Tests spend most of their time compiling. Without LLVM's optimizations, and by XLA's older
             # emitter of fused kernels, it is half as long, and programs run somewhat slower. LLVM would then
             # fuse multiplications and additions in some programs and not in others, which round differently:
-            # an instruction set without them rounds all alike. Notebooks and commands in processes of their
-            # own, and any other selection of tests (`-m ""`), compile as users do.
+            # an instruction set without them rounds all alike. Notebooks, and any other selection of tests
+            # (`-m ""`), compile as users do.
             flags = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
             if platform.machine() in ("x86_64", "AMD64"):
                 flags.append("--xla_cpu_max_isa=AVX")
@@ -80,7 +80,7 @@ def pytest_configure(config):
     for name, value in settings.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
-    if config.option.fault is not None and "jaxvol" in sys.modules:
+    if config.option.fault is not None and not deals:
         faults.all_faults()[config.option.fault].inject()
     config.pluginmanager.register(programs.Programs(Path(folder), config.option.most_programs), "programs")
 
