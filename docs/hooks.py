@@ -2,6 +2,7 @@
 
 - Documents and pictures outside `docs/` become part of the site, at their own paths. Links work in both
   places: a page of `docs/` names `../paper_figs/README.md`, as it must where the repository is read.
+- Charts and pages of records are drawn from these, as `python -m experiments.redraw` does.
 - `<!-- section FILE: HEADING -->` is replaced by the text under that heading of a Markdown file.
 - `<!-- table failures -->` and `<!-- table references -->` are replaced by tables made from the record of the
   failure atlas and from CITATION.cff.
@@ -11,7 +12,11 @@ import json
 import os
 import posixpath
 import re
+import subprocess
+import sys
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
@@ -28,9 +33,9 @@ OUTSIDE = (
     "experiments/**/*.py",
     "experiments/results/*.md",
     "experiments/results/*.png",
-    "experiments/results/*.html",
+    "experiments/results/*.webp",
     "paper_figs/README.md",
-    "paper_figs/output/*.png",
+    "paper_figs/output/*.webp",
 )
 """Files outside `docs/` that become part of the site."""
 
@@ -46,7 +51,20 @@ def on_files(files: Any, config: Any) -> Any:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()
             files.append(File.generated(config, name, abs_src_path=str(path)))
+    there = {file.src_uri for file in files}
+    for path in sorted(Path(drawn().name).iterdir()):
+        if (name := f"experiments/results/{path.name}") not in there:
+            files.append(File.generated(config, name, abs_src_path=str(path)))
     return files
+
+
+@cache
+def drawn() -> "TemporaryDirectory[str]":
+    """A folder, until the end of this process, of the charts and pages of all records."""
+    folder = TemporaryDirectory()
+    command = [sys.executable, "-m", "experiments.redraw", "--output", folder.name]
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    return folder
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:

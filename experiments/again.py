@@ -57,8 +57,10 @@ def recorded(name: str, folder: Path) -> None:
     with TemporaryDirectory(dir=folder) as new:  # so that files are moved at once
         module = f"experiments.{experiment}"
         subprocess.run([sys.executable, "-m", module, *options, "--output", new], check=True)
-        for file in sorted(each for each in Path(new).iterdir() if each.is_file()):
-            os.replace(file, folder / file.name.replace(experiment, name, 1))
+        for file in sorted(each for each in Path(new).rglob("*") if each.is_file()):
+            place = folder / file.relative_to(new).parent
+            place.mkdir(exist_ok=True)
+            os.replace(file, place / file.name.replace(experiment, name, 1))
 
 
 def told(name: str, folder: Path) -> str:

@@ -133,5 +133,7 @@ def _labelled(leads: tuple[int, ...], value: float, _: Any) -> str:
 def save(figure: Any, path: Path) -> None:
     """Write a chart. Equal results give equal files."""
     with whole_file(path) as part:
-        figure.savefig(part, dpi=90, metadata={"Software": None})
+        exactly: dict[str, Any] = {"pil_kwargs": {"lossless": True}}
+        how = exactly if path.suffix == ".webp" else {"metadata": {"Software": None}}
+        figure.savefig(part, dpi=90, **how)
     plt.close(figure)

@@ -1,8 +1,9 @@
-"""Draws charts again from their records; nothing is measured.
+"""Draws charts and pages from their records; nothing is measured.
 
-`python -m experiments.redraw` draws all, `--only speed kisti` some. `elevation_angle.png`, `path_traced.png`,
-`tomography.png`, `lit.png` and `stability.html` show images that no record holds: their experiments alone
-draw them.
+`python -m experiments.redraw` draws all, `--only speed kisti` some. They are not kept beside the records, and
+the documentation draws its own. `elevation_angle.png`, `path_traced.webp`, `tomography.png` and `lit.png`
+show images that no record holds: their experiments alone draw them. `pareto.html` holds images only if its
+experiment left some here.
 """
 
 from argparse import Namespace
@@ -30,6 +31,7 @@ from . import (
     out_of_core,
     overhead,
     pareto_chart,
+    pareto_page,
     planning,
     probe_geometry,
     record,
@@ -41,6 +43,11 @@ from . import (
     viewer_latency,
 )
 from .command import command
+
+
+def draw_pareto(result: Any, path: Path) -> None:
+    pareto_chart.draw(result, path)
+    pareto_page.write(record.RESULTS / "pareto.json", record.RESULTS / "pareto", path.with_suffix(".html"))
 
 
 DRAWN: dict[str, Callable[[Any, Path], None]] = {
@@ -66,7 +73,7 @@ DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "model_choice": model_choice.draw,
     "out_of_core": out_of_core.draw,
     "overhead": lambda result, path: overhead.draw(result["conditions"], result["sizes"], path),
-    "pareto": pareto_chart.draw,
+    "pareto": draw_pareto,
     "planning": planning.draw,
     "planning_seed_1": planning.draw,
     "probe_geometry": probe_geometry.draw,
@@ -75,7 +82,7 @@ DRAWN: dict[str, Callable[[Any, Path], None]] = {
     "shading": lambda result, path: shading.draw(result["scenes"], path),
     "speed": speed.draw,
     "speed_gpu": speed.draw,
-    "stability": stability.draw_chart,
+    "stability": lambda result, path: stability.draw(result, record.RESULTS / "stability", path),
     "viewer_latency": viewer_latency.draw,
 }
 """By the name of a record, what draws its result."""

@@ -24,7 +24,7 @@ from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 from . import common, record
 from .atlas import ENTRIES, FAMILIES
 from .atlas.entry import Entry, pictured, sweep
-from .atlas.page import Pictures, number, page, pictures_of
+from .atlas.page import keep, number, page
 from .common import plt
 
 
@@ -89,8 +89,8 @@ def _scale(panel: Any, name: Literal["x", "y"], scale: str, values: Sequence[flo
         axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
 
 
-def draw(result: dict[str, Any], pictures: dict[str, Pictures], path: Path) -> None:
-    """The chart of all entries, and the page beside it."""
+def draw(result: dict[str, Any], pictures: Path, path: Path) -> None:
+    """The chart of all entries, and the page beside it. `pictures`: their folder."""
     draw_chart(result, path)
     entries = result["entries"]
     families = {family: [e for e in row if e.name in entries] for family, row in FAMILIES.items()}
@@ -127,7 +127,7 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
 )
 def main(chosen: Namespace) -> common.Answer:
     entries: dict[str, Any] = {}
-    pictures: dict[str, Pictures] = {}
+    pictures = chosen.output / "stability"
     if chosen.quick and chosen.only == list(ENTRIES):  # one of each family, since all take minutes to compile
         chosen.only = [family[0].name for family in FAMILIES.values()]
     for name in chosen.only:
@@ -135,38 +135,31 @@ def main(chosen: Namespace) -> common.Answer:
         size = SMALL if chosen.quick else PICTURE
         values = [entry.values[0], entry.values[-1]] if chosen.quick else None
         found = sweep(entry, entry.size, values)
-        pictures[name] = {value: entry.picture(value, size) for value in pictured(entry, found)}
+        keep(entry, [entry.picture(value, size) for value in pictured(entry, found)], pictures)
         about = {
             key: getattr(entry, key) for key in ("question", "method", "regime", "metric", "judged", "limit")
         }
         entries[name] = {**about, **found, "outcome": entry.outcome, "does": entry.does, "size": entry.size}
         within, beyond = (number(found["edge"][side]) for side in ("within", "beyond"))
         print(f"{name:40} {entry.outcome:18} within {within}, beyond {beyond} ({entry.regime})", flush=True)
-    kept, shown = recorded(chosen)
-    entries, pictures = (
-        {n: all_[n] for n in ENTRIES if n in all_} for all_ in (entries | kept, pictures | shown)
-    )
-    result = {"entries": entries}
+    all_of_them = entries | recorded(chosen)
+    result = {"entries": {name: all_of_them[name] for name in ENTRIES if name in all_of_them}}
     return result, partial(draw, result, pictures)
 
 
-def recorded(chosen: Namespace) -> tuple[dict[str, Any], dict[str, Pictures]]:
-    """What record and page in the output say of the entries that are not chosen, with the commit and the
-    command that measured them; nothing if quick."""
+def recorded(chosen: Namespace) -> dict[str, Any]:
+    """What the record in the output says of the entries that are not chosen, with the commit and the command
+    that measured them; nothing if quick."""
     path = chosen.output / "stability.json"
-    page = path.with_suffix(".html")
-    if chosen.quick or not (path.is_file() and page.is_file()):
-        return {}, {}
-    found, text = record.read(path), page.read_text(encoding="utf-8")
+    if chosen.quick or not path.is_file():
+        return {}
+    found = record.read(path)
     made = {"commit": found["commit"], "command": found["command"]}
-    kept, shown = {}, {}
-    for name, entry in found["result"]["entries"].items():
-        if name in ENTRIES and name not in chosen.only:
-            kept[name] = {"measured": made, **entry}
-            shown[name] = dict(
-                zip(pictured(ENTRIES[name], entry), pictures_of(text, ENTRIES[name]), strict=True)
-            )
-    return kept, shown
+    return {
+        name: {"measured": made, **entry}
+        for name, entry in found["result"]["entries"].items()
+        if name in ENTRIES and name not in chosen.only
+    }
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def draw(measured: dict[str, Any], path: Path) -> None:
 @command(__doc__, OUTPUT, results=RECORDS)
 def main(chosen: Namespace) -> None:
     measured = record.read(chosen.results / "minimum_distance.json")
-    draw(measured, chosen.output / "chae_fig5.png")
+    draw(measured, chosen.output / "chae_fig5.webp")
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def main(chosen: Namespace) -> None:
         caption += f"\nRMSE from no leaping {rmse(image, whole):.1e}"
         page.draw(1, column, marked, caption)
         print(f"chae_fig6 R = {cell}: {', '.join(caption.splitlines())}")
-    page.save(chosen.output / "chae_fig6.png")
+    page.save(chosen.output / "chae_fig6.webp")
 
 
 if __name__ == "__main__":

@@ -174,5 +174,5 @@ class Page:
         plt.close(self.figure)
         last = np.flatnonzero((pixels < 255).any(axis=(1, 2)))[-1]
         with whole_file(path) as part:
-            Image.fromarray(pixels[: last + 1 + GAP]).save(part, "PNG", optimize=True)
+            Image.fromarray(pixels[: last + 1 + GAP]).save(part, "WEBP", quality=95, method=6)
         print(path)

@@ -41,7 +41,7 @@ class Entry:
     @property
     def file(self) -> str:
         """Name of the file that the script writes."""
-        return f"{self.name}.{'md' if self.name in TABLES else 'png'}"
+        return f"{self.name}.{'md' if self.name in TABLES else 'webp'}"
 
 
 TABLES = "table1", "kim_table1", "kisti_table", "lee_tables"

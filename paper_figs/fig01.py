@@ -14,7 +14,7 @@ def main(chosen: Namespace) -> None:
     size, resolution = chosen.size, chosen.resolution
     view = fig09.real(chosen.data, size) if chosen.data else fig09.phantom(resolution, size)
     title = "Fig. 1: wood grain, and noise on the cut face"
-    comparison(view, title, chosen.output / "fig01.png", (PLAIN, JITTER))
+    comparison(view, title, chosen.output / "fig01.webp", (PLAIN, JITTER))
 
 
 if __name__ == "__main__":

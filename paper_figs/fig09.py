@@ -28,7 +28,7 @@ def real(folder: Path, size: int) -> View:
 @figure(__doc__)
 def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
-    comparison(view, "Fig. 9: the head; boundary noise is that of the cut face", chosen.output / "fig09.png")
+    comparison(view, "Fig. 9: the head; boundary noise is that of the cut face", chosen.output / "fig09.webp")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     shown = "bones of the chest" if chosen.data else "a cut engine"
     title = f"Fig. 10: {shown} in place of the heart; boundary noise is that of the cut faces"
-    comparison(view, title, chosen.output / "fig10.png")
+    comparison(view, title, chosen.output / "fig10.webp")
 
 
 if __name__ == "__main__":

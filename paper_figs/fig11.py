@@ -35,7 +35,7 @@ def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     shown = "a cut engine" if chosen.data else "a colon in soft tissue"
     title = f"Fig. 11: {shown} in place of the kidney; boundary noise is that of the cut face"
-    comparison(view, title, chosen.output / "fig11.png")
+    comparison(view, title, chosen.output / "fig11.webp")
 
 
 if __name__ == "__main__":

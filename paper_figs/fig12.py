@@ -35,7 +35,7 @@ def real(folder: Path, size: int) -> View:
 def main(chosen: Namespace) -> None:
     view = real(chosen.data, chosen.size) if chosen.data else phantom(chosen.resolution, chosen.size)
     title = "Fig. 12: vessels; boundary noise is that of the pixels that alignment changes"
-    comparison(view, title, chosen.output / "fig12.png", region=View.left)
+    comparison(view, title, chosen.output / "fig12.webp", region=View.left)
 
 
 if __name__ == "__main__":

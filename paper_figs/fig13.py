@@ -32,7 +32,7 @@ def main(chosen: Namespace) -> None:
             x, y = (middle * size - side / 2 for middle in view.middle)
             axes.add_patch(Rectangle((x, y), side, side, fill=False, color="white", linewidth=0.8))
         print(f"fig13 {look}: {caption}")
-    page.save(chosen.output / "fig13.png")
+    page.save(chosen.output / "fig13.webp")
 
 
 if __name__ == "__main__":

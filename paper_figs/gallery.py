@@ -114,7 +114,7 @@ def main(chosen: Namespace) -> None:
     page = Page(4, len(each), chosen.size, "Kinds of light")
     for row, (name, make) in enumerate(each.items()):
         draw(page, row, name, make(), 4 if chosen.quick else PATHS)
-    page.save(chosen.output / "gallery.png")
+    page.save(chosen.output / "gallery.webp")
 
 
 if __name__ == "__main__":

@@ -80,8 +80,8 @@ def main(chosen: Namespace) -> None:
     axes.set_ylabel("z, mm", fontsize=8)
     axes.tick_params(labelsize=8)
     axes.set_title("Kim, Kwon and Shin, Fig. 6: bricks in the order of their centres' depth", fontsize=9)
-    save(figure, chosen.output / "kim_fig6.png")
-    print(chosen.output / "kim_fig6.png")
+    save(figure, chosen.output / "kim_fig6.webp")
+    print(chosen.output / "kim_fig6.webp")
 
 
 if __name__ == "__main__":

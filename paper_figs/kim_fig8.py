@@ -65,7 +65,7 @@ def main(chosen: Namespace) -> None:
         caption = f"largest {off.max():.2f}\n{share:.0%} of the pixels by > 1/255"
         page.draw(row, 2, off, caption, "difference" if row == 0 else "")
         print(f"kim_fig8 {'zoomed' if row else 'whole'}: {', '.join(caption.splitlines())}")
-    page.save(chosen.output / "kim_fig8.png")
+    page.save(chosen.output / "kim_fig8.webp")
 
 
 if __name__ == "__main__":

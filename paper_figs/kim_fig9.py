@@ -53,7 +53,7 @@ def draw(measured: dict[str, Any], path: Path) -> None:
 
 @command(__doc__, OUTPUT, results=RECORDS)
 def main(chosen: Namespace) -> None:
-    draw(record.read(chosen.results / "bricks.json"), chosen.output / "kim_fig9.png")
+    draw(record.read(chosen.results / "bricks.json"), chosen.output / "kim_fig9.webp")
 
 
 if __name__ == "__main__":

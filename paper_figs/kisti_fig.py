@@ -34,7 +34,7 @@ def main(chosen: Namespace) -> None:
                 f"{name}, transfer function {column + 1}",
                 title if row == 0 else "",
             )
-    page.save(chosen.output / "kisti_fig.png")
+    page.save(chosen.output / "kisti_fig.webp")
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def main(chosen: Namespace) -> None:
         panel.set_title(caption, fontsize=10)
         print(f"lee_fig1 {' '.join(caption.split())}; {np.sum(template.intensity > 0)} photons")
     page.colorbar(axes[-1].collections[0], ax=axes, label="z / λ")
-    save(page, chosen.output / "lee_fig1.png")
+    save(page, chosen.output / "lee_fig1.webp")
 
 
 if __name__ == "__main__":

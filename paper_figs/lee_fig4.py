@@ -57,7 +57,7 @@ def main(chosen: Namespace) -> None:
         caption = f"brightness of the ear {(image[ear] @ LUMINANCE).mean():.3f}"
         page.draw(0, column, image, caption, title)
         print(f"lee_fig4 {title}: {caption}")
-    page.save(chosen.output / "lee_fig4.png")
+    page.save(chosen.output / "lee_fig4.webp")
 
 
 if __name__ == "__main__":

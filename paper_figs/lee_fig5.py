@@ -96,7 +96,7 @@ def main(chosen: Namespace) -> None:
         lighting = ScattererTemplates(MATERIALS, LIGHTS, **how) if isinstance(how, dict) else how
         rendering = jv.render(scene.volume, scene.transfer, scene.camera, march(scene), lighting=lighting)
         page.draw(0, column, rendering.image(BLACK), "", title)
-    page.save(chosen.output / "lee_fig5.png")
+    page.save(chosen.output / "lee_fig5.webp")
 
 
 if __name__ == "__main__":

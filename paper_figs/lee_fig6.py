@@ -109,7 +109,7 @@ def main(chosen: Namespace) -> None:
     page = Page(len(COLUMNS), len(subjects), chosen.size, "Lee, Kwon and Shin, Fig. 6: light from the left")
     for row, (name, subject) in enumerate(subjects.items()):
         draw(page, row, name, subject)
-    page.save(chosen.output / "lee_fig6.png")
+    page.save(chosen.output / "lee_fig6.webp")
 
 
 if __name__ == "__main__":

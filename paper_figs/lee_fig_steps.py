@@ -150,7 +150,7 @@ def main(chosen: Namespace) -> None:
             mean = " ".join(f"{part:.2f}" for part in image[visible].mean(axis=0))
             page.draw(row, column, image, f"{look.caption}\n{mean}", title if row == 0 else "")
             print(f"lee_fig_steps {title}: {look.caption}: {mean}")
-    page.save(chosen.output / "lee_fig_steps.png")
+    page.save(chosen.output / "lee_fig_steps.webp")
 
 
 if __name__ == "__main__":

@@ -39,8 +39,8 @@ def test_the_page_shows_what_the_records_hold_beside_what_the_papers_report(tmp_
     for entry in contents.ENTRIES:
         assert (f'id="{entry.name}"' in page) == (entry.name in only)
         assert (tmp_path / entry.file).is_file() == (entry.name in only)
-    assert (tmp_path / "fig13.png").read_bytes() == (common.OUTPUT / "fig13.png").read_bytes()
-    assert imread(tmp_path / "chae_fig5.png").std() > 10
+    assert (tmp_path / "fig13.webp").read_bytes() == (common.OUTPUT / "fig13.webp").read_bytes()
+    assert imread(tmp_path / "chae_fig5.webp").std() > 10
     row = record.read(record.RESULTS / "overhead.json")["result"]["conditions"]["all samples"]["volumes"]
     ratio = row["engine"]["512"][BOTH]["ratio"]["median"]
     assert f"<td>{ratio:.3f} [" in page  # ours
@@ -53,7 +53,7 @@ def test_the_page_shows_what_the_records_hold_beside_what_the_papers_report(tmp_
 def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_path, monkeypatch, capsys):
     assert cli.main(["figures", "-o", str(tmp_path / "made"), "--only", "fig12", "lee_fig1"]) == 0
     made = {path.name for path in (tmp_path / "made").iterdir()}
-    assert made == {"fig12.png", "index.html", "lee_fig1.png"}
+    assert made == {"fig12.webp", "index.html", "lee_fig1.webp"}
     assert str(tmp_path / "made" / "index.html") in capsys.readouterr().out
     assert cli.main(["figures", "--quick"]) == 2
     assert "--quick goes with --run" in capsys.readouterr().err
@@ -78,12 +78,12 @@ def test_figures_are_measured_and_rendered_anew(tmp_path):
                 assert row["rmse"] > 0
                 assert row["ratio"]["low"] <= row["ratio"]["median"] <= row["ratio"]["high"]
     assert "rendered for this page" in page.read_text(encoding="utf-8")
-    assert imread(tmp_path / "fig13.png").shape != imread(common.OUTPUT / "fig13.png").shape
+    assert imread(tmp_path / "fig13.webp").shape != imread(common.OUTPUT / "fig13.webp").shape
     assert (tmp_path / "lee_tables.md").read_text() == (common.OUTPUT / "lee_tables.md").read_text()
 
 
 @pytest.mark.slow
 def test_a_figure_is_drawn(tmp_path):
     fig09.main(["--quick", "--output", str(tmp_path)])
-    assert imread(tmp_path / "fig09.png").std() > 10
-    assert [path.name for path in tmp_path.iterdir()] == ["fig09.png"]
+    assert imread(tmp_path / "fig09.webp").std() > 10
+    assert [path.name for path in tmp_path.iterdir()] == ["fig09.webp"]

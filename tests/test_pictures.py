@@ -11,29 +11,34 @@ DRAWN = "docs", "paper_figs/output", "experiments/results"
 LEAST = 256
 
 PANELS = {
-    "paper_figs/output/chae_fig6.png": (5, 2),
-    "paper_figs/output/fig01.png": (2, 2),
-    "paper_figs/output/fig09.png": (4, 2),
-    "paper_figs/output/fig10.png": (4, 2),
-    "paper_figs/output/fig11.png": (4, 2),
-    "paper_figs/output/fig12.png": (4, 2),
-    "paper_figs/output/fig13.png": (2, 1),
-    "paper_figs/output/gallery.png": (4, 5),
-    "paper_figs/output/kim_fig8.png": (3, 2),
-    "paper_figs/output/kisti_fig.png": (2, 2),
-    "paper_figs/output/lee_fig4.png": (3, 1),
-    "paper_figs/output/lee_fig5.png": (4, 1),
-    "paper_figs/output/lee_fig6.png": (3, 2),
-    "paper_figs/output/lee_fig_steps.png": (6, 2),
+    "paper_figs/output/chae_fig6.webp": (5, 2),
+    "paper_figs/output/fig01.webp": (2, 2),
+    "paper_figs/output/fig09.webp": (4, 2),
+    "paper_figs/output/fig10.webp": (4, 2),
+    "paper_figs/output/fig11.webp": (4, 2),
+    "paper_figs/output/fig12.webp": (4, 2),
+    "paper_figs/output/fig13.webp": (2, 1),
+    "paper_figs/output/gallery.webp": (4, 5),
+    "paper_figs/output/kim_fig8.webp": (3, 2),
+    "paper_figs/output/kisti_fig.webp": (2, 2),
+    "paper_figs/output/lee_fig4.webp": (3, 1),
+    "paper_figs/output/lee_fig5.webp": (4, 1),
+    "paper_figs/output/lee_fig6.webp": (3, 2),
+    "paper_figs/output/lee_fig_steps.webp": (6, 2),
     "experiments/results/lit.png": (2, 1),
-    "experiments/results/path_traced.png": (4, 2),
+    "experiments/results/path_traced.webp": (4, 2),
     "experiments/results/tomography.png": (4, 2),
 }
 """How many pictures of scenes stand side by side, and below each other, on pages of several."""
 
 
 def test_no_picture_is_smaller():
-    files = [path for folder in DRAWN for path in sorted((ROOT / folder).glob("*.png"))]
+    files = [
+        path
+        for folder in DRAWN
+        for path in sorted((ROOT / folder).iterdir())
+        if path.suffix in (".png", ".webp")
+    ]
     names = {path.relative_to(ROOT).as_posix(): path for path in files}
     assert set(PANELS) <= set(names)
     for name, path in names.items():

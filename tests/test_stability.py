@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import atlas, record
+from experiments import atlas, record, stability
 from experiments.atlas.entry import Edge, edge, sweep
 from experiments.atlas.page import method
 
@@ -43,9 +43,11 @@ def test_an_edge_is_the_first_value_beyond_the_limit():
     assert edge([1, 2], [0, float("nan")], 1) == Edge(1, 2)
 
 
-def test_record_and_page_hold_every_entry_with_the_edge_of_its_own_curve():
-    text = (record.RESULTS / "stability.html").read_text(encoding="utf-8")
+def test_record_and_page_hold_every_entry_with_the_edge_of_its_own_curve(tmp_path):
+    stability.draw({"entries": RECORDED}, record.RESULTS / "stability", tmp_path / "stability.png")
+    text = (tmp_path / "stability.html").read_text(encoding="utf-8")
     assert list(RECORDED) == list(atlas.ENTRIES)
+    assert text.count("data:image/webp") == 2 * len(RECORDED)
     for name, found in RECORDED.items():
         entry = atlas.ENTRIES[name]
         assert f">{name}</h3>" in text

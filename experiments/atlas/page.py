@@ -3,22 +3,22 @@
 import base64
 import html
 import io
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 import jaxvol as jv
+from jaxvol._util.whole_files import whole_file
 
 from ..common import plt
-from .entry import Entry
+from .entry import Entry, pictured
 
 
 SOURCES = "../../"
 """From the folder of records to the root, where `jaxvol/` is."""
-LEAST = 192
-"""Pixels along the shorter side of a picture, at least."""
 DONE = {"bounded": "#2a7f2a", "detected and said": "#1f5fa8", "documented": "#b86a00", "fails": "#b02020"}
 STYLE = """
 body { font: 16px/1.45 sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
@@ -39,22 +39,19 @@ means that the failure does not occur anywhere in the sweep.
 
 Chart = Callable[[Any, Entry, dict[str, Any]], None]
 
-Pictures = dict[float, np.ndarray | str]
-"""Of an entry, by value: linear images, or what a page holds of them, data URIs."""
-
 
 def page(
     families: dict[str, list[Entry]],
     found: dict[str, dict[str, Any]],
-    pictures: dict[str, Pictures],
+    pictures: Path,
     chart: Chart,
 ) -> str:
-    """The page of all entries in `found`."""
+    """The page of all entries in `found`. `pictures`: the folder in which `keep` left theirs."""
     body = ["<h1>Failure atlas</h1>", f"<p>{INTRODUCTION}</p>", _contents(families, found)]
     for family, entries in families.items():
         if entries:
             body.append(f"<h2>{html.escape(family)}</h2>")
-        body += [_entry(e, found[e.name], pictures[e.name], chart) for e in entries]
+        body += [_entry(e, found[e.name], pictures, chart) for e in entries]
     head = f'<meta charset="utf-8"><title>jaxvol: failure atlas</title><style>{STYLE}</style>'
     return (
         f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n'
@@ -63,10 +60,17 @@ def page(
     )
 
 
-def pictures_of(text: str, entry: Entry) -> list[str]:
-    """The pictures of an entry that a page holds, as data URIs; none if it does not hold the entry."""
-    _, _, section = text.partition(f'<h3 id="{_anchor(entry)}">')
-    return re.findall(r'<figure class="picture"><img src="([^"]+)"', section.partition("<h3 ")[0])
+def keep(entry: Entry, images: Sequence[np.ndarray], folder: Path) -> None:
+    """Writes the pictures of an entry, linear images."""
+    folder.mkdir(exist_ok=True)
+    for file, image in zip(_files(entry, folder), images, strict=True):
+        levels = np.round(255 * np.asarray(jv.to_srgb(np.clip(image, 0, 1)))).astype(np.uint8)
+        with whole_file(file) as part:
+            Image.fromarray(levels).save(part, "WEBP", lossless=True)
+
+
+def _files(entry: Entry, folder: Path) -> list[Path]:
+    return [folder / f"{_anchor(entry)}.{i}.webp" for i in (1, 2)]
 
 
 def number(value: float | None) -> str:
@@ -94,13 +98,14 @@ def _contents(families: dict[str, list[Entry]], found: dict[str, dict[str, Any]]
     return f"<table><tr><th>entry</th><th>what jaxvol does</th><th>edge</th></tr>\n{rows}</table>"
 
 
-def _entry(entry: Entry, found: dict[str, Any], pictures: Pictures, chart: Chart) -> str:
+def _entry(entry: Entry, found: dict[str, Any], pictures: Path, chart: Chart) -> str:
     source, name = _source(entry.method)
     figures = "".join(
-        f'<figure class="picture"><img src="{image if isinstance(image, str) else _png(image)}" '
+        f'<figure class="picture"><img src="{_uri(file.read_bytes(), "webp")}" '
         f'alt="{html.escape(entry.shows)}">'
         f"<figcaption>{html.escape(entry.regime)}: <b>{number(value)}</b></figcaption></figure>"
-        for value, image in pictures.items()
+        for value, file in zip(pictured(entry, found), _files(entry, pictures), strict=True)
+        if file.is_file()
     )
     return (
         f'<h3 id="{_anchor(entry)}">{html.escape(entry.name)}</h3>\n'
@@ -135,23 +140,14 @@ def _source(name: str) -> tuple[str, str]:
     return method(name).__module__.replace(".", "/") + ".py", name
 
 
-def _png(image: np.ndarray) -> str:
-    """A linear image as a data URI, each pixel enlarged where it is small."""
-    times = max(1, -(-LEAST // min(image.shape[:2])))
-    levels = np.round(255 * np.asarray(jv.to_srgb(np.clip(image, 0, 1)))).astype(np.uint8)
-    buffer = io.BytesIO()
-    plt.imsave(buffer, np.kron(levels, np.ones((times, times, 1), np.uint8)), format="png")
-    return _uri(buffer)
-
-
 def _chart(entry: Entry, found: dict[str, Any], chart: Chart) -> str:
     figure, panel = plt.subplots(figsize=(4.2, 3.0), layout="constrained")
     chart(panel, entry, found)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=90, metadata={"Software": None})
     plt.close(figure)
-    return _uri(buffer)
+    return _uri(buffer.getvalue(), "png")
 
 
-def _uri(buffer: io.BytesIO) -> str:
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+def _uri(image: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
