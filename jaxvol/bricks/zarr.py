@@ -28,6 +28,9 @@ SPACE = ("x", "y", "z")
 AT_ONCE = 2**22
 """Bytes of decoded chunks that are read at a time, if a layer of single chunks has no more."""
 
+LARGE, BEYOND = 2**26, 8
+"""Bytes of a chunk that are always taken, and of those of the array, how many times as many."""
+
 DECODERS = min(os.cpu_count() or 1, 8)
 """Threads that read files, and threads that decode them."""
 
@@ -75,6 +78,7 @@ class ZarrSource(VoxelSource):
         self._complete = missing == "error"
         version, metadata = array_metadata(path)
         store = _opened(self.path, version, fill=missing == "fill", cache=cache)
+        _check_chunks(path, store)
         names = _axes(path, axes, metadata, store.rank)
         fixed = _fixed(path, names, store.shape, index or {})
         self._index = {names[axis]: at for axis, at in fixed.items()}
@@ -207,6 +211,18 @@ def _opened(path: Path, version: Literal[2, 3], *, fill: bool, cache: int) -> An
         return tensorstore.open(spec, open=True, read=True, context=context).result()
     except ValueError as fault:
         raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
+
+
+def _check_chunks(path: Path, store: Any) -> None:
+    """Raises for chunks for which no memory should be taken: a chunk is decoded as a whole, even if it
+    reaches beyond the array."""
+    chunk = [c or n for c, n in zip(store.chunk_layout.read_chunk.shape, store.shape, strict=True)]
+    of_chunk, whole = (math.prod(shape) * store.dtype.numpy_dtype.itemsize for shape in (chunk, store.shape))
+    if of_chunk > max(LARGE, BEYOND * whole):
+        raise ValueError(
+            f"path: {path} must have chunks that are not much larger than it; got chunks of {tuple(chunk)} "
+            f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
+        )
 
 
 def _axes(path: Path, axes: Any, metadata: dict[str, Any], rank: int) -> list[str]:

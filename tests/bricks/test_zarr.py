@@ -33,6 +33,15 @@ def written(path, data, chunks=(8, 8, 16), **options):
     return path
 
 
+def test_no_memory_is_taken_for_chunks_far_larger_than_the_array(tmp_path):
+    path = written(tmp_path / "a", np.zeros((5, 4, 3), np.uint8), (3, 4, 3))
+    metadata = json.loads((path / "zarr.json").read_text())
+    metadata["chunk_grid"]["configuration"]["chunk_shape"][1] = 10**9
+    (path / "zarr.json").write_text(json.dumps(metadata))
+    with pytest.raises(ValueError, match=r"got chunks of \(3, 1000000000, 3\) voxels, 9000000000 bytes"):
+        source_of(path)
+
+
 def chunk_files(path):
     return sorted(f for f in path.rglob("*") if f.is_file() and not f.name.startswith((".z", "zarr.")))
 

@@ -298,6 +298,8 @@ def test_gradients_are_those_of_differences(quadrature):
         slopes, here = program(scene)[1], float(program(scene)[0])
         for leaf, where in LEAVES.items():
             direction = jnp.asarray(random.uniform(0.2, 1, where(scene).shape))
+            if leaf == "extinction" and quadrature == "preintegrated":
+                direction = direction.at[1].set(direction[0])  # both are 0: see `March`
             one, two = (
                 float(program(eqx.tree_at(where, scene, where(scene) + n * STEP * direction))[0])
                 for n in (1, 2)
