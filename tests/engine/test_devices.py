@@ -38,8 +38,7 @@ def environment(devices: int) -> dict[str, str]:
 def on_eight_devices(fault: str | None, known: Path | str, *cases: str) -> None:
     """Runs cases of `on_devices.py`, with the fault of this session, if any."""
     start = f"""import sys
-from tests import conftest, faults
-conftest.import_with_types_checked()
+from tests import faults
 from tests.engine import on_devices
 if {fault!r}:
     faults.all_faults()[{fault!r}].inject()

@@ -206,7 +206,7 @@ def test_light_scattered_many_times_is_reflected_as_by_chandrasekhar(light):
     albedo, cosine, volume = np.array([0.5, 0.8, 0.95]), 0.6, cube()
     sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
     lights = lit(sun) if light == "sun" else lit(ConstantLight((2.0, 2.0, 2.0)))
-    traced = often(2, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lights)
+    traced = often(4, volume, uniform_transfer(60.0, albedo), far(volume, 0.01), lights)
     expected = np.pi * reflected(albedo, 1.0, cosine) if light == "sun" else 2 * under_sky(albedo, 1.0)
     mean, error = mean_and_error(traced)
     assert np.all(error < 0.01 * expected)
