@@ -344,10 +344,10 @@ HALF = math.pi / 2
 SCAN = (40, 48, 64)
 
 
-def probe_fog(*radii):
+def probe_fog(a, b):
     """A toroidal volume, red near the probe and blue behind, and its probe. At a small one's apex, nodes lie
     densely."""
-    probe = jv.ToroidalMap(*radii, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
+    probe = jv.ToroidalMap(a, b, (HALF - 0.6, HALF + 0.6), (HALF - 0.9, HALF + 0.9), (0, 60))
     points = [
         (v, color, 0.02)
         for v, color in ((0, (1, 0, 0)), (120, (1, 0, 0)), (135, (0, 0, 1)), (255, (0, 0, 1)))
