@@ -120,6 +120,18 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
     np.testing.assert_allclose(found.rgba, expected, rtol=2e-5, atol=2e-5)
 
 
+def test_there_is_a_gradient_of_a_lit_image():
+    """Its values are checked by slow tests, here and of templates, since it takes a minute to compile."""
+
+    def loss(scene):
+        return jnp.sum(jv.render(*scene[:4], lighting=scene[4]).rgba)
+
+    scene = (*scene_of(), FOG)
+    gradient = eqx.filter_eval_shape(eqx.filter_grad(loss), scene)
+    expected = eqx.filter(scene, eqx.is_inexact_array)
+    assert jax.tree.map(jnp.shape, gradient) == jax.tree.map(jnp.shape, expected)
+
+
 LEAVES = {
     "direction of the light": lambda s: s[4].lighting.toward,
     "density": lambda s: s[4].lighting.density,
