@@ -50,16 +50,18 @@ NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 
 
 def recorded(name: str, folder: Path) -> None:
-    """Measures a result and puts its files into the folder: the record, charts and pages of its name.
+    """Measures a result and puts its files into the folder: the record, charts and pages of its name, and
+    the pictures that pages show.
 
     **Raises** `subprocess.CalledProcessError` if the experiment fails; the folder is then as it was."""
     experiment, *options = shlex.split(ARGUMENTS.get(name, name))
     with TemporaryDirectory(dir=folder) as new:  # so that files are moved at once
         module = f"experiments.{experiment}"
         subprocess.run([sys.executable, "-m", module, *options, "--output", new], check=True)
-        for file in sorted(each for each in Path(new).rglob("*") if each.is_file()):
+        pictures = Path(new).glob("*/**/*.webp")  # what else is in folders serves to go on after Ctrl-C
+        for file in sorted({*pictures, *(each for each in Path(new).iterdir() if each.is_file())}):
             place = folder / file.relative_to(new).parent
-            place.mkdir(exist_ok=True)
+            place.mkdir(parents=True, exist_ok=True)
             os.replace(file, place / file.name.replace(experiment, name, 1))
 
 

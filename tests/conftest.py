@@ -60,8 +60,8 @@ def pytest_configure(config):
             # Tests spend most of their time compiling. Without LLVM's optimizations, and by XLA's older
             # emitter of fused kernels, it is half as long, and programs run somewhat slower. LLVM would then
             # fuse multiplications and additions in some programs and not in others, which round differently:
-            # an instruction set without them rounds all alike. Notebooks and the demo, and any other
-            # selection of tests (`-m ""`), compile as users do.
+            # an instruction set without them rounds all alike. Notebooks, documents and the demo, and any
+            # other selection of tests (`-m ""`), compile as users do.
             flags = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
             if platform.machine() in ("x86_64", "AMD64"):
                 flags.append("--xla_cpu_max_isa=AVX")

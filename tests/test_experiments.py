@@ -78,6 +78,22 @@ def test_every_record_has_a_chart_that_can_be_drawn_and_can_be_made_again(tmp_pa
     assert "speed" in capsys.readouterr().out
 
 
+def test_a_record_made_again_replaces_its_files_and_pictures_and_no_other(tmp_path, monkeypatch):
+    def run(command, check):
+        new = Path(command[-1])
+        (new / "pareto" / "engine").mkdir(parents=True)
+        for name in ("pareto.json", "pareto.png", "pareto/engine/left.webp", "pareto/engine/scene.json"):
+            (new / name).write_text("new")
+
+    monkeypatch.setattr(again.subprocess, "run", run)
+    (tmp_path / "pareto.json").write_text("old")
+    (tmp_path / "speed.json").write_text("old")
+    again.recorded("pareto", tmp_path)
+    files = {p.relative_to(tmp_path).as_posix(): p.read_text() for p in tmp_path.rglob("*") if p.is_file()}
+    made = dict.fromkeys(("pareto.json", "pareto.png", "pareto/engine/left.webp"), "new")
+    assert files == made | {"speed.json": "old"}
+
+
 # -- what experiments compute themselves ------------------------------------------------------------------
 
 
