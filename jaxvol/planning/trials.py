@@ -8,6 +8,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from ..compositing import Over
 from ..march import March, Quadrature, Transform
@@ -185,9 +186,7 @@ class Trials:
     def adaptive(self, step: float, truth: Truth) -> Trial | str:
         """Adaptive sampling, with cells from half this step on, and the largest tolerance of its own that
         keeps the goal; or why not."""
-        windows = Windows.of(self.setting.volume)
-        varies = self.setting.compositing.variation(self.setting.transfer, windows)
-        if not bool(jnp.any(jnp.isfinite(varies.total))):
+        if not bool(_predictable(self.setting)):
             return "it cannot be predicted how this scene varies"
         found, tolerance = None, 2 * self.goal
         for _ in range(4):
@@ -205,3 +204,10 @@ class Trials:
             else:
                 tolerance /= 4
         return found or SLOWER
+
+
+@eqx.filter_jit
+def _predictable(setting: Setting) -> Bool[Array, ""]:
+    """Whether it is known anywhere how the scene varies."""
+    varies = setting.compositing.variation(setting.transfer, Windows.of(setting.volume))
+    return jnp.any(jnp.isfinite(varies.total))

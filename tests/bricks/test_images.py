@@ -1,6 +1,7 @@
 """Are bricks seen? Images by bricks are those of the whole volume, and so are gradients; little is read."""
 
 import math
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -168,6 +169,17 @@ def test_other_transformations_say_what_to_do():
         with pytest.raises(ValueError, match=r"gradients in reverse mode.*none in forward mode \(jax\.jvp"):
             forward()
 
+    def shown(how, extinction):
+        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
+        return jv.render_bricks(ARRAY, transfer, WIDE, PLAIN, **how).rgba
+
+    for how, message in (
+        ({"compositing": jv.Isosurface(0.5)}, "compositing by Isosurface has no gradient through bricks"),
+        ({"method": "naive"}, 'method="naive" has no gradient'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jax.vjp(partial(shown, how), at)
+
     def image(source):
         return jnp.sum(jv.render_bricks(source, TRANSFER, WIDE, PLAIN).rgba)
 
@@ -225,6 +237,10 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"compositing": "over!"}, "compositing must be one of"),
     ({"progress": 5}, "progress must be a function"),
     ({"own": "bricks"}, "devices="),
+    (
+        {"own": "bricks", "devices": jax.devices(), "march": jv.March(1.0, (jv.EmptySpaceJitter(0),))},
+        r'own="bricks" does not go with EmptySpaceJitter',
+    ),
     ({"own": "voxels"}, "own must be one of rays, bricks; got 'voxels'"),
 ]
 

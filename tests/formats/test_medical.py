@@ -165,6 +165,9 @@ def test_a_metaimages_voxels_may_be_the_end_of_another_file_or_text(tmp_path):
         write_mhd(path, text.replace("23", wrong).encode(), "BinaryData = False")
         with pytest.raises(ValueError, match=rf"must hold integers from 0 to 255.*; got {wrong}"):
             load(path)
+    for wrong, message in ((text.replace("23", "many"), "must hold numbers in text"),):
+        with pytest.raises(ValueError, match=message):
+            load(write_mhd(path, wrong.encode(), "BinaryData = False"))
     for count in (23, 25, 10**6):
         with pytest.raises(ValueError, match=r"cut short|oversized"):
             load(write_mhd(path, b"1 " * count, "BinaryData = False"))

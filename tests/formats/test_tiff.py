@@ -59,6 +59,11 @@ def test_a_folder_of_images_is_sorted_by_number_and_bad_stacks_are_refused(tmp_p
     tifffile.imwrite(tmp_path / "one.tif", DATA[:, :, 0].T)
     tifffile.imwrite(tmp_path / "rgb.tif", np.zeros((4, 8, 9, 3), np.uint8), photometric="rgb")
     tifffile.imwrite(tmp_path / "b.tif", DATA.T, photometric="minisblack")
+    with tifffile.TiffWriter(tmp_path / "sizes.tif") as file:
+        for width in (7, 7, 5):
+            file.write(DATA[:width, :, 0].T, photometric="minisblack", contiguous=False)
+    tifffile.imwrite(write_folder(tmp_path / "stacks") / "slice8.tif", DATA.T, photometric="minisblack")
+    write_folder(tmp_path / "single", (8,))
     content = (tmp_path / "b.tif").read_bytes()
     cut = {f"cut{length}.tif": length for length in (4, 100, len(content) // 2, len(content) - 20)}
     for name, length in cut.items():
@@ -67,6 +72,9 @@ def test_a_folder_of_images_is_sorted_by_number_and_bad_stacks_are_refused(tmp_p
         "a": r"same size and type.*slice8\.tif has \(6, 7\).*slice10.tif \(4, 7\)",
         "gap": r"slices are missing.*slice10\.tif is followed by slice12\.tif",
         "one.tif": "at least 2 images; got 1",
+        "sizes.tif": r"size|series|one stack",
+        "stacks": r"slice8\.tif must hold one image, as a slice of .*; got 5",
+        "single": "at least 2 slices; got 1",
         "rgb.tif": "one value per pixel",
         **{name: name for name in cut},
     }

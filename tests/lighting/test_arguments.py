@@ -119,6 +119,8 @@ BAD = {
     "many templates": (lambda: lit(templates=10**9)().grown(blend=False), "1000000000 templates.*asks for"),
     "faint": (lit(FAINT), "opacity 0.031 leaves no photon"),
     "given": (lit([HALF, HALF], given=PAIR), "templates of 2 materials"),
+    "given by a number": (lit(given=3), "given must be a ScattererTemplate; got 3"),
+    "a critical angle": (lit(critical_angle=91.0), "critical_angle must be"),
     "lights": (lit(lights=()), "lights must be a light"),
     "materials": (lit(()), "materials must hold at least one Material"),
     "labels": (
@@ -153,6 +155,27 @@ def test_bad_input_is_named(case):
 
 def test_the_threshold_that_is_advised_leaves_photons():
     assert Threshold(value=0.00775).levels(FAINT) > 1
+
+
+def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():
+    """Of an opacity that is not traced, no more than there are; and energy that is not conserved is not made
+    up for."""
+    one, two = (lit(levels=levels)() for levels in (1, 2))
+    assert (one.photons, two.photons) == (4, 12)
+
+    def shape(opacity):
+        lighting = lit(Material(opacity, 1.0), levels=2)()
+        assert lighting.photons >= two.photons
+        return lighting.grown(blend=False).intensity
+
+    assert jax.eval_shape(shape, 0.5).shape[:2] == (1, two.templates)
+    grown = jax.eval_shape(lambda: lit(energy="printed", critical_angle=42.0)().grown(blend=True).intensity)
+    assert grown.shape[:2] == (1, 1)
+
+
+def test_baked_light_is_read_at_any_distance():
+    assert lit(baked=True)().farthest_read is None
+    assert 0 < lit(given=jax.tree.map(jnp.ones_like, PAIR))().farthest_read < np.inf
 
 
 def test_defaults():

@@ -399,6 +399,11 @@ def test_bad_arguments_are_named():
     fails("paths", paths=1.5)
     fails("key", key="seed")
     fails("key", key=-1)
+    with pytest.raises(ValueError, match=r"key must be an integer, or a key of jax.random; got"):
+        jax.eval_shape(lambda key: jv.path_trace(NOISE, transfer, camera, FURNACE, key=key).radiance, 0.5)
+    for key in (jnp.int32(3), jax.random.key(3)):  # traced
+        traced = jax.eval_shape(lambda key: jv.path_trace(NOISE, transfer, camera, FURNACE, key=key), key)
+        assert traced.radiance.shape == (*camera.size[::-1], 3)
     fails("anisotropy", anisotropy=1.0)
     fails("max_scatterings", max_scatterings=0)
     fails("lanes", lanes=0)

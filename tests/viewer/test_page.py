@@ -1,5 +1,6 @@
 """Who may connect to the page of `jaxvol view`, and what can a client make it do?"""
 
+import asyncio
 import socket
 import threading
 from types import SimpleNamespace
@@ -131,6 +132,43 @@ def test_the_controls_show_how_it_begins():
     assert (shown["window"].value, shown["level"].value) == (0, 9)
     assert shown["level"].max - shown["level"].min > 20
     assert "light" in shown
+
+
+def test_labels_are_shown_and_changed_by_their_controls(page, monkeypatch):
+    """What is changed in a browser; not what the program itself shows in its controls."""
+    from jaxvol.viewer.model import Model
+    from jaxvol.viewer.page_look import _LabelControls
+
+    from .test_model import LABELS, begun
+
+    changes: list[Any] = []
+    monkeypatch.setattr(Model, "change", lambda _, **changed: changes.append(changed["look"]))
+    model = Model(*begun(LABELS, None), lambda _: None, lambda _: None, rest=0)
+    try:
+        controls = _LabelControls(page._server.gui, model)
+    finally:
+        model.close()
+    look = model.state.look
+    assert (controls.label.options, controls.label.value) == (("1", "2"), "1")
+
+    def choose(control, value, client):
+        control.value = value
+        for call in control._impl.update_cb:
+            asyncio.run(call(SimpleNamespace(client=client)))
+
+    choose(controls.shown, False, None)
+    assert not changes
+    choose(controls.shown, False, "a browser")
+    assert equal(changes.pop(), look.changed(1, shown=False))
+    choose(controls.label, "2", "a browser")
+    assert controls.shown.value  # as the look has it
+    assert controls.color.value == tuple(round(255 * part) for part in look.color(2))
+    choose(controls.opacity, 0.5, "a browser")
+    assert equal(changes.pop(), look.changed(2, opacity=0.5))
+
+
+def equal(one, other) -> bool:
+    return (one.shown, one.opacities) == (other.shown, other.opacities)
 
 
 def test_a_port_that_is_none_is_named():
