@@ -175,7 +175,9 @@ def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():
 
 def test_baked_light_is_read_at_any_distance():
     assert lit(baked=True)().farthest_read is None
-    assert 0 < lit(given=jax.tree.map(jnp.ones_like, PAIR))().farthest_read < np.inf
+    farthest = lit(given=jax.tree.map(jnp.ones_like, PAIR))().farthest_read
+    assert farthest is not None
+    assert 0 < farthest < np.inf
 
 
 def test_defaults():

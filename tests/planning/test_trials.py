@@ -206,6 +206,7 @@ def test_the_first_light_within_the_goal_is_taken():
     ):
         light = Light(1e-3, *map(Light, errors))
         (_, chosen, error, _, _), parts = lit(known, light, gradients=gradients)
+        assert isinstance(chosen, Light)
         assert chosen.error == used == pytest.approx(error, rel=1e-3)
         assert [part.name for part in parts if part.kept] == ["step 1", f"light: {_name(used, light)}"]
     assert not any("0.6" in part.name for part in parts)
@@ -217,6 +218,7 @@ def _name(error: float, light: Light) -> str:
 
 def test_the_least_error_is_taken_where_no_light_is_within_the_goal():
     (_, chosen, error, _, _), parts = lit(Known(lambda step: 0.0), Light(math.nan, Light(math.nan)))
+    assert isinstance(chosen, Light)
     assert chosen.error == error == 0
     assert {part.name: part.kept for part in parts}["light: as given, without its noise"]
 

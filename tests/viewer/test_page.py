@@ -148,7 +148,7 @@ def test_labels_are_shown_and_changed_by_their_controls(page, monkeypatch):
         controls = _LabelControls(page._server.gui, model)
     finally:
         model.close()
-    look = model.state.look
+    look: Any = model.state.look
     assert (controls.label.options, controls.label.value) == (("1", "2"), "1")
 
     def choose(control, value, client):
