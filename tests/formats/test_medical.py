@@ -165,6 +165,15 @@ def test_a_metaimages_voxels_may_be_the_end_of_another_file_or_text(tmp_path):
         write_mhd(path, text.replace("23", wrong).encode(), "BinaryData = False")
         with pytest.raises(ValueError, match=rf"must hold integers from 0 to 255.*; got {wrong}"):
             load(path)
+    doubles = write_mhd(path, VALUES.astype("<f8").tobytes())
+    doubles.write_text(doubles.read_text().replace("MET_UCHAR", "MET_DOUBLE"))
+    assert same(load(doubles), expected.astype(np.float32))
+    doubles.write_text(doubles.read_text().replace("MET_DOUBLE", "MET_STRING"))
+    with pytest.raises(ValueError, match=r"ElementType must be one of .*got 'MET_STRING'"):
+        load(doubles)
+    for spacing in ("1 1", "1 1 far"):
+        with pytest.raises(ValueError, match=f"ElementSpacing must be 3 numbers; got '{spacing}'"):
+            load(write_mhd(path, VALUES.tobytes(), f"ElementSpacing = {spacing}"))
     for wrong, message in ((text.replace("23", "many"), "must hold numbers in text"),):
         with pytest.raises(ValueError, match=message):
             load(write_mhd(path, wrong.encode(), "BinaryData = False"))

@@ -12,7 +12,7 @@ from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
 from jaxvol.metrics import rmse
 from jaxvol.occupancy import Blocks
 from jaxvol.planning import trials
-from jaxvol.planning.plan import _proven
+from jaxvol.planning.plan import _checked, _proven
 from jaxvol.space import Affine
 
 from ..scenes import scaled_phantom, slow, soft_transfer, uniform_transfer
@@ -106,6 +106,15 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face():
         proven, parts = _proven(visible(cube), Affine(cube), ())
         assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
         assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
+
+
+def test_transforms_that_are_part_of_the_scene_are_kept():
+    clip, borders = jv.Clip((-1, 1, -1, 1, -1, 1)), jv.AlphaCorrection(labels=True)
+    tolerance, given = _checked(0.1, (clip, borders), SPHERE)
+    assert (tolerance, given) == (0.1, (clip, borders))
+    proven, (aligned, *_) = _proven(visible(), Affine(SPHERE), given)
+    assert (aligned.kept, aligned.why) == (True, "part of the scene")
+    assert not any(isinstance(each, jv.AlphaCorrection) for each in proven)
 
 
 @pytest.mark.parametrize("inside_out", [False, *slow(True)])
