@@ -26,14 +26,15 @@ import numpy as np
 from matplotlib.ticker import NullFormatter
 
 import jaxvol as jv
-from jaxvol.bricks import overlap_of, share
+from jaxvol.bricks import VoxelSource, overlap_of, share, source_of
 
 from . import bricks_paper, common, record, timing
 from .bricks_paper import BEST, TABLE, Split
 from .common import plt
+from .naive_bricks import each_at_once
 
 
-METHODS = ("overlap", "reload", "naive")
+METHODS: dict[str, Any] = {"overlap": "overlap", "reload": "reload", "naive": each_at_once}
 SCALE = 0.17
 """Of the probe, so that the fetus lies within the scan."""
 MANY = 100
@@ -57,7 +58,7 @@ class Scan(NamedTuple):
     """A scan on disk."""
 
     path: Path
-    shape: tuple[int, int, int]
+    source: VoxelSource
     probe: jv.ToroidalMap
     transfer: jv.TransferFunction
 
@@ -65,7 +66,7 @@ class Scan(NamedTuple):
     def step(self) -> float:
         """Of rays, in mm: two samples of a beam."""
         first, last = self.probe.gamma_range
-        return 2 * float(last - first) / (self.shape[2] - 1)
+        return 2 * float(last - first) / (self.source.shape[2] - 1)
 
     @property
     def march(self) -> jv.March:
@@ -91,7 +92,7 @@ def stored(folder: Path, resolution: int) -> Scan:
     volume, probe = phantom(resolution)
     path = folder / "fetus.npy"
     np.save(path, np.asarray(volume.data))
-    return Scan(path, volume.shape, probe, jv.TransferFunction.from_points(TISSUE))
+    return Scan(path, source_of(path), probe, jv.TransferFunction.from_points(TISSUE))
 
 
 def forget(path: Path) -> None:
@@ -105,8 +106,8 @@ def forget(path: Path) -> None:
 
 def frame(scan: Scan, view: jv.Camera, split: Split, method: str) -> jv.Rendering:
     forget(scan.path)
-    how = {"bricks": split, "method": method, "outputs": "rgba"}
-    return jv.render_bricks(scan.path, scan.transfer, view, scan.march, **how)
+    how = {"bricks": split, "method": METHODS[method], "outputs": "rgba"}
+    return jv.render_bricks(scan.source, scan.transfer, view, scan.march, **how)
 
 
 def whole(scan: Scan, view: jv.Camera) -> jv.Rendering:
@@ -131,7 +132,7 @@ def compared(
     programs: dict[str, Callable[[], Any]] = {method: partial(run, method) for method in METHODS}
     programs[WHOLE] = lambda: whole(scan, view).rgba
     seconds = timing.interleaved(programs, repetitions)
-    voxels = np.prod(scan.shape) * np.dtype(np.float32).itemsize
+    voxels = np.prod(scan.source.shape) * np.dtype(np.float32).itemsize
     rows: dict[str, dict[str, Any]] = {WHOLE: {"seconds": median(seconds[WHOLE])}}
     for method in METHODS:
         report = found[method].bricks
@@ -234,12 +235,12 @@ def main(chosen: Namespace) -> common.Answer:
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
         for split in splits:
-            grid = bricks_paper.grid(scan.shape, split)
+            grid = bricks_paper.grid(scan.source.shape, split)
             rows[named(split)] = {
                 **({"paper": TABLE[split]._asdict()} if split in TABLE else {}),
                 "formula": round(bricks_paper.overlap(split), 3),
                 "formula, of these voxels": round(
-                    100 * share(overlap_of(scan.probe, grid), scan.shape[2]), 3
+                    100 * share(overlap_of(scan.probe, grid), scan.source.shape[2]), 3
                 ),
                 **measure(split, VIEW),
             }
@@ -247,7 +248,7 @@ def main(chosen: Namespace) -> common.Answer:
             from_[view] = measure(BEST, view)
     about = {
         "image": [chosen.size] * 2,
-        "voxels": list(scan.shape),
+        "voxels": list(scan.source.shape),
         "step, mm": round(scan.step, 5),
         "view": VIEW,
     }

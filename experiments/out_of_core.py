@@ -61,8 +61,6 @@ def volume(folder: Path, voxels: int, kind: str, seed: int) -> Path:
 def image(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[str, Any]:
     """What `experiments.out_of_core_image` tells of a file. `memory`: MiB; None for all."""
     given = "resident" if memory is None else str(memory * 2**20)
-    for summary in path.parent.glob(f"{path.name}.jaxvol-summary-*"):
-        summary.unlink()  # so that the first image takes a pass over all voxels
     words = ["-m", "experiments.out_of_core_image", str(path), str(voxels), str(pixels), given]
     ran = subprocess.run(
         [sys.executable, *words], cwd=Path(__file__).parent.parent, capture_output=True, text=True, check=True

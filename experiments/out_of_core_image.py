@@ -47,8 +47,10 @@ def measure(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[st
     raw = {"shape": (voxels,) * 3, "dtype": "uint8"} if path.suffix == ".raw" else {}
     jax.block_until_ready(camera.position + 1)  # JAX is up
     found: dict[str, Any] = {"before": round(peak(), 1)}
-    volume = None
-    if memory is None:
+    volume = source = None
+    if memory is not None:
+        source = jv.bricks.source_of(path, spacing=spacing, origin=origin, **raw)
+    else:
         begun = time.perf_counter()
         data = np.fromfile(path, np.uint8).reshape((voxels,) * 3).T
         volume = jv.Volume(data, spacing, origin)
@@ -58,8 +60,7 @@ def measure(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[st
     def image(transfer: jv.TransferFunction) -> jv.Rendering:
         if volume is not None:
             return jv.render(volume, transfer, camera, march, outputs="rgba")
-        where = {"spacing": spacing, "origin": origin, "memory": memory}
-        return jv.render_bricks(path, transfer, camera, march, outputs="rgba", **where, **raw)
+        return jv.render_bricks(source, transfer, camera, march, outputs="rgba", memory=memory)
 
     for name, transfer in transfers.items():
         row = found[name] = {}

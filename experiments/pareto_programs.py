@@ -93,10 +93,10 @@ def in_bricks(part: float, step: float, case: Case) -> Program:
     memory = int(part * COPIES * volume.data.nbytes)
     path = Path(_folder().name) / f"{len(list(Path(_folder().name).glob('*.npy')))}.npy"
     np.save(path, np.asarray(volume.data))
-    place: dict[str, Any] = {"spacing": volume.spacing, "origin": volume.origin}
+    source = jv.bricks.source_of(path, spacing=volume.spacing, origin=volume.origin)
 
     def render() -> jv.Rendering:
-        return jv.render_bricks(path, transfer, camera, march, memory=memory, outputs="rgba", **place)
+        return jv.render_bricks(source, transfer, camera, march, memory=memory, outputs="rgba")
 
     def image() -> np.ndarray:
         rendering = render()

@@ -12,6 +12,7 @@ import jaxvol as jv
 from jaxvol.bricks import BrickGrid, overlap_of
 from jaxvol.space import enter
 
+from ..naive_bricks import each_at_once
 from .entry import Entry, colors
 
 
@@ -54,8 +55,11 @@ def whole(depth: float, size: int) -> np.ndarray:
     return np.asarray(jv.render(volume(), fog(depth), view(size), march, **how).rgba, np.float64)
 
 
+METHODS: dict[str, Any] = {"naive": each_at_once, "overlap": "overlap"}
+
+
 def by_bricks(depth: float, size: int, method: str) -> jv.Rendering:
-    how = {"bricks": BRICKS, "method": method, "outputs": "rgba"}
+    how = {"bricks": BRICKS, "method": METHODS[method], "outputs": "rgba"}
     return jv.render_bricks(volume(), fog(depth), view(size), jv.March(STEP, (PROBE,)), **how)
 
 
@@ -65,7 +69,7 @@ def error(found: jv.Rendering, truth: np.ndarray) -> float:
 
 def ordered(depth: float, size: int) -> dict[str, float]:
     truth = whole(depth, size)
-    return {method: error(by_bricks(depth, size, method), truth) for method in ("naive", "overlap")}
+    return {method: error(by_bricks(depth, size, method), truth) for method in METHODS}
 
 
 def ordered_picture(depth: float, size: int) -> np.ndarray:
@@ -84,11 +88,11 @@ ORDER = Entry(
     judged="naive",
     limit=LEVEL,
     outcome="documented",
-    does='A ray that leaves a brick and comes back passes another one between. Under method="naive" both '
+    does="A ray that leaves a brick and comes back passes another one between. Shown at once (naive), both "
     "parts of it in the first brick are blended at once, and what lies between them after or before both. "
     '"overlap" and "reload" keep the order of the samples, and their error is that of rounding.',
     picture=ordered_picture,
-    shows='a scan that is red near the probe (below) and blue far from it, under method="naive"',
+    shows="a scan that is red near the probe (below) and blue far from it, each brick shown at once",
     size=SIZE,
 )
 

@@ -1,17 +1,15 @@
 """Volumes that need not fit into memory, on disk or in the memory of the host.
 
 `jaxvol.render_bricks` renders them, brick by brick. Here is what it uses: sources, from which boxes of voxels
-are read (`source_of`, `levels_of`); their summaries, which tell what is empty (`summary_of`); levels of
-detail (`level_for`); and the overlap of bricks with curved faces (`overlap_of`).
+are read (`source_of`, `levels_of`); their summaries, which tell what is empty (`summary_of`); and the overlap
+of bricks with curved faces (`overlap_of`).
 """
 
-from .detail import level_for as level_for, range_error as range_error
-from .files import npy as npy, raw as raw
 from .grid import BrickGrid as BrickGrid
+from .levels import level_for as level_for
 from .opening import levels_of as levels_of, source_of as source_of
 from .overlap import overlap_of as overlap_of, share as share
 from .plan import BudgetPlan as BudgetPlan, plan as plan
 from .render import render_bricks as render_bricks
-from .sources import ArraySource as ArraySource, VoxelSource as VoxelSource
-from .summary import Summary as Summary
-from .summary_files import summary_of as summary_of
+from .sources import VoxelSource as VoxelSource
+from .summary import Summary as Summary, summary_of as summary_of

@@ -43,7 +43,7 @@ def cheapest(
 
     def cost(other: BrickGrid) -> int:
         stored = stored_of(other, margin, None)
-        each = source.touched(stored) + math.prod(stored) * source.dtype.itemsize + PER_RAY * rays
+        each = source.bytes_touched(stored) + math.prod(stored) * source.dtype.itemsize + PER_RAY * rays
         return each * -(-int(visible(other, summary, table).sum()) // least)
 
     tried = [other for other in _others(grid, source, margin, memory) if other.number >= least]

@@ -30,8 +30,8 @@ from ..engine.parts import Underway, arrive, joined, march_part, set_out
 from ..engine.scene import Scene
 from ..rendering import Rendering
 from ..volume import part_of, with_voxels
+from .cells import behind_straight, of_straight
 from .grid import BrickGrid, Node
-from .ranges import behind_straight, of_straight
 from .stream import Stream
 
 

@@ -23,7 +23,6 @@ from .opening import OF_RAW, OF_ZARR, Openable, levels_of
 from .render import bricks_of, budget, render_bricks
 from .sources import VoxelSource
 from .split import TooLittleMemory, check_smallest
-from .summary_files import check_cache
 
 
 IN_MEMORY = 9
@@ -46,7 +45,7 @@ class BudgetPlan(NamedTuple):
       most: those that may hold anything visible. `bytes_read`: of these, at most. All three hold for the
       camera of the plan, and for others of as many pixels: into which bricks a volume is split depends on
       the number of rays (`bricks/choice.py`).
-    - `compositing`, `cache`: as given.
+    - `compositing`: as given.
     """
 
     plan: Plan
@@ -57,7 +56,6 @@ class BudgetPlan(NamedTuple):
     loads: int
     bytes_read: int
     compositing: Any
-    cache: Any
 
     @property
     def march(self) -> March:
@@ -72,7 +70,7 @@ class BudgetPlan(NamedTuple):
         how = {"compositing": self.compositing, "lighting": self.lighting} | options
         if self.counts is None:
             return render(self.plan.volume, transfer, camera, self.march, **how)
-        how = {"memory": self.memory, "cache": self.cache} | how
+        how = {"memory": self.memory} | how
         return render_bricks(self.source, transfer, camera, self.march, **how)
 
     def __str__(self) -> str:
@@ -111,7 +109,6 @@ def plan(
     spacing: Arrayable | None = None,
     origin: Arrayable | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
-    cache: Any = "beside",
     source: dict[str, Any] | None = None,
     **options: Any,
 ) -> BudgetPlan: ...
@@ -125,7 +122,6 @@ def plan(
     spacing: Arrayable | None = None,
     origin: Arrayable | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
-    cache: Any = "beside",
     source: dict[str, Any] | Any | None = None,
     **options: Any,
 ) -> Plan | BudgetPlan:
@@ -148,7 +144,7 @@ def plan(
       levels of detail, the finest.
     - `transfer`, `camera`, `tolerance`, `compositing`: as for `planning.plan`.
     - `memory`: bytes, as for `render_bricks`; by default a quarter of the device's memory.
-    - `spacing`, `origin`, `cache`: as for `render_bricks`.
+    - `spacing`, `origin`: as for `render_bricks`.
     - `source`: other options of `bricks.levels_of`, such as {"shape": (nx, ny, nz), "dtype": "uint8"}.
     - `options`: of `planning.plan`: `transforms`, `lighting`, `gradients`, `seed`.
 
@@ -169,7 +165,6 @@ def plan(
         )
     opened, *_ = levels_of(volume, **place, **(source or {}))
     # before anything takes time
-    check_cache(cache)
     check_smallest(opened.shape, opened.dtype, room)
     stride = 1
     while IN_MEMORY * opened.dtype.itemsize * math.prod(-(-n // stride) for n in opened.shape) > room:
@@ -181,9 +176,9 @@ def plan(
     copy = copied(opened, stride)
     found = plan_in_memory(copy, transfer, camera, tolerance, **how)
     if stride == 1:
-        return BudgetPlan(found, opened, room, 1, None, 0, opened.nbytes, compositing, cache)
+        return BudgetPlan(found, opened, room, 1, None, 0, opened.nbytes, compositing)
     march, parts = _finer(found.march, stride), _parts(found.parts)
-    how = {"compositing": compositing, "lighting": found.lighting, "cache": cache}
+    how = {"compositing": compositing, "lighting": found.lighting}
     halved = 0
     while True:
         try:
@@ -196,7 +191,7 @@ def plan(
     loads = int(stream.visible.sum())
     nbytes = loads * int(np.prod(stream.stored)) * opened.dtype.itemsize
     found = found._replace(march=march, parts=parts, probed=time.perf_counter() - begun)
-    return BudgetPlan(found, opened, room, stride, stream.report().counts, loads, nbytes, compositing, cache)
+    return BudgetPlan(found, opened, room, stride, stream.report().counts, loads, nbytes, compositing)
 
 
 def copied(source: VoxelSource, stride: int) -> Volume:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._util.checks import Arrayable, described, integer, is_traced, number, shortened
+from .._util.checks import Arrayable, described, integer, is_traced, shortened
 from .._util.memory import memory_of_device
 from .._util.trees import PyTree, strong
 from .._util.xla import compiled, forward_mode, transformations
@@ -32,20 +32,18 @@ from ..labels import LabelTransferFunction
 from ..lighting.shading import Lighting
 from ..march import March
 from ..modes import Mode, compositing_of
-from ..occupancy import BLOCK
 from ..rendering import Details, Rendering
 from ..selection import Selection
 from ..transfer import Transfer
 from ..transforms import SpaceLeaping, ToroidalMap
 from ..volume import Volume, part_of
-from .detail import level_for
 from .grid import is_straight
+from .levels import level_for
 from .opening import OF_RAW, OF_ZARR, levels_of
 from .owned import render_owned
 from .sources import VoxelSource
-from .stream import CELL, Method, Stream
-from .summary import Summary
-from .summary_files import summary_of
+from .stream import METHODS, Method, Stream
+from .summary import Summary, summary_of
 
 
 Own = Literal["rays", "bricks"]
@@ -67,8 +65,6 @@ def render_bricks(
     lighting: Lighting | Any | None = None,
     outputs: Asked | Any = "all",
     level: int | Literal["auto"] | Any = "auto",
-    tolerance: float | Any | None = None,
-    cache: Literal["beside"] | str | Any | None = "beside",
     progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
     own: Own | Any = "rays",
@@ -91,9 +87,11 @@ def render_bricks(
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
 
-    - `source`: an array or a memory map, data[x, y, z]; the path of a raw, .npy, Zarr or OME-Zarr file; a
-      `Volume`; a `bricks.VoxelSource`. See `bricks.levels_of`, which also takes `options` (`shape` and
-      `dtype` of a raw file, and `axes`, `index` and `missing` of a Zarr array).
+    - `source`: anything with `shape`, `dtype` and `source[box]`, data[x, y, z]; the path of a raw, .npy, Zarr
+      or OME-Zarr file; a `Volume`; a `bricks.VoxelSource`. See `bricks.levels_of`, which also takes `options`
+      (`shape` and `dtype` of a raw file, and `axes`, `index` and `missing`). One pass over all voxels finds
+      their ranges before the first image. A `VoxelSource` of a file keeps them for the next: open it once, by
+      `bricks.source_of`. An array in memory has the pass in each image.
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
       them an image takes some 550 bytes for each pixel, compiled programs some 300 MiB, the ranges of values
@@ -107,18 +105,12 @@ def render_bricks(
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
       fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
-      them. `"naive"`: each brick shows at once all that a ray meets in it, in the wrong order: what the
-      paper compares with, not an image to use.
+      them. A function plans turns of its own (`bricks.stream.Turns`).
     - `lighting`: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
       (`Lighting.farthest_read`).
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
-      are no larger than a pixel; or, with a `tolerance`, whose error by ranges of values stays below that
-      (`bricks.level_for`). A `tolerance` goes with `"auto"` alone. Under a `ToroidalMap` it is the finest, 0:
-      its ranges are those of the finest level's nodes, and the nodes of the others lie elsewhere.
-    - `cache`: where the ranges of values are kept, which are found in one pass over the voxels before the
-      first image: `"beside"` the data, in a folder, or nowhere (None); see `bricks.summary_of`. With
-      `tolerance` it is over all levels. What nobody knows to be unchanged, an array or a memory map open for
-      writing, has it in each image.
+      are no larger than a pixel at the volume's nearest corner (`bricks.level_for`); under a `ToroidalMap`
+      the finest, 0: its ranges are those of the finest level's nodes, and those of others lie elsewhere.
     - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
       anything visible. The former may end below the latter, where bricks are not needed, or above it, where
       they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
@@ -148,8 +140,7 @@ def render_bricks(
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
     unknown; for voxels outside of the ranges of values found before, which tell that it changed; for less
     memory than the smallest bricks take; for what needs the whole volume at once (labels,
-    baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written but the
-    cache, which appears whole or not at all.
+    baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written.
 
     Where it fails, and where not: `experiments/stability.py`, "wrong order".
 
@@ -164,15 +155,13 @@ def render_bricks(
         raise TypeError(f"render_bricks has no arguments {', '.join(unknown)}; see its docstring.")
     if progress is not None and not callable(progress):
         raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
-    if tolerance is not None:
-        number("tolerance", tolerance, above=0, below=1)
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
     known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
     levels = levels_of(source, **known, **options)
     room = budget(memory)
-    chosen = _level(levels, level, camera, transfer, march, tolerance, room, cache)
+    chosen = _level(levels, level, camera, march)
     place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
     if len(known) < 2:
         if len(levels) > 1:
@@ -181,11 +170,10 @@ def render_bricks(
             part if name in known else given
             for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
         )
-    direction = source.direction if isinstance(source, Volume) else None
-    scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting, direction)
+    scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting)
     check_not_sharded(mesh, scene)
     scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
-    job = _Job(chosen, room, _counts(bricks), method, outputs, cache, progress, mesh, owned, [])
+    job = _Job(chosen, room, _counts(bricks), method, outputs, progress, mesh, owned, [])
     if owned:
         _check_owned(scene, method)
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
@@ -214,14 +202,13 @@ def bricks_of(
     memory: int,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | None = None,
-    cache: Any = "beside",
 ) -> Stream:
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
     _check(march, transfer, lighting, "overlap", "all", "rays")
     place = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
     scene = _scene_of(source, place, transfer, camera, march, compositing, lighting)
     marched = _marched(scene)
-    job = _Job(source, memory, None, "overlap", "all", cache, None, None, False, [])
+    job = _Job(source, memory, None, "overlap", "all", None, None, False, [])
     return job.stream(marched, scene, job.options("all"))
 
 
@@ -233,10 +220,9 @@ def _scene_of(
     march: March,
     compositing: Mode | Compositing[Any] | Any,
     lighting: Lighting | None,
-    direction: Any = None,
 ) -> Scene:
     """The scene of a source, without its voxels. `place`: spacing and origin, along x, y and z."""
-    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=direction)
+    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
     return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
@@ -262,7 +248,6 @@ class _Job:
     counts: tuple[int, int, int] | None
     method: Method
     outputs: Asked
-    cache: Any
     progress: Callable[[int, int], Any] | None
     devices: Mesh | None
     owned: bool
@@ -279,8 +264,7 @@ class _Job:
         def summary() -> Summary:
             if self.streams:  # the second march of a gradient
                 return self.streams[0].summary
-            cell = CELL if min(self.source.shape) > CELL else BLOCK
-            return summary_of(self.source, cell, memory=self.memory, cache=self.cache)
+            return summary_of(self.source, memory=self.memory)
 
         where = self.memory, self.counts, self.method, self.progress
         least = number_of(self.devices) if self.owned else 1
@@ -302,13 +286,13 @@ def _image(scene: Scene, job: _Job) -> Rendering:
     if job.owned:
         assert job.devices is not None
         return render_owned(stream, job.devices)
-    naive = job.method == "naive"
+    exact = callable(job.method)
 
     def march_brick(
         part: Volume, cells: CellRange, state: tuple[Underway, PyTree]
     ) -> tuple[Underway, PyTree]:
         underway, pixels = state
-        after = _march_part(*_on(part, marched, options), underway, cells, naive)
+        after = _march_part(*_on(part, marched, options), underway, cells, exact)
         if selects:
             pixels = _resolve_part(*_on(part, scene, options), marched.march, underway.at, after, pixels)
         return after, pixels
@@ -342,14 +326,14 @@ def _differentiable(scene: Scene, job: _Job) -> Rendering:
 
 @_differentiable.def_fwd
 def _(perturbed: Any, scene: Scene, job: _Job) -> tuple[Rendering, Rendering]:
-    mode, method = scene.compositing, job.method
+    mode = scene.compositing
     if mode.resolves:
         raise ValueError(
             f"compositing by {type(mode).__name__} has no gradient through bricks; use jv.render on a volume "
             "in memory."
         )
-    if method == "naive":
-        raise ValueError('method="naive" has no gradient; use "overlap".')
+    if callable(job.method):
+        raise ValueError('method: turns of your own have no gradient; use "overlap".')
     rendering = _differentiable(scene, job)
     return rendering, rendering
 
@@ -385,14 +369,7 @@ def _on(
 
 
 def _level(
-    levels: tuple[VoxelSource, ...],
-    level: int | Literal["auto"] | Any,
-    camera: Camera,
-    transfer: Transfer,
-    march: March,
-    tolerance: float | None,
-    memory: int,
-    cache: Any,
+    levels: tuple[VoxelSource, ...], level: int | Literal["auto"] | Any, camera: Camera, march: March
 ) -> VoxelSource:
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
     if level != "auto":
@@ -402,23 +379,15 @@ def _level(
                 "level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got "
                 f"{level}."
             )
-        if tolerance is not None:
-            raise ValueError(
-                f"tolerance chooses a level, and level={level} is one: leave one of them out; got "
-                f"tolerance={tolerance}."
-            )
         return levels[chosen]
     if len(levels) == 1 or mapped:
         return levels[0]
-    if is_traced(camera, transfer):
+    if is_traced(camera):
         raise ValueError(
             f"level must be one of 0 to {len(levels) - 1} where gradients are taken; got 'auto', which "
             "depends on what is differentiated."
         )
-    summaries = None
-    if tolerance is not None:
-        summaries = [summary_of(each, CELL, memory=memory, cache=cache) for each in levels]
-    return levels[level_for(levels, camera, transfer, summaries, tolerance=tolerance)]
+    return levels[level_for(levels, camera)]
 
 
 def _counts(bricks: Any) -> tuple[int, int, int] | None:
@@ -437,9 +406,10 @@ def _counts(bricks: Any) -> tuple[int, int, int] | None:
 def _check(
     march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any, own: Any
 ) -> None:
-    for name, given, known in (("method", method, Method), ("outputs", outputs, Asked), ("own", own, Own)):
-        if not isinstance(given, str) or given not in get_args(known):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
+    words = (("outputs", outputs, get_args(Asked)), ("own", own, get_args(Own)))
+    for name, given, known in (*words, *(() if callable(method) else (("method", method, METHODS),))):
+        if not isinstance(given, str) or given not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
     if isinstance(transfer, LabelTransferFunction):
         raise ValueError(
             "transfer must be of values: bricks have no labels. Use jv.render for labelled volumes."

@@ -1,35 +1,36 @@
-"""Where do the voxels of a brick come from? What every source answers, and arrays in memory.
-
-A source is a volume that need not be in memory: it reads boxes of voxels. Indices are those of a `Volume`,
-data[x, y, z], whatever the order of axes in a file.
-"""
+"""Where do the voxels of a brick come from? From anything with `shape`, `dtype` and `array[box]`."""
 
 import math
+import mmap
 import operator
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from .._util.axes import XYZ, Axes, permuted
-from .._util.checks import Arrayable, is_traced
-from .._util.voxels import check_shape, given_array
+from .._util.checks import described, integer, is_traced
+from .._util.voxels import check_shape
 from ..volume import Volume
 from .dtypes import Box, converted, voxel_type
 
 
 Result = TypeVar("Result")
+Triple: TypeAlias = tuple[float, float, float]
 
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
 
+SPACE = ("x", "y", "z")
 
 AT_ONCE = 2**23
-"""Bytes of a box that are read before they are converted, or brought into another order of axes."""
+"""Bytes of storage that are read at a time: a box that takes more is read in layers."""
+
+PAGE = 2**12
+"""Bytes: a row of a memory map that is not read whole costs as much more, at its ends."""
 
 ALIGNED = 64
 """Bytes, of whose multiples the addresses of JAX's arrays are."""
@@ -38,50 +39,121 @@ _READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
 
 def in_background(function: Callable[..., Result], *arguments: Any) -> "Future[Result]":
-    """A call in another thread of those that read."""
+    """Call in another thread, of those that read."""
     return _READERS.submit(function, *arguments)
 
 
-class VoxelSource(ABC):
-    """A volume of which boxes are read.
+class VoxelSource:
+    """A volume of which boxes are read, so that it need not be in memory.
 
-    - `name`: what it is called in errors: its path, or "array".
-    - `shape`: number of voxels along x, y, z.
-    - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`).
-    - `stored_type`: of the voxels that `_stored` returns. Where it is not `dtype`, boxes are read and
-      converted some layers at a time, so that they take little more memory than what they become. By default
-      it is not known, and boxes are read at once.
-    - `spacing`, `origin`: as in `Volume`, where the source knows them, or else None.
-    - `chunks`: voxels along x, y, z of the parts in which it is stored. Reading parts of these costs as much
-      as reading all. Boxes that are longest along the axes of long chunks are read fastest.
-    - `beside`: the path that files derived from the data are named after; None for data in memory.
-    - `order`: axes in the order of storage: along the first one, neighbours lie farthest apart, along the
-      last one, side by side. By default x, y, z.
+    **Arguments:**
+
+    - `array`: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
+      axis: an array or a memory map of NumPy, an array of JAX, zarr, h5py, dask or tensorstore, or an object
+      of your own. It is read from other threads.
+    - `spacing`, `origin`, `direction`: as in `Volume`; None where nobody knows them.
+    - `axes`: the name of each of its axes, such as "tczyx" or ["z", "y", "x"]; x, y and z among them. By
+      default it is array[x, y, z], as in `Volume`.
+    - `index`: which entry to take along each other axis, such as {"c": 1, "t": 0}. An axis of one entry needs
+      none.
+    - `name`: what it is called in errors.
+    - `hint`: what to do where reading fails, from the error's text.
+
+    **Attributes:** all have their axes in the order x, y, z.
+
+    - `shape`: number of voxels.
+    - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`). `stored_type`: of those of the array.
+    - `chunks`: voxels of the parts in which it is stored. Reading part of one costs as much as reading all.
+    - `order`: axes in the order of storage: along the first one, neighbours lie farthest apart.
+
+    **Raises:** `ValueError` for a shape or type that no volume has, for axes or an index that the array does
+    not have, and for a traced array.
     """
 
-    name: str
-    shape: tuple[int, int, int]
-    dtype: np.dtype
-    stored_type: np.dtype | None = None
-    spacing: tuple[float, float, float] | None
-    origin: tuple[float, float, float] | None
-    chunks: tuple[int, int, int]
-    beside: Path | None
-    order: Axes = XYZ
+    def __init__(
+        self,
+        array: Any,
+        spacing: Triple | None = None,
+        origin: Triple | None = None,
+        *,
+        direction: Any = None,
+        axes: str | Sequence[str] | Any | None = None,
+        index: Mapping[str, int] | None = None,
+        name: str = "array",
+        hint: Callable[[str], str] = lambda fault: "",
+    ):
+        check_known(array)
+        self.array, self.name, self._hint = array, name, hint
+        self.spacing, self.origin, self.direction = spacing, origin, direction
+        shape = tuple(map(int, array.shape))
+        if len(shape) < 3:
+            check_shape(shape)
+        names = _axis_names(name, axes, len(shape))
+        self._fixed = _fixed(name, names, shape, index or {})
+        place = tuple(names.index(each) for each in SPACE)
+        spatial = sorted(place)
+        self._axes = permuted([spatial.index(axis) for axis in place], XYZ)
+        self._spatial = spatial
+        check_shape(tuple(shape[axis] for axis in place))
+        self.shape: tuple[int, int, int] = permuted([shape[axis] for axis in place], XYZ)
+        self.stored_type = np.dtype(_dtype_of(array))
+        self.dtype = voxel_type(self.stored_type)
+        chunks, order = _layout_of(array, shape)
+        x, y, z = (min(chunks[axis], n) for axis, n in zip(place, self.shape, strict=True))
+        self.chunks: tuple[int, int, int] = x, y, z
+        slow, middle, fast = (place.index(axis) for axis in order if axis in place)
+        self.order: Axes = slow, middle, fast
+        self._map = _map_under(array)
+        self._summary: Any = None  # found by `summary.summary_of`
+
+    @classmethod
+    def of_volume(cls, volume: Volume) -> "VoxelSource":
+        """The voxels of a `Volume`.
+
+        **Raises:** `ValueError` for one with labels or a field, which are not voxels, and a traced one."""
+        check_known(volume)
+        for part in ("labels", "field"):
+            if getattr(volume, part) is not None:
+                raise ValueError(
+                    f"source must be a volume of voxels alone; got a Volume with {part}. Pass volume.data, "
+                    "or render it with jv.render."
+                )
+        (dx, dy, dz), (x, y, z) = (
+            np.asarray(part, float).tolist() for part in (volume.spacing, volume.origin)
+        )
+        data = np.asarray(volume.data)
+        return cls(data, (dx, dy, dz), (x, y, z), direction=volume.direction, name="volume")
 
     @property
     def nbytes(self) -> int:
         """Bytes of all voxels, as they are read."""
-        nx, ny, nz = self.shape
-        return nx * ny * nz * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
-    def touched(self, size: tuple[int, int, int]) -> int:
-        """Bytes of storage, uncompressed, that are read for a box of so many voxels, about."""
+    @property
+    def in_memory(self) -> bool:
+        """Whether the voxels are an array of NumPy, not one that maps a file."""
+        return isinstance(self.array, np.ndarray) and self._map is None
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether nobody is known to write to it, so that what was found out of it stays true: it is no array
+        in memory, and no memory map that is open for writing."""
+        return not self.in_memory and (self._map is None or self._map.read_only)
+
+    def bytes_touched(self, size: tuple[int, int, int]) -> int:
+        """About how many bytes of storage, uncompressed, are read for a box of so many voxels."""
+        item = self.stored_type.itemsize
+        if self.in_memory:
+            return math.prod(size) * item
+        if self._map is not None:
+            planes, rows, row = permuted(size, self.order)
+            whole = self.shape[self.order[2]] * item
+            return planes * rows * min(whole, row * item + PAGE)
         chunks = (
             min(-(-(s - 1) // c) + 1, -(-n // c)) * c
             for s, c, n in zip(size, self.chunks, self.shape, strict=True)
         )
-        return math.prod(chunks) * (self.stored_type or self.dtype).itemsize
+        return math.prod(chunks) * item
 
     def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
         """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
@@ -90,54 +162,58 @@ class VoxelSource(ABC):
         (2, 1, 0). In the `order` of storage, voxels keep their order, and are read fastest.
 
         **Returns:** a C-contiguous array of type `dtype` in native byte order. It may be a view of the source
-        where that is an array: do not write to it.
+        where that is an array in memory: do not write to it.
 
         **Raises:** `ValueError` for a box that is empty or exceeds the volume; for voxels that are NaN,
-        infinite, or not exact in `dtype`; and where the data are missing, damaged, or, as far as size and
-        time of a single file tell, changed since the source was made.
+        infinite, or not exact in `dtype`; where the array raises anything; and if the file under a memory map
+        was written to since the source was made.
         """
         box = self._box(low, high)
-        if self.stored_type is None or self.stored_type == self.dtype:
-            return converted(self._stored(*box, axes), box, axes, self.name)
+        if self.in_memory:
+            return converted(self._stored(box, axes), box, axes, self.name)
+        if self._map is not None:
+            self._map.check_unchanged(self.name)
         voxels = empty_box(*box, axes, self.dtype)
-        for layer in self._layers_of(box, self.stored_type.itemsize):
+        for layer in self._layers_of(box):
             place = [slice(a - x, b - x) for a, b, x in zip(*layer, box[0], strict=True)]
-            voxels[permuted(place, axes)] = converted(self._stored(*layer, axes), layer, axes, self.name)
+            voxels[permuted(place, axes)] = converted(self._stored(layer, axes), layer, axes, self.name)
+        if self._map is not None:
+            self._map.forget()
         return voxels
-
-    def _layers_of(self, box: Box, of_voxel: int) -> Iterator[Box]:
-        """A box, cut along the first axis of storage into parts of no more than AT_ONCE bytes, or of single
-        chunks. `of_voxel`: bytes of one."""
-        axis, (low, high) = self.order[0], box
-        plane = math.prod(b - a for a, b in zip(low, high, strict=True)) // (high[axis] - low[axis])
-        chunk = self.chunks[axis]
-        for begin, end in pairwise(cuts(low[axis], high[axis], chunk, plane * chunk * of_voxel, AT_ONCE)):
-            first, last = list(low), list(high)
-            first[axis], last[axis] = begin, end
-            yield (first[0], first[1], first[2]), (last[0], last[1], last[2])
 
     def read_async(self, low: Corner, high: Corner, axes: Axes = XYZ) -> "Future[np.ndarray]":
         """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
         return in_background(self.read, low, high, axes)
 
-    @abstractmethod
-    def fingerprint(self) -> dict[str, Any] | None:
-        """Identifies the data, as a tree that JSON can hold. Equal fingerprints mean equal voxels, as far as
-        times of files tell: these may miss a change within a tick of the system's clock, and one through a
-        memory map until it is written back.
+    def _stored(self, box: Box, axes: Axes) -> np.ndarray:
+        """The voxels of a box as they are stored, with their axes in the order `axes`."""
+        index: list[Any] = list(self._fixed)
+        for a, b, axis in zip(*box, self._axes, strict=True):
+            index[self._spatial[axis]] = slice(a, b)
+        try:
+            found = np.asarray(self.array[tuple(index)])
+        except Exception as fault:  # of whatever library
+            hint = self._hint(str(fault)) or "Check what it is stored in."
+            raise ValueError(
+                f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). {hint}"
+            ) from fault
+        return found.transpose(permuted(self._axes, axes))
 
-        None: nothing identifies them, such as an array that anybody may write to. What is computed from the
-        voxels is then valid for this object alone, and while nobody writes to it."""
-
-    @abstractmethod
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
-        """The voxels of a box that lies inside, as they are stored: of any byte order, and any layout in
-        memory. A source of your own has this method.
-
-        `low`, `high`: as for `read`. `axes`: of what is returned, of which the first one is the axis axes[0]
-        of the volume, and so on: data[z, y, x] for (2, 1, 0). What has data[x, y, z] returns
-        `data[x0:x1, y0:y1, z0:z1].transpose(axes)`; it is asked for its own `order`, so that this moves
-        nothing, and for others by those who call `read` alone."""
+    def _layers_of(self, box: Box) -> Iterator[Box]:
+        """A box, cut between chunks, along the axis on which it touches the most of them, into parts of no
+        more than AT_ONCE bytes of storage, or of single layers of chunks."""
+        low, high = box
+        counts = [(b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)]
+        axis = max(self.order, key=lambda axis: counts[axis])
+        chunk = self.chunks[axis]
+        of_layer = self.bytes_touched(permuted([b - a for a, b in zip(low, high, strict=True)], XYZ))
+        of_layer //= counts[axis]
+        thick = chunk * max(1, AT_ONCE // max(of_layer, 1))
+        ends = [low[axis], *range(low[axis] // chunk * chunk + thick, high[axis], thick), high[axis]]
+        for begin, end in pairwise(ends):
+            first, last = list(low), list(high)
+            first[axis], last[axis] = begin, end
+            yield permuted(first, XYZ), permuted(last, XYZ)
 
     def _box(self, low: Corner, high: Corner) -> Box:
         try:
@@ -156,59 +232,100 @@ class VoxelSource(ABC):
         return first, last
 
 
-class ArraySource(VoxelSource):
-    """Voxels of an array in memory, data[x, y, z], of any memory layout. It is not copied.
+class _Map:
+    """The memory map of a file."""
 
-    **Arguments:** `data`: the array. `spacing`, `origin`: as in `Volume`; by default unknown.
+    def __init__(self, mapped: np.memmap):
+        self.pages: Any = mapped.base
+        self.path, self.read_only = mapped.filename, mapped.mode == "r"
+        self.state = self._state()
 
-    **Raises:** `ValueError` for arrays of a shape or type that no volume has, and for traced ones.
-    """
+    def _state(self) -> tuple[int, ...] | None:
+        """Inode, size and time of the file; None if it is gone, and stays there for the map alone."""
+        try:
+            found = os.stat(self.path)  # pyright: ignore[reportArgumentType]
+        except (OSError, TypeError):
+            return None
+        return found.st_ino, found.st_size, found.st_mtime_ns if self.read_only else 0
 
-    def __init__(
-        self,
-        data: Arrayable,
-        spacing: tuple[float, float, float] | None = None,
-        origin: tuple[float, float, float] | None = None,
-    ):
-        check_known(data)
-        array = given_array("data", data)
-        check_shape(array.shape)
-        self._data = np.asarray(array)
-        self.name, self.beside = "array", None
-        self.shape = nx, ny, nz = self._data.shape
-        self.dtype, self.stored_type = voxel_type(self._data.dtype), self._data.dtype
-        self.spacing, self.origin = spacing, origin
-        slowest, *_ = self.order = by_stride(self._data.strides)
-        self.chunks = (1, ny, nz) if slowest == 0 else (nx, 1, nz) if slowest == 1 else (nx, ny, 1)
+    def check_unchanged(self, name: str) -> None:
+        """**Raises** `ValueError` if the file was written to: a map of one that became shorter ends the
+        process when it is read. One that was replaced has another inode, and the map its old voxels."""
+        now = self._state()
+        if now is not None and self.state is not None and now[0] == self.state[0] and now != self.state:
+            raise ValueError(f"{name} changed after it was opened as a source. Open it again.")
 
-    def touched(self, size: tuple[int, int, int]) -> int:
-        return math.prod(size) * self._data.dtype.itemsize
-
-    def fingerprint(self) -> dict[str, Any] | None:
-        return None
-
-    def _stored(self, low: tuple[int, int, int], high: tuple[int, int, int], axes: Axes) -> np.ndarray:
-        return self._data[tuple(map(slice, low, high))].transpose(axes)
+    def forget(self) -> None:
+        """Unmap what was read: it would count as memory of the process. The system still has it."""
+        if self.read_only and hasattr(mmap, "MADV_DONTNEED"):
+            self.pages.madvise(mmap.MADV_DONTNEED)
 
 
-def cuts(begin: int, end: int, chunk: int, of_chunk: int, at_once: int) -> list[int]:
-    """Where an interval of voxels along an axis is cut: between chunks, so that each is read once; into parts
-    of no more than `at_once` bytes, if these are thicker than a chunk, of `of_chunk` bytes."""
-    thick = chunk * max(1, at_once // of_chunk)
-    return [begin, *range(begin // chunk * chunk + thick, end, thick), end]
+def _map_under(array: Any) -> _Map | None:
+    """The map that an array is a part of."""
+    root = array
+    while isinstance(root, np.ndarray) and not isinstance(root.base, mmap.mmap):
+        root = root.base
+    return _Map(root) if isinstance(root, np.memmap) else None
 
 
-def by_stride(strides: Sequence[int]) -> Axes:
-    """Axes in the order of storage, by the distances of neighbours along them."""
-    a, b, c = sorted(range(3), key=lambda axis: -abs(strides[axis]))
-    return a, b, c
+def _dtype_of(array: Any) -> np.dtype:
+    found = array.dtype
+    return np.dtype(getattr(found, "numpy_dtype", found))  # tensorstore has types of its own
+
+
+def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[list[int], list[int]]:
+    """Voxels of a chunk along each axis, and the axes in the order of storage, the slowest first."""
+    axes = list(range(len(shape)))
+    strides = getattr(array, "strides", None)
+    if isinstance(array, np.ndarray) and strides is not None:
+        axes.sort(key=lambda axis: -abs(strides[axis]))
+    layout = getattr(array, "chunk_layout", None)
+    if layout is not None:  # tensorstore
+        return [c or n for c, n in zip(layout.read_chunk.shape, shape, strict=True)], list(
+            layout.inner_order or axes
+        )
+    chunks = getattr(array, "chunks", None)
+    if chunks is None:
+        slowest = next((axis for axis in axes if shape[axis] > 1), 0)
+        return [1 if axis == slowest else n for axis, n in enumerate(shape)], axes
+    # of zarr and h5py a number for each axis, of dask all numbers
+    return [int(np.max(c)) for c in chunks], axes
+
+
+def _axis_names(name: str, axes: Any, rank: int) -> list[str]:
+    if axes is None and rank == 3:
+        axes = SPACE
+    names = list(axes) if isinstance(axes, Sequence) else None
+    if names is None or len(names) != rank or len({*names}) != rank or not {*SPACE} <= {*names}:
+        raise ValueError(
+            f"axes must name each of the {rank} axes of {name} once, x, y and z among them, such as "
+            f'"{"tczyx"[-rank:] if 3 <= rank <= 5 else "zyx"}"; got {axes!r}.'
+        )
+    return names
+
+
+def _fixed(name: str, names: list[str], shape: tuple[int, ...], index: Mapping[str, int]) -> list[int]:
+    """The entry to take along each axis that is not one of space."""
+    if unknown := {*index} - {*names} | {*index} & {*SPACE}:
+        raise ValueError(
+            f"index must name axes of {name} other than x, y, z; got {sorted(unknown)} of {names}."
+        )
+    fixed = []
+    for axis, count in zip(names, shape, strict=True):
+        if axis not in SPACE and axis not in index and count > 1:
+            raise ValueError(
+                f"index must choose one of the {count} entries of {name} along {axis!r}; got none. Pass "
+                f'index={{"{axis}": 0}}.'
+            )
+        fixed.append(integer(f"index[{axis!r}]", index.get(axis, 0), 0, max(count - 1, 0)))
+    return fixed
 
 
 def empty_box(low: Corner, high: Corner, axes: Axes, dtype: np.dtype) -> np.ndarray:
     """An array for the voxels of a box, with its axes in this order. It is aligned as JAX aligns its own, so
     that `jax.device_put` uses it in place where the device is the CPU."""
-    size = [int(b) - int(a) for a, b in zip(low, high, strict=True)]
-    shape = permuted(size, axes)
+    shape = permuted([int(b) - int(a) for a, b in zip(low, high, strict=True)], axes)
     size = math.prod(shape) * dtype.itemsize
     memory = np.empty(size + ALIGNED, np.uint8)
     start = -memory.ctypes.data % ALIGNED
@@ -216,25 +333,19 @@ def empty_box(low: Corner, high: Corner, axes: Axes, dtype: np.dtype) -> np.ndar
 
 
 def check_known(thing: Any) -> None:
-    """**Raises** `ValueError` for traced voxels, spacing or origin."""
+    """**Raises** `ValueError` for traced voxels, spacing or origin, and what is no array."""
     if is_traced(thing):
         raise ValueError(
             "source must not be traced, since it is read while an image is made: there are no gradients to "
             "voxels by bricks (jv.render has them), and none inside jax.jit and jax.vmap. For gradients to "
             "spacing and origin, pass these to render_bricks, beside an array."
         )
+    if isinstance(thing, type) or (not isinstance(thing, Volume) and not _is_array(thing)):
+        raise ValueError(
+            "source must be an array, a Volume, a VoxelSource, or the path of a file or folder; got "
+            f"{described(thing)}."
+        )
 
 
-def array_of(volume: Volume) -> ArraySource:
-    """The voxels of a `Volume`.
-
-    **Raises:** `ValueError` for one with labels or a field, which are not voxels, and for a traced one."""
-    check_known(volume)
-    for part in ("labels", "field"):
-        if getattr(volume, part) is not None:
-            raise ValueError(
-                f"source must be a volume of voxels alone; got a Volume with {part}. Pass volume.data, or "
-                "render it with jv.render."
-            )
-    (dx, dy, dz), (x, y, z) = (np.asarray(part, float).tolist() for part in (volume.spacing, volume.origin))
-    return ArraySource(volume.data, (dx, dy, dz), (x, y, z))
+def _is_array(thing: Any) -> bool:
+    return all(hasattr(thing, name) for name in ("shape", "dtype", "__getitem__"))

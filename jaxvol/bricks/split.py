@@ -15,9 +15,9 @@ from ..occupancy import BLOCK
 from ..space import Space
 from ..transforms import ToroidalMap
 from ..transforms.adaptive_sampling import FARTHEST
+from .cells import reach
 from .grid import BrickGrid, Node, is_straight
 from .overlap import most
-from .ranges import reach
 
 
 EDGE = 16

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,20 +27,22 @@ from ..rendering import BrickReport
 from ..space import Ray, Space
 from ..transforms import ToroidalMap
 from ..volume import Volume, part_of, with_voxels
+from .cells import Found, Turn, of_curved, of_straight, widened
 from .choice import cheapest, counts as counted, visible
 from .dtypes import range_of
 from .grid import BrickGrid, Node, is_straight
-from .ranges import Found, Turn, of_curved, of_straight, widened
 from .sources import VoxelSource, in_background
 from .split import Margin, bytes_of, check_part, divided, fits, split, stored_of, stored_shape
 from .summary import Summary
 
 
-Method = Literal["overlap", "reload", "naive"]
 State = TypeVar("State")
 
-CELL = 16
-"""Cells along the side of the blocks whose ranges of values tell which bricks are empty."""
+Turns: TypeAlias = Callable[["Stream", Ray, list[Progress]], Iterator["Load"]]
+"""Which brick is read next, and for which cells of each ray: called with the stream, the rays, and a list
+whose only entry always tells how far rays have come. Bricks are planned one ahead of what is marched."""
+
+Method: TypeAlias = Literal["overlap", "reload"] | Turns
 
 BEAMS = 32
 """Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
@@ -67,6 +69,7 @@ class Stream:
     - `scene`: with a volume without its voxels.
     - `visible`: for each brick, whether anything may be visible in it.
     - `straight`: whether rays are straight in the grid.
+    - `turns`: which of them is read next.
     - `done`: bricks that were rendered. `loads`: those whose reading has begun.
     - `stored`: nodes along each axis that are read at a time. `alone`: as many suffice for each brick without
       the bricks that had their turn before. `memory`: bytes that these may take.
@@ -85,7 +88,7 @@ class Stream:
     alone: Node
     stored: Node
     memory: int
-    method: Method
+    turns: Turns
     progress: Callable[[int, int], Any] | None = None
     done: int = 0
     loads: list[int] = field(default_factory=list)
@@ -128,28 +131,15 @@ class Stream:
             rays = math.prod(marched.source.size)
             grid = cheapest(grid, source, summary, table, margin, memory, rays, least)
         stored = alone = stored_of(grid, margin, overlapping)
-        if not straight and method != "naive":  # what is read is found from the rays: begin with less
+        if not straight and isinstance(method, str):  # what is read is found from the rays: begin with less
             middle = (np.asarray(source.shape) - 1) / 2
             typical = replace(margin, cells=margin.of_box(space, source.shape, middle, middle))
             stored = stored_of(grid, typical, overlapping)
         order, seen = grid.order(space, marched.source), visible(grid, summary, table)
-        return cls(
-            *(
-                source,
-                summary,
-                marched,
-                options,
-                space,
-                grid,
-                margin,
-                order,
-                seen,
-                straight,
-                alone,
-                stored,
-            ),
-            *(max(memory, bytes_of(alone, source.dtype, margin)), method, progress),
-        )
+        turns = method if callable(method) else in_order if straight else METHODS[method]
+        room = max(memory, bytes_of(alone, source.dtype, margin))
+        place = space, grid, margin, order, seen, straight, alone, stored, room
+        return cls(source, summary, marched, options, *place, turns, progress)
 
     @property
     def mesh(self) -> Mesh | None:
@@ -165,7 +155,7 @@ class Stream:
     ) -> State:
         """The state after `march(part, cells, state)` of all bricks."""
         living, returned = [where(state)], self.bytes_read
-        turns = self._turns(rays, living)
+        turns = self.turns(self, rays, living)
         load = next(turns, None)
         while load is not None:
             jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
@@ -206,64 +196,7 @@ class Stream:
         voxels = jax.device_put(load.voxels.result())  # on a CPU, not copied if a file was read (`empty_box`)
         return part_of(with_voxels(volume, voxels), jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
-    def _turns(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:
-        """Bricks, each from when it is planned to be read. `living`: which rays may still see more, the
-        newest answer."""
-        if self.method == "naive":
-            yield from self._alone(rays, living)
-            return
-        if self.straight:
-            for brick in self.order:
-                if not self.visible[brick]:
-                    continue
-                number = jnp.asarray(brick, jnp.int32)
-                finished = living[0].finished
-                cells, any_ = _cells_of_straight(self.grid, self.scene.march, rays, finished, number)
-                if any_:
-                    yield self._load(brick, cells, *self.around(brick))
-            return
-        reached, going = jnp.zeros(rays.length.shape, jnp.int32), True
-        while going:
-            had, going = set[int](), False
-            for brick in self.order:
-                if not self.visible[brick]:
-                    continue
-                through = {brick} if self.method == "reload" else {brick, *had}
-                found = self._found(brick, through, rays, living[0], reached)
-                if found is not None and not self._fits(found):
-                    found = self._found(brick, {brick}, rays, living[0], reached, over_empty=False)
-                    assert found is None or self._fits(found)
-                had.add(brick)
-                if found is not None:
-                    going, reached = True, found.reached
-                    yield self._load(brick, widened(found.cells), *self._box(found))
-            going &= self.method == "reload" or not bool(jnp.all(living[0].finished))
-
-    def _alone(self, rays: Ray, living: list[Progress]) -> Iterator[Load]:
-        """Each brick with all its cells of each ray, whatever other bricks the ray meets between them."""
-        nowhere = np.append(np.ones(self.grid.number, bool), True)
-        for brick in self.order:
-            reached = jnp.zeros(rays.length.shape, jnp.int32)
-            others = nowhere.copy()
-            others[brick] = False
-            own, load = ~others, None
-            own[-1] = True  # a ray goes on through a gap, in which there is no brick
-            outside = jnp.asarray(others)
-            turn = Turn(jnp.asarray(brick, jnp.int32), outside, jnp.asarray(own), outside)
-            while self.visible[brick]:
-                found = _cells_of_curved(
-                    self.mesh, self.grid, 0, self.scene.march, rays, living[0], reached, turn
-                )
-                if not bool(found.any):
-                    break
-                if load is None:
-                    load = self._load(brick, found.cells, *self.around(brick))
-                else:
-                    load = load._replace(cells=found.cells)
-                reached = found.reached
-                yield load
-
-    def _found(
+    def found(
         self,
         brick: int,
         through: set[int],
@@ -279,7 +212,11 @@ class Stream:
         on = empty.copy() if over_empty else np.zeros_like(empty)
         on[list(through)] = True
         turn = Turn(jnp.asarray(brick, jnp.int32), jnp.asarray(empty), jnp.asarray(on), jnp.asarray(empty))
-        march, beyond = self.scene.march, self.margin.steps
+        return self.cells_in(turn, rays, at, reached, self.margin.steps)
+
+    def cells_in(self, turn: Turn, rays: Ray, at: Progress, reached: Array, beyond: int = 0) -> Found | None:
+        """The cells of rays in a turn, as of `cells.of_curved`, by the device; None if there are none."""
+        march = self.scene.march
         found = _cells_of_curved(self.mesh, self.grid, beyond, march, rays, at, reached, turn)
         return found if bool(found.any) else None
 
@@ -291,15 +228,15 @@ class Stream:
         margin = np.asarray(cells)
         return low - margin, high + margin
 
-    def _box(self, found: Found) -> tuple[np.ndarray, np.ndarray]:
+    def box_of(self, found: Found) -> tuple[np.ndarray, np.ndarray]:
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
         around = self.margin.of_points(self.space, self.grid.shape, low, high)
         return np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
 
-    def _fits(self, found: Found) -> bool:
+    def make_room(self, found: Found) -> bool:
         """Whether a box fits into what is read at a time, which is made larger for it as far as memory goes:
         so far that each brick alone still fits."""
-        low, high = self._box(found)
+        low, high = self.box_of(found)
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
         wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
         x, y, z = map(max, wanted, self.stored)
@@ -309,7 +246,7 @@ class Stream:
         self.stored = x, y, z
         return True
 
-    def _load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:
+    def load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:
         """Starts to read a brick, for these cells."""
         return Load(brick, cells, *self.read(brick, low, high))
 
@@ -331,10 +268,54 @@ class Stream:
             raise ValueError(
                 f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
                 f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now {lowest} to "
-                f"{highest}. Delete the file of ranges beside it (`cache`), or pass cache=None, and open it "
-                "again."
+                f"{highest}. Open it again."
             )
         return voxels
+
+
+def in_order(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[Load]:
+    """Where rays are straight: bricks front to back, each of which a ray meets once."""
+    for brick in stream.order:
+        if not stream.visible[brick]:
+            continue
+        number, finished = jnp.asarray(brick, jnp.int32), living[0].finished
+        cells, any_ = _cells_of_straight(stream.grid, stream.scene.march, rays, finished, number)
+        if any_:
+            yield stream.load(brick, cells, *stream.around(brick))
+
+
+def overlapping(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[Load]:
+    """Where rays are curved: bricks front to back, each read with what rays come back to of those that had
+    their turn, as far as memory goes; and again for rays that still come back."""
+    return _until_all_left(stream, rays, living, lambda had: had)
+
+
+def reloading(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[Load]:
+    """Where rays are curved: bricks front to back, and again as long as rays come back to them."""
+    return _until_all_left(stream, rays, living, lambda had: set())
+
+
+def _until_all_left(
+    stream: Stream, rays: Ray, living: list[Progress], overlap: Callable[[set[int]], set[int]]
+) -> Iterator[Load]:
+    reached, going = jnp.zeros(rays.length.shape, jnp.int32), True
+    while going:
+        had, going = set[int](), False
+        for brick in stream.order:
+            if not stream.visible[brick]:
+                continue
+            found = stream.found(brick, {brick, *overlap(had)}, rays, living[0], reached)
+            if found is not None and not stream.make_room(found):
+                found = stream.found(brick, {brick}, rays, living[0], reached, over_empty=False)
+                assert found is None or stream.make_room(found)
+            had.add(brick)
+            if found is not None:
+                going, reached = True, found.reached
+                yield stream.load(brick, widened(found.cells), *stream.box_of(found))
+        going &= not bool(jnp.all(living[0].finished))
+
+
+METHODS: dict[str, Turns] = {"overlap": overlapping, "reload": reloading}
 
 
 def _straight(

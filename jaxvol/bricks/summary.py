@@ -4,8 +4,11 @@ From these, a renderer tells which bricks are empty without reading them. They a
 `occupancy.Blocks` has of a volume in memory.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import equinox as eqx
@@ -13,23 +16,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._util.axes import inverse
+from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import integer
 from .._util.memory import give_back
-from ..occupancy import BLOCK, Blocks, over_blocks, widened
-from .dtypes import is_half
+from ..occupancy import BLOCK, Blocks, widened
+from .dtypes import Box, is_half
 from .sources import Corner, VoxelSource
-from .streaming import slabs
 
 
-COMBINED = {"low": np.minimum, "high": np.maximum}
-"""Each kind of range, and how those of two blocks are combined."""
+CELL = 16
+"""Cells along the side of a block, if the volume has more."""
 
 AT_ONCE = 2**18
 """Blocks that are looked through at a time, if a layer of them has no more."""
 
-LAYERS = 8
-"""Layers of blocks of 16-bit floats that are converted at a time."""
+COPIES = 8
+"""Of the voxels that are read at a time: these, the next ones, and what finding their ranges takes."""
+
+MOST = 2**25
+"""Bytes of voxels that are read at a time, if a chunk has no more: larger parts leave the caches."""
 
 Progress = Callable[[int, int], Any]
 """Called with the number of voxels done and the number of all."""
@@ -40,18 +45,14 @@ class Summary:
     """Ranges of the voxels in each block of `cell`³ cells, including the nodes on its faces.
 
     - `shape`: of the volume, in voxels.
-    - `cell`: cells along the side of a block, a multiple of `occupancy.BLOCK`.
-    - `ranges`: `low`, `high`: least and greatest voxel, in the voxels' type, (bx, by, bz).
+    - `cell`: cells along the side of a block.
+    - `low`, `high`: least and greatest voxel, in the voxels' type, (bx, by, bz).
     """
 
     shape: tuple[int, int, int]
     cell: int
-    ranges: dict[str, np.ndarray]
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all ranges."""
-        return sum(each.nbytes for each in self.ranges.values())
+    low: np.ndarray
+    high: np.ndarray
 
     def range_of(self, low: Corner, high: Corner) -> tuple[float, float]:
         """A range that holds all voxels with `low` <= (x, y, z) < `high`: the range of the blocks that hold
@@ -62,42 +63,18 @@ class Summary:
                 self.blocks_of(int(a), int(b) - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
             )
         )
-        return float(self.ranges["low"][touched].min()), float(self.ranges["high"][touched].max())
+        return float(self.low[touched].min()), float(self.high[touched].max())
 
     def where(self, holds: Callable[[Blocks], Any]) -> np.ndarray:
         """For each block, whether something holds of it, such as `transfer.visible`: some layers of them at a
         time, since a transfer function may take a hundred times their memory. `holds` is a
         tree (`eqx.Partial`): a new lambda would be compiled anew."""
-        low, high = self.ranges["low"], self.ranges["high"]
-        layers = max(1, AT_ONCE // low[0].size)
+        layers = max(1, AT_ONCE // self.low[0].size)
         found = []
-        for begin in range(0, len(low), layers):
+        for begin in range(0, len(self.low), layers):
             some = slice(begin, begin + layers)
-            found.append(np.asarray(_holding(holds, low[some], high[some])))
+            found.append(np.asarray(_holding(holds, self.low[some], self.high[some])))
         return np.concatenate(found)
-
-    def blocks(self, low: Corner | None = None, high: Corner | None = None) -> Blocks:
-        """The `Blocks` of the volume, or of the voxels with `low` <= (x, y, z) < `high` as a volume of their
-        own. They have no slopes.
-
-        They equal those of the voxels in memory if `cell` is `occupancy.BLOCK` and the box is the volume.
-        Otherwise each range holds all voxels of its block, and others around it: up to `cell` away."""
-        found = self._of_box(low, high)
-        least, most = widened(jnp.asarray(found["low"]), jnp.asarray(found["high"]))
-        return Blocks(least, most, None)
-
-    def _of_box(self, low: Corner | None, high: Corner | None) -> dict[str, np.ndarray]:
-        """Ranges of the blocks of BLOCK³ cells of a box of voxels."""
-        found = self.ranges
-        first, last = (0, 0, 0) if low is None else low, self.shape if high is None else high
-        for axis in range(3):
-            begin, end, n = int(first[axis]), int(last[axis]), self.shape[axis]
-            nodes = range(begin, end - 1, BLOCK)
-            touched = [self.blocks_of(node, min(node + BLOCK, end - 1), n) for node in nodes]
-            found = {
-                name: over_intervals(part, axis, touched, COMBINED[name]) for name, part in found.items()
-            }
-        return found
 
     def blocks_of(self, first: int, last: int, count: int) -> tuple[int, int]:
         """First and last block along an axis of `count` nodes, that together hold the nodes `first` to
@@ -107,85 +84,122 @@ class Summary:
         return begin, min(max(begin, (last - 1) // self.cell), final)
 
 
-def over_intervals(
-    values: np.ndarray, axis: int, intervals: Sequence[tuple[int, int]], combine: np.ufunc
-) -> np.ndarray:
-    """Combine the entries of each interval along an axis, from its first to its last."""
-    first, last = np.array(intervals).T
-    found = np.take(values, first, axis)
-    for offset in range(1, int(np.max(last - first)) + 1):
-        found = combine(found, np.take(values, np.minimum(first + offset, last), axis))
+def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress | None = None) -> Summary:
+    """The summary of a source: from one pass over its voxels, kept by the source for the next images, unless
+    it is an array in memory or a memory map that is open for writing, which anybody may write to.
+
+    **Arguments:** `source`: the voxels. `memory`, `progress`: see `scan`.
+
+    **Returns:** the summary.
+
+    **Raises:** as `scan` does.
+    """
+    if source._summary is not None:
+        return source._summary
+    cell = CELL if min(source.shape) > CELL else BLOCK
+    found = scan(source, cell, memory=memory, progress=progress)
+    if source.is_constant:
+        source._summary = found
     return found
 
 
 def scan(
-    source: VoxelSource,
-    cell: int | Any = BLOCK,
-    *,
-    memory: int = 2**28,
-    progress: Progress | None = None,
+    source: VoxelSource, cell: int | Any = BLOCK, *, memory: int = 2**28, progress: Progress | None = None
 ) -> Summary:
-    """The summary of a source, from one pass over its voxels. `summary_of` keeps it in a file.
+    """The summary of a source, from one pass over its voxels.
 
     **Arguments:**
 
-    - `cell`: cells along the side of a block, a multiple of `occupancy.BLOCK`. A summary takes
-      2 / `cell`³ of the voxels' memory.
+    - `cell`: cells along the side of a block. A summary takes 2 / `cell`³ of the voxels' memory.
     - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk of the source does.
-    - `progress`: called after each slab; what it raises ends the pass.
+    - `progress`: called after each part; what it raises ends the pass.
 
     **Raises:** `ValueError` for what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
     """
-    cell = integer("cell", cell, BLOCK)
-    if cell % BLOCK:
-        raise ValueError(f"cell must be a multiple of {BLOCK}; got {cell}.")
+    cell = integer("cell", cell, 1)
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
-    ranges: dict[str, np.ndarray] = {}
-    done, whole = 0, int(np.prod([-(-(n - 1) // BLOCK) for n in source.shape], dtype=np.int64))
-    nx, ny, nz = source.shape
-    for slab in slabs(source, memory):
-        for name, combine in COMBINED.items():
-            # by NumPy: to compile for each shape of a slab takes longer, and memory
-            part = _over_blocks(slab.voxels, combine).transpose(inverse(source.order))
-            merged, place = _merged(part, slab.first, cell // BLOCK, combine)
-            if name not in ranges:
-                ranges[name] = np.full(blocks, _neutral(part.dtype, combine), part.dtype)
-            ranges[name][place] = combine(ranges[name][place], merged)
-        done += int(np.prod(slab.blocks))
+    limits = (jnp.iinfo if source.dtype.kind in "iu" else jnp.finfo)(source.dtype)
+    low, high = np.full(blocks, limits.max, source.dtype), np.full(blocks, limits.min, source.dtype)
+    done, order = 0, source.order
+    for box, voxels in _parts(source, memory):
+        done += voxels.size
+        if is_half(voxels.dtype):  # NumPy compares these one by one, and float32 in a fraction of the time
+            voxels = voxels.astype(np.float32)
+        first = permuted(box[0], order)
+        for ranges, combine in ((low, np.minimum), (high, np.maximum)):
+            part, place = _over_blocks(voxels, first, cell, combine, permuted(blocks, order))
+            part, where = part.transpose(inverse(order)), permuted(place, inverse(order))
+            ranges[where] = combine(ranges[where], part.astype(source.dtype))
         if progress is not None:
-            progress(done * (nx * ny * nz) // whole, nx * ny * nz)
+            progress(done, math.prod(source.shape))
     give_back()
-    return Summary(source.shape, cell, ranges)
+    return Summary(source.shape, cell, low, high)
 
 
-def _over_blocks(voxels: np.ndarray, combine: np.ufunc) -> np.ndarray:
-    """Combines the nodes of each block. NumPy compares 16-bit floats one by one, and float32 in a fraction of
-    the time, which they become layer by layer."""
-    if not is_half(voxels.dtype):
-        return over_blocks(voxels, combine)
-    thick = LAYERS * BLOCK
-    starts = range(0, len(voxels) - 1, thick)
-    parts = [over_blocks(voxels[i : i + thick + 1].astype(np.float32), combine) for i in starts]
-    return np.concatenate(parts).astype(voxels.dtype)
+def _parts(source: VoxelSource, memory: int) -> Iterator[tuple[Box, np.ndarray]]:
+    """All voxels, in boxes of whole chunks, each read while the one before is looked at, with their axes in
+    the order of storage."""
+    most = min(memory // COPIES, MOST)
+    extent = list(source.chunks)
+    item = source.dtype.itemsize
+    for axis in reversed(source.order):  # rows first
+        while extent[axis] < source.shape[axis] and 2 * math.prod(extent) * item <= most:
+            extent[axis] = min(2 * extent[axis], source.shape[axis])
+    ends = [range(0, n, step) for n, step in zip(source.shape, extent, strict=True)]
+    boxes: list[Box] = []
+    for low in product(*permuted(ends, source.order)):
+        first = permuted(low, inverse(source.order))
+        last = [min(a + e, n) for a, e, n in zip(first, extent, source.shape, strict=True)]
+        boxes.append((first, permuted(last, XYZ)))
+
+    def reading(number: int) -> "Future[np.ndarray]":
+        low, high = boxes[number]
+        return source.read_async(low, high, source.order)
+
+    coming = reading(0)
+    for number, box in enumerate(boxes):
+        voxels = coming.result()
+        if number + 1 < len(boxes):
+            coming = reading(number + 1)
+        yield box, voxels
 
 
-def _merged(
-    part: np.ndarray, first: tuple[int, int, int], several: int, combine: np.ufunc
-) -> tuple[np.ndarray, tuple[Any, ...]]:
-    """Ranges of blocks that are `several` times as long, as far as `part`, from block `first` on, tells; and
-    their place among all."""
+def _over_blocks(
+    voxels: np.ndarray, first: Axes, cell: int, combine: np.ufunc, counts: Axes
+) -> tuple[np.ndarray, tuple[slice, slice, slice]]:
+    """Ranges of the blocks that nodes from `first` on are part of, and the place of these among all. A node
+    on a face is part of both blocks beside it. `counts`: of all blocks."""
     place = []
-    for axis, begin in enumerate(first):
-        block = np.arange(begin, begin + part.shape[axis]) // several
-        starts = np.flatnonzero(np.diff(block, prepend=-1))
-        part = combine.reduceat(part, starts, axis)
-        place.append(slice(block[0], block[-1] + 1))
-    return part, tuple(place)
+    for axis, (begin, count) in enumerate(zip(first, counts, strict=True)):
+        end = begin + voxels.shape[axis]
+        block, until = max((begin - 1) // cell, 0), min((end - 1) // cell + 1, count)
+        place.append(slice(block, until))
+        voxels = _along(voxels, axis, begin, end, range(block, until), cell, combine)
+    return voxels, (place[0], place[1], place[2])
 
 
-def _neutral(dtype: np.dtype, combine: np.ufunc) -> Any:
-    limits = jnp.iinfo(dtype) if dtype.kind in "iu" else jnp.finfo(dtype)
-    return limits.max if combine is np.minimum else limits.min
+def _along(
+    voxels: np.ndarray, axis: int, begin: int, end: int, blocks: range, cell: int, combine: np.ufunc
+) -> np.ndarray:
+    """Along one axis, of which there are the nodes from `begin` to `end`."""
+
+    def nodes(low: int, high: int, step: int = 1) -> np.ndarray:
+        return voxels[(slice(None),) * axis + (slice(low - begin, high - begin, step),)]
+
+    # blocks of which all nodes are there, by strides: a node of each at a time
+    whole = [b for b in blocks if b * cell >= begin and (b + 1) * cell < end]
+    found = []
+    for block in blocks:
+        if block not in whole:
+            low, high = max(block * cell, begin), min((block + 1) * cell + 1, end)
+            found.append(combine.reduce(nodes(low, high), axis, keepdims=True))
+        elif block == whole[0]:
+            start, last = whole[0] * cell, whole[-1] * cell
+            part = nodes(start, last + 1, cell).copy()
+            for node in range(1, cell + 1):
+                combine(part, nodes(start + node, last + node + 1, cell), out=part)
+            found.append(part)
+    return np.concatenate(found, axis)
 
 
 @eqx.filter_jit

@@ -13,8 +13,8 @@ import pytest
 import jaxvol as jv
 from experiments import bricks_paper
 from jaxvol.bricks import BrickGrid, Summary, overlap_of, share, source_of, split as splitting
+from jaxvol.bricks.cells import Turn
 from jaxvol.bricks.choice import cheapest, counts, visible
-from jaxvol.bricks.ranges import Turn
 from jaxvol.bricks.render import _scene_of, bricks_of
 from jaxvol.bricks.split import Margin, TooLittleMemory, check_smallest, fits, nodes_within, split, stored_of
 from jaxvol.bricks.stream import _curved
@@ -80,7 +80,7 @@ def summary_with(shape, box):
     """Ranges of a volume in which something lies in a box of blocks, and these blocks."""
     high = np.zeros([-(-(n - 1) // CELL) for n in shape], np.uint8)
     high[box] = 200
-    return Summary(shape, CELL, {"low": np.zeros_like(high), "high": high}), high > 0
+    return Summary(shape, CELL, np.zeros_like(high), high), high > 0
 
 
 def nothing(shape):

@@ -68,7 +68,6 @@ def test_a_plan_by_bricks_keeps_its_tolerance_and_its_memory(path):
 BAD: list[tuple[Any, Any, dict[str, Any], str]] = [
     (None, 100, {}, r"memory must be at least \d+ bytes, which the smallest bricks take.* Got 100\."),
     (np.zeros((4, 512, 512), np.uint8), 500_000, {}, "memory must hold a copy of 2 voxels along each axis"),
-    (None, 10**6, {"cache": 7}, "cache must be"),
     (None, 1.5, {}, r"memory must be an integer of at least 1; got 1\.5"),
     ("no_such.raw", 10**9, {}, r"no file no_such\.raw"),
     (None, 10**6, {"source": 3}, "source must be a dictionary of options, of shape, dtype"),

@@ -2,18 +2,18 @@
 
 import itertools
 import os
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 import pytest
+import tensorstore
+import zarr
 
 import jaxvol as jv
-from jaxvol.bricks import files
-from jaxvol.bricks.files import FileSource
-from jaxvol.bricks.opening import source_of
-from jaxvol.bricks.sources import ArraySource
+from jaxvol.bricks import source_of, sources
 
 from ..scenes import in_float64
 
@@ -83,50 +83,95 @@ def test_arrays_and_files_of_every_type(dtype, tmp_path):
     for order in ("C", "F"):
         np.save(tmp_path / "data.npy", np.asarray(data, order=order))
         assert_reads(source_of(str(tmp_path / "data.npy")), data)
-        mapped = source_of(np.load(tmp_path / "data.npy", mmap_mode="r"))
-        assert isinstance(mapped, FileSource)
-        assert_reads(mapped, data)
 
 
-@pytest.mark.parametrize(("gap", "together"), [(0, 1), (10, 2000), (files.GAP, 2000)])
-def test_files_are_read_in_rows_and_in_planes(gap, together, tmp_path, monkeypatch):
+class OfOurOwn:
+    """What has a shape, a type and boxes."""
+
+    chunks: Any = None
+
+    def __init__(self, data):
+        self.data, self.shape, self.dtype = data, data.shape, data.dtype
+        self.asked = []
+
+    def __getitem__(self, box):
+        self.asked.append(box)
+        return self.data[box].tolist() if self.dtype == bool else self.data[box]
+
+
+def kinds_of_arrays(data, folder):
+    """Arrays of the libraries that there are, of voxels that lie in another order, and those of a test."""
+    turned = np.ascontiguousarray(data.transpose(2, 0, 1))
+    yield OfOurOwn(data), {}
+    yield OfOurOwn(turned), {"axes": "zxy"}
+    yield zarr.create_array({}, data=turned, chunks=(8, 9, 10)), {"axes": "zxy"}
+    yield tensorstore.array(turned), {"axes": "zxy"}
+    dask, h5py = pytest.importorskip("dask.array"), pytest.importorskip("h5py")
+    yield dask.from_array(turned, chunks=(8, 9, 10)), {"axes": ("z", "x", "y")}
+    with h5py.File(folder / "a.h5", "w") as file:
+        yield file.create_dataset("a", data=turned, chunks=(8, 9, 10)), {"axes": "zxy"}
+        yield file.create_dataset("b", data=turned), {"axes": "zxy"}
+
+
+def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "AT_ONCE", 3000)
     data = voxels("int16")
-    source = source_of(x_fastest(tmp_path / "data.raw", data), shape=SHAPE, dtype="int16")
-    with_gaps = source.touched((4, 5, 6))
-    monkeypatch.setattr(files, "GAP", gap)
-    monkeypatch.setattr(files, "AT_ONCE", together)
-    assert_reads(source, data)
-    assert gap == files.GAP or source.touched((4, 5, 6)) <= with_gaps == 6 * 5 * SHAPE[0] * 2
+    for array, options in kinds_of_arrays(data, tmp_path):
+        source = source_of(array, **options)
+        assert_reads(source, data)
+        assert not source.in_memory
+        assert source.order == ((2, 0, 1) if options else (0, 1, 2))
+    ours = OfOurOwn(data)
+    source_of(ours).read((1, 2, 3), (9, 10, 11))
+    assert len(ours.asked) == 4  # in layers of 3000 bytes, whole planes
+    assert ours.asked[0][0] == slice(1, 3)
+
+    def fails(box):
+        raise RuntimeError("no disk")
+
+    monkeypatch.setattr(OfOurOwn, "__getitem__", lambda _, box: fails(box))
+    with pytest.raises(ValueError, match=r"array: the voxels from \(0, 0, 0\) .* cannot be read \(no disk\)"):
+        source_of(ours).read((0, 0, 0), SHAPE)
 
 
-def test_views_of_memory_maps_are_read_from_the_file_as_long_as_it_is_theirs(tmp_path):
+def test_chunks_are_touched_whole_and_rows_of_a_map_by_pages(tmp_path):
+    data = voxels("uint8", (64, 64, 9000))
+    np.save(tmp_path / "a.npy", data)
+    mapped, chunked = source_of(tmp_path / "a.npy"), OfOurOwn(data)
+    chunked.chunks = (16, 16, 100)
+    assert source_of(data).bytes_touched((4, 5, 6)) == 4 * 5 * 6
+    assert 4 * 5 * 2**12 <= mapped.bytes_touched((4, 5, 6)) < 4 * 5 * (2**12 + 10)
+    assert mapped.bytes_touched((4, 5, 8000)) == 4 * 5 * 9000
+    assert source_of(chunked).bytes_touched((4, 17, 6)) == 32 * 32 * 200
+
+
+def test_memory_maps_are_read_and_not_held(tmp_path):
     data, path = voxels("int16"), tmp_path / "data"
     path.write_bytes(b"header" + data.tobytes())
     mapped = np.memmap(path, np.int16, "r", 6, SHAPE)
-    views: dict[Any, type] = {
-        lambda a: a.T: FileSource,
-        lambda a: a[3:, 2:9]: FileSource,
-        lambda a: a[2:].transpose(1, 0, 2): FileSource,
-        lambda a: a[:, :, ::2]: ArraySource,
-    }
-    for view, kind in views.items():
+    for view in (
+        lambda a: a.T,
+        lambda a: a[3:, 2:9],
+        lambda a: a[2:].transpose(1, 0, 2),
+        lambda a: a[:, :, ::2],
+    ):
         source = source_of(view(mapped))
-        assert isinstance(source, kind)
         assert_reads(source, view(data))
+        assert source.is_constant
+        found = source.read((0, 0, 0), source.shape, source.order)
+        assert not np.shares_memory(found, mapped)
+        assert found.ctypes.data % 64 == 0  # as JAX uses it in place
     (tmp_path / "new").write_bytes(b"header" + (data + 1).tobytes())
     for change in (lambda: (tmp_path / "new").replace(path), path.unlink):
-        change()
         source = source_of(mapped)
-        assert_reads(source, data)
-        assert source.fingerprint() is None
-    path.write_bytes(b"short")
-    with pytest.raises(ValueError, match="is cut short: it holds 5 bytes"):
-        source_of(mapped)
+        change()
+        assert_reads(source, data)  # the map has the old voxels
     written = np.memmap(tmp_path / "other", np.int16, "w+", shape=SHAPE)
     source = source_of(written)
     written[:] = data
     assert_reads(source, data)
-    assert source.fingerprint() is None
+    assert not source.is_constant
+    assert not source_of(data).is_constant
 
 
 def test_spacing_and_origin(tmp_path):
@@ -219,7 +264,9 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
         (3, {}, "source must be an array, a Volume, a VoxelSource, or the path"),
         (jv.Volume(np.zeros(SHAPE), labels=np.zeros(SHAPE, np.uint8)), {}, "a Volume with labels"),
         ("data.npy", {"shape": SHAPE}, "^shape: .* takes no such option"),
-        (np.zeros(SHAPE), {"axes": "xyz"}, "^axes: .* takes no such option"),
+        (np.zeros(SHAPE), {"axes": "xyc"}, "axes must name each of the 3 axes of array once"),
+        (np.zeros(SHAPE), {"missing": "fill"}, "^missing: .* takes no such option"),
+        ([[[1, 2], [3, 4]]], {}, "source must be an array, .* got "),
         (source_of(np.zeros(SHAPE)), {"index": {"c": 0}}, "^index: .* takes no such option"),
     ]
     for thing, options, message in bad:
@@ -231,18 +278,14 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
         source_of("")
 
 
-@pytest.mark.parametrize("mapped", [False, True])
-def test_a_file_that_is_cut_or_changed_after_opening_is_an_error(mapped, tmp_path):
-    path = tmp_path / "data.raw"
-    for change, message in (
-        (lambda: os.truncate(path, 100), "changed after it was opened"),
-        (lambda: os.utime(path, ns=(0, 0)), "changed after it was opened"),
-        (path.unlink, "cannot be read any more"),
-    ):
-        x_fastest(path, voxels())
-        thing = np.memmap(path, np.uint8, "r", shape=SHAPE, order="F") if mapped else path
-        source = source_of(thing, **({} if mapped else {"shape": SHAPE, "dtype": "uint8"}))
-        change()
+@pytest.mark.parametrize("change", [partial(os.truncate, length=100), partial(os.utime, ns=(0, 0))])
+def test_a_file_that_is_cut_or_written_to_after_opening_is_an_error(change, tmp_path):
+    """To read a map of a file that was cut would end the process."""
+    path = x_fastest(tmp_path / "data.raw", voxels())
+    mapped = np.memmap(path, np.uint8, "r", shape=SHAPE, order="F")
+    sources_ = source_of(mapped), source_of(path, shape=SHAPE, dtype="uint8")
+    change(path)
+    for source in sources_:
         for read in (source.read, lambda *box, source=source: source.read_async(*box).result()):
-            with pytest.raises(ValueError, match=message):
+            with pytest.raises(ValueError, match="changed after it was opened as a source"):
                 read((0, 0, 0), (1, 1, 1))

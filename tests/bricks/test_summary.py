@@ -1,16 +1,12 @@
 """Are the ranges of values those of the voxels, found in one pass that is never repeated nor out of date?"""
 
-import os
+from typing import Any
 
 import numpy as np
 import pytest
 
-from jaxvol.bricks import summary_files
-from jaxvol.bricks.files import FileSource
-from jaxvol.bricks.opening import source_of
-from jaxvol.bricks.summary import LAYERS, scan
-from jaxvol.bricks.summary_files import summary_of
-from jaxvol.occupancy import BLOCK
+from jaxvol.bricks import VoxelSource, source_of, summary, summary_of
+from jaxvol.bricks.summary import scan
 
 from .test_sources import voxels, x_fastest
 from .test_zarr import written
@@ -19,23 +15,15 @@ from .test_zarr import written
 SHAPE = (23, 18, 33)
 
 
-@pytest.fixture
-def reads(monkeypatch):
-    """The boxes that are read of files."""
-    boxes, stored = [], FileSource._stored
-    monkeypatch.setattr(FileSource, "_stored", lambda *box: boxes.append(box) or stored(*box))
-    return boxes
-
-
-def assert_ranges(summary, data):
+def assert_ranges(found, data):
     """Of each block with the nodes on its faces, by looking at them."""
-    cell, data = summary.cell, data.astype(np.float64)
+    cell, data = found.cell, data.astype(np.float64)
     for block in np.ndindex(*(-(-(n - 1) // cell) for n in data.shape)):
         part = data[tuple(slice(i * cell, (i + 1) * cell + 1) for i in block)]
-        assert (summary.ranges["low"][block], summary.ranges["high"][block]) == (part.min(), part.max())
+        assert (found.low[block], found.high[block]) == (part.min(), part.max())
 
 
-@pytest.mark.parametrize("shape", [SHAPE, (2, 2, 2), (2 * LAYERS * BLOCK + 7, 5, 9)], ids=str)
+@pytest.mark.parametrize("shape", [SHAPE, (2, 2, 2), (71, 5, 9)], ids=str)
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float16", "bfloat16"])
 def test_ranges_are_those_of_the_voxels_in_each_block(dtype, shape):
     data = voxels(dtype, shape)
@@ -46,16 +34,16 @@ def test_ranges_are_those_of_the_voxels_in_each_block(dtype, shape):
 def test_the_range_of_a_box_holds_its_voxels_and_no_more_than_its_blocks():
     data, rng = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32), np.random.default_rng(1)
     for cell in (4, 12):
-        summary = scan(source_of(data), cell)
+        found = scan(source_of(data), cell)
         for _ in range(200):
             low = rng.integers(0, SHAPE)
             high = rng.integers(low + 1, np.array(SHAPE) + 1)
-            least, most = summary.range_of(low, high)
+            least, most = found.range_of(low, high)
             part = data[tuple(map(slice, low, high))]
             assert least <= part.min() <= part.max() <= most
             wider = data[tuple(slice(max(0, a - cell), b + cell) for a, b in zip(low, high, strict=True))]
             assert wider.min() <= least <= most <= wider.max()
-        corner = summary.range_of((0, 0, 0), (cell + 1,) * 3)
+        corner = found.range_of((0, 0, 0), (cell + 1,) * 3)
         part = data[: cell + 1, : cell + 1, : cell + 1]
         assert corner == (part.min(), part.max())
 
@@ -65,72 +53,57 @@ def test_faults_of_a_pass():
     data[22, 17, 32] = np.nan
     with pytest.raises(ValueError, match=r"must be finite.*\(22, 17, 32\)"):
         scan(source_of(data), memory=10_000)
-    for cell in (0, 2, 6, 4.0, None):
+    for cell in (0, -1, 4.0, None):
         with pytest.raises(ValueError, match="cell must be"):
             scan(source_of(data), cell)
 
 
-# ---- files ----
+# ---- kept ----
 
 
-def opened(folder, data):
-    return source_of(x_fastest(folder / "data.raw", data), shape=SHAPE, dtype=data.dtype.name)
-
-
-def summary_files_in(folder):
-    return sorted(file.name for file in folder.iterdir() if "summary" in file.name)
-
-
-def test_a_finished_pass_is_not_repeated_until_the_data_change_or_the_file_is_damaged(tmp_path, reads):
+def test_the_pass_is_kept_by_a_source_that_nobody_writes_to(tmp_path, monkeypatch):
     data = voxels("int16", SHAPE)
-    summary_of(opened(tmp_path, data))
-    assert summary_files_in(tmp_path) == ["data.raw.jaxvol-summary-4.npz"]
-    for _ in range(3):  # in quick succession: times may be the same
-        times = os.stat(tmp_path / "data.raw")
-        data[5, 6, 7] += 1
-        x_fastest(tmp_path / "data.raw", data)
-        os.utime(tmp_path / "data.raw", ns=(times.st_atime_ns, times.st_mtime_ns))
-        source = source_of(tmp_path / "data.raw", shape=SHAPE, dtype="int16")
-        assert_ranges(summary_of(source), data)
-        reads.clear()
-        assert_ranges(summary_of(source), data)
-        assert reads == []
-    (file,), source = tmp_path.glob("*.npz"), source_of(tmp_path / "data.raw", shape=SHAPE, dtype="int16")
-    whole = file.read_bytes()
-    for content in (b"", whole[: len(whole) // 2], whole.replace(b'"version"', b'"revision'), whole[10:]):
-        file.write_bytes(content)
-        assert_ranges(summary_of(source), data)
-        assert reads != []
-        reads.clear()
-        summary_of(source)
-        assert reads == []
+    passes = []
+    monkeypatch.setattr(summary, "scan", lambda *given, **more: passes.append(1) or scan(*given, **more))
+    of_file = source_of(x_fastest(tmp_path / "data.raw", data), shape=SHAPE, dtype="int16")
+    writable = np.memmap(tmp_path / "data.raw", np.int16, "r+", shape=SHAPE, order="F")
+    for source, number in ((of_file, 1), (source_of(data), 3), (source_of(writable), 3)):
+        passes.clear()
+        for _ in range(3):
+            assert_ranges(summary_of(source), data)
+        assert len(passes) == number
 
 
-def test_changed_chunks_get_a_new_summary(tmp_path):
-    data = voxels("uint8", SHAPE)
-    for change in (0, 1):
-        data[20:] = change
-        source = source_of(written(tmp_path / "a.zarr", data, overwrite=True))
-        assert_ranges(summary_of(source), data)
-        assert summary_files_in(tmp_path) == ["a.zarr.jaxvol-summary-4.npz"]
-    with pytest.raises(ValueError, match="changed while it was read"):
-        summary_of(source, 8, progress=lambda *_: (tmp_path / "a.zarr" / "zarr.json").touch())
+def test_a_pass_that_is_interrupted_is_begun_anew(tmp_path):
+    data = voxels("int16", SHAPE)
+    source = source_of(x_fastest(tmp_path / "data.raw", data), shape=SHAPE, dtype="int16")
+
+    def stop(done, of):
+        assert 0 < done < of == data.size
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        summary_of(source, memory=10_000, progress=stop)
+    told = []
+    assert_ranges(summary_of(source, memory=10_000, progress=lambda *numbers: told.append(numbers)), data)
+    assert told[-1] == (data.size, data.size)
+    assert len(told) > 3
 
 
-def test_where_files_lie(tmp_path, monkeypatch):
-    source = opened(tmp_path, voxels("uint8", SHAPE))
-    summary_of(source, cache=None)
-    assert summary_files_in(tmp_path) == []
-    summary_of(source, cache=str(tmp_path / "new"))
-    assert summary_files_in(tmp_path / "new")[0].endswith("-data.raw.jaxvol-summary-4.npz")
-    with pytest.raises(ValueError, match=r"cache: there is no folder .*missing in which folder"):
-        summary_of(source, cache=tmp_path / "missing" / "folder")
-    with pytest.raises(ValueError, match="cache must be"):  # of arrays, too, which have no files
-        summary_of(source_of(voxels("uint8", SHAPE)), cache=3)
-
-    def refused(path):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(summary_files, "whole_file", refused)
-    with pytest.warns(UserWarning, match=r"cannot be written \(Permission denied\).* Pass cache="):
-        summary_of(source)
+@pytest.mark.parametrize("dtype", ["uint8", "float16"])
+def test_chunks_of_any_size_are_read_once(dtype, tmp_path, monkeypatch):
+    """Also where they end within blocks."""
+    data = voxels(dtype, (40, 37, 33))
+    for number, chunks in enumerate([(7, 5, 33), (40, 3, 4), (13, 13, 13)]):
+        source = source_of(written(tmp_path / f"{number}.zarr", data, chunks))
+        boxes: list[Any] = []
+        read: Any = VoxelSource.read
+        monkeypatch.setattr(VoxelSource, "read", lambda *box, to=boxes: to.append(box[1:]) or read(*box))
+        assert_ranges(scan(source, 8, memory=10_000), data)
+        held = np.zeros(data.shape, int)
+        for low, high, _ in boxes:
+            assert all(a % c == 0 for a, c in zip(low, chunks, strict=True))
+            held[tuple(map(slice, low, high))] += 1
+        assert np.all(held == 1)
+        assert len(boxes) > 2
+        monkeypatch.undo()

@@ -55,13 +55,13 @@ def test_zarr_arrays_of_every_layout_and_their_damage(layout, tmp_path):
     assert_reads(source, data)
     first, *_, last = chunk_files(path)
     first.unlink()
-    with pytest.raises(ValueError, match=r'a chunk is missing or damaged.*missing="fill"'):
+    with pytest.raises(ValueError, match=r'cannot be read .*A chunk is missing.*missing="fill"'):
         source_of(path).read((0, 0, 0), SHAPE)
     filled, expected = source_of(path, missing="fill").read((0, 0, 0), SHAPE), data.copy()
     expected[(slice(16), slice(16), slice(32)) if "sharded" in layout else np.s_[:8, :8, :16]] = 7
     np.testing.assert_array_equal(filled, expected)
     last.write_bytes(last.read_bytes()[:-20])
-    with pytest.raises(ValueError, match=r"from .* to .* cannot be read: a chunk is missing or damaged"):
+    with pytest.raises(ValueError, match=r"from .* to .* cannot be read .* A chunk is damaged"):
         source_of(path, missing="fill").read((0, 0, 0), SHAPE)
 
 
@@ -95,13 +95,6 @@ def test_axes_by_name_in_any_order(axes, tmp_path):
     assert_reads(source_of(written(tmp_path / "b", stored, chunks), axes=axes), data)
     of_xarray = {"zarr_format": 2, "attributes": {"_ARRAY_DIMENSIONS": list(axes)}}
     assert_reads(source_of(written(tmp_path / "c", stored, chunks, **of_xarray)), data)
-    if axes == "zyx":  # open arrays, and those in a group, are read from their folder
-        assert_reads(source_of(zarr.open_array(tmp_path / "a")), data)
-        group = zarr.create_group(tmp_path / "d.zarr")
-        written(tmp_path / "d.zarr" / "inner", data)
-        assert_reads(source_of(group["inner"]), data)
-        with pytest.raises(ValueError, match=r"source: .*Array.* no.* in a folder .* pass the path"):
-            source_of(zarr.create_array({}, shape=SHAPE, dtype="i2"))
 
 
 def test_an_index_chooses_along_other_axes(tmp_path):
@@ -109,7 +102,6 @@ def test_an_index_chooses_along_other_axes(tmp_path):
     path = written(tmp_path / "a.zarr", data, (1, 1, 8, 8, 8), dimension_names=list("tczyx"))
     source = source_of(path, index={"t": 1, "c": 2})
     assert_reads(source, data[1, 2].T)
-    assert source.fingerprint() != source_of(path, index={"t": 1, "c": 1}).fingerprint()
     for index, message in (
         (None, "index must choose one of the 2 entries .* along 't'"),
         ({"t": 0}, "index must choose one of the 3 entries .* along 'c'"),
@@ -196,32 +188,34 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
         assert_reads(source, data)
         np.testing.assert_allclose(source.spacing or (), np.array([0.3, 0.4, 2.0]) * 2**number)
         np.testing.assert_allclose(source.origin or (), np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
-        assert source.beside == tmp_path / f"image.ome.zarr.{number}"
     # a user's spacing and origin move all levels
     second = levels_of(path, spacing=(3, 4, 10), origin=(1, 1, 1))[1]
     np.testing.assert_allclose((second.spacing or (), second.origin or ()), ((6, 8, 20), (2.5, 3, 6)))
     # transformations of all levels come after their own
-    outer = [{"type": "scale", "scale": [10] * len(axes)}, {"type": "identity"}]
+    outer = [{"type": "scale", "scale": [10] * len(axes)}]
     outer += [{"type": "translation", "translation": [3] * len(axes)}]
     write_image(path, image | {"coordinateTransformations": outer}, version)
     second = levels_of(path)[1]
     np.testing.assert_allclose((second.spacing or (), second.origin or ()), ((6, 8, 40), (4.5, 5, 13)))
 
 
+UNITS = (("z", "meter"), ("y", "micrometer"), ("x", "micrometer"))
+
+
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        ({"axes": None}, "axes of multiscales must be a list"),
-        ({"axes": ["z", "y", "x"]}, "axes must be objects with a name"),
-        ({"axes": [{"name": a} for a in "abc"]}, "a volume has the axes x, y and z"),
-        ({"axes": [{"name": a, "unit": a} for a in "zyx"]}, "must have the same unit"),
-        ({"datasets": []}, "datasets of multiscales must be a list"),
-        ({"datasets": [{"path": "../other"}]}, "datasets must name arrays within the group"),
-        ({"datasets": [{"path": "5"}]}, "is no Zarr array"),
-        ({"datasets": [{}]}, "datasets must name arrays"),
-        ({"coordinateTransformations": [{"type": "affine"}]}, "must be of type scale, translation"),
-        ({"coordinateTransformations": [{"type": "scale", "scale": [1, 2]}]}, "one number for each of 3"),
-        ({"coordinateTransformations": [{"type": "scale", "path": "s"}]}, "one number for each of 3 axes"),
+        ({"axes": None}, "does not follow OME-Zarr"),
+        ({"axes": ["z", "y", "x"]}, "does not follow OME-Zarr"),
+        ({"axes": [{"name": a, "type": "space"} for a in "abc"]}, "a volume has the axes x, y and z"),
+        ({"axes": [{"name": a, "unit": u, "type": "space"} for a, u in UNITS]}, "must have the same unit"),
+        ({"datasets": []}, "does not follow OME-Zarr"),
+        ({"datasets": [{"path": "../other"}]}, "does not follow OME-Zarr.*not a valid Zarr node name"),
+        ({"datasets": [{"path": "5"}]}, "does not follow OME-Zarr"),
+        ({"datasets": [{}]}, "does not follow OME-Zarr"),
+        ({"coordinateTransformations": [{"type": "affine"}]}, "does not follow OME-Zarr"),
+        ({"coordinateTransformations": [{"type": "scale", "scale": [1, 2]}]}, "does not follow OME-Zarr"),
+        ({"coordinateTransformations": [{"type": "scale", "path": "s"}]}, "does not follow OME-Zarr"),
         ({"coordinateTransformations": [{"type": "scale", "scale": [1, 0, 1]}]}, "spacing must be positive"),
     ],
 )
@@ -240,9 +234,9 @@ def test_levels_must_become_coarser(tmp_path):
     finer_along_y = {"path": "1", "coordinateTransformations": [{"type": "scale", "scale": [2.0, 0.2, 0.3]}]}
     for order in ([second, first, third], [first, third, second], [first, finer_along_y]):
         write_image(tmp_path, image | {"datasets": order}, "0.5")
-        with pytest.raises(ValueError, match="must be ordered from the highest resolution"):
+        with pytest.raises(ValueError, match="not ordered from highest to lowest resolution"):
             levels_of(tmp_path)
     shutil.rmtree(tmp_path / "1")
     write_image(tmp_path, image, "0.5")
-    with pytest.raises(ValueError, match="1 is no Zarr array"):
+    with pytest.raises(ValueError, match="1 is no Zarr array within the group"):
         levels_of(tmp_path)

@@ -147,7 +147,7 @@ UNOWNED: list[tuple[tuple[jv.Transform, ...], dict[str, Any], str]] = [
     ((jv.AdaptiveSampling(0.1),), {}, "AdaptiveSampling, whose strides"),
     ((), {"compositing": "maximum"}, "compositing by Maximum, which"),
     ((), {"compositing": "average"}, "compositing by Average, which"),
-    ((), {"method": "naive"}, "method='naive'"),
+    ((), {"method": "reload"}, "method='reload'"),
     ((), {"gradient": True}, "gradients"),
 ]
 
