@@ -93,11 +93,10 @@ def test_a_pass_that_is_interrupted_is_begun_anew(tmp_path):
 @pytest.mark.parametrize("dtype", ["uint8", "float16"])
 def test_chunks_of_any_size_are_read_once(dtype, tmp_path, monkeypatch):
     """Also where they end within blocks."""
-    data = voxels(dtype, (40, 37, 33))
+    data, read = voxels(dtype, (40, 37, 33)), VoxelSource.read
     for number, chunks in enumerate([(7, 5, 33), (40, 3, 4), (13, 13, 13)]):
         source = source_of(written(tmp_path / f"{number}.zarr", data, chunks))
         boxes: list[Any] = []
-        read: Any = VoxelSource.read
         monkeypatch.setattr(VoxelSource, "read", lambda *box, to=boxes: to.append(box[1:]) or read(*box))
         assert_ranges(scan(source, 8, memory=10_000), data)
         held = np.zeros(data.shape, int)
