@@ -2,19 +2,21 @@
 
 A phantom of a fetus as the paper's probe would see it, without speckle, through the translucent tissue around
 it, and cut into bricks along the beams alone. Left: each brick shows at once all that a ray meets in it
-(`method="naive"`), as the paper's Fig. 8 does on its left. A ray meets tissue in a brick far from the probe,
-then the fetus in one near it, and the far one again; the near one has the first turn, so that the fetus
-stands before the tissue that covers it. Middle: with overlap (`"overlap"`); right: the difference. Below,
-what is framed.
+(`experiments.naive_bricks`), as the paper's Fig. 8 does on its left. A ray meets tissue in a brick far from
+the probe, then the fetus in one near it, and the far one again; the near one has the first turn, so that the
+fetus stands before the tissue that covers it. Middle: with overlap (`"overlap"`); right: the difference.
+Below, what is framed.
 """
 
 from argparse import Namespace
+from typing import Any
 
 import numpy as np
 from matplotlib.patches import Rectangle
 
 import jaxvol as jv
 from experiments.bricks import phantom
+from experiments.naive_bricks import each_at_once
 
 from .common import BLACK, Page, figure
 
@@ -32,6 +34,7 @@ ZOOM, MIDDLE = 2.2, (0.29, 0.44)
 EYE = (-220.0, -200.0, 40.0)
 """Beside the head, mm: rays pass the curved faces at small angles, and the fetus in between."""
 TITLES = {"naive": "wrong order: no overlap", "overlap": "right order: overlap"}
+METHODS: dict[str, Any] = {"naive": each_at_once, "overlap": "overlap"}
 
 
 @figure(__doc__, resolution=360)
@@ -48,7 +51,7 @@ def main(chosen: Namespace) -> None:
         images = {}
         for column, (method, title) in enumerate(TITLES.items()):
             rendering = jv.render_bricks(
-                volume, transfer, camera, march, bricks=SPLIT, method=method, outputs="rgba"
+                volume, transfer, camera, march, bricks=SPLIT, method=METHODS[method], outputs="rgba"
             )
             images[method] = np.asarray(rendering.image(BLACK))
             report = rendering.bricks

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from .opening import is_zarr_array, read_json, triple, zarr_array
-from .sources import SPACE, Triple, VoxelSource
+from .sources import SPACE, Triple, VoxelSource, triple
+from .zarr import is_zarr_array, read_json, zarr_array
 
 
 def levels_in(

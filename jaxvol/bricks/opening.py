@@ -1,6 +1,5 @@
 """Which source, and which levels of detail, does a user mean?"""
 
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -9,14 +8,16 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from .._util.checks import Arrayable, described, finite_array
+from .._util.checks import Arrayable, described
 from .._util.files import Header, check_size, decoding, file_size
 from .._util.named_axes import along_xyz, is_named
 from .._util.npy import npy_header
 from .._util.voxels import check_shape
 from ..formats.raw import raw_header
 from ..volume import Volume
-from .sources import Triple, VoxelSource
+from .ome_zarr import levels_in
+from .sources import Triple, VoxelSource, triple
+from .zarr import is_zarr_array, zarr_array
 
 
 Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
@@ -27,18 +28,16 @@ METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs"
 
 OF_RAW, OF_ARRAY, OF_ZARR = ("shape", "dtype"), ("axes", "index"), ("axes", "index", "missing")
 
-LARGE, BEYOND = 2**26, 8
-"""Bytes of a chunk that are always taken, and of those of the array, how many times as many."""
-
-DECODED = 2**24
-"""Bytes of decoded chunks that are kept, for boxes that share them."""
-
-DECODERS = min(os.cpu_count() or 1, 8)
-"""Threads that read files, and threads that decode them."""
-
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:
-    """The finest level of what `levels_of` opens, with its arguments and errors."""
+    """The finest level of what `levels_of` opens.
+
+    **Arguments:** `thing`, `options`: as for `levels_of`.
+
+    **Returns:** the source.
+
+    **Raises:** as `levels_of`.
+    """
     return levels_of(thing, **options)[0]
 
 
@@ -161,111 +160,8 @@ def _of_folder(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tu
     _refuse(str(path), options, OF_ZARR)
     if is_zarr_array(path):
         return (zarr_array(path, **options, **place),)
-    from .ome_zarr import levels_in
-
     _refuse(str(path), options, ("index", "missing"))
     return levels_in(path, **options, **place)
-
-
-def is_zarr_array(path: Path) -> bool:
-    """Whether a folder is that of a Zarr array, not of a group or anything else."""
-    if (path / "zarr.json").is_file():
-        return read_json(path / "zarr.json").get("node_type") == "array"
-    return (path / ".zarray").is_file()
-
-
-def zarr_array(
-    path: Path,
-    *,
-    axes: Any = None,
-    index: Mapping[str, int] | None = None,
-    missing: Literal["error", "fill"] | Any = "error",
-    spacing: Triple | None = None,
-    origin: Triple | None = None,
-) -> VoxelSource:
-    """The array in a folder, opened by tensorstore. Arguments and errors as for `levels_of`."""
-    if missing not in ("error", "fill"):
-        raise ValueError(f'missing must be "error" or "fill"; got {missing!r}.')
-    try:
-        import tensorstore
-    except ImportError as fault:
-        raise ImportError(
-            f'{path} is a Zarr array, which tensorstore reads; it is missing: pip install "jaxvol[bricks]".'
-        ) from fault
-    second = (path / ".zarray").is_file()
-    spec = {
-        "driver": "zarr" if second else "zarr3",
-        "kvstore": {"driver": "file", "path": f"{path.resolve()}{os.sep}"},
-        "fill_missing_data_reads": missing == "fill",
-    }
-    context = {
-        "cache_pool": {"total_bytes_limit": DECODED},
-        "data_copy_concurrency": {"limit": DECODERS},
-        "file_io_concurrency": {"limit": DECODERS},
-    }
-    try:
-        store = tensorstore.open(spec, open=True, read=True, context=tensorstore.Context(context)).result()
-    except ValueError as fault:
-        raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
-    _check_chunks(path, store)
-    if axes is None:
-        axes = _told_axes(path, second=second)
-    return VoxelSource(store, spacing, origin, axes=axes, index=index, name=str(path), hint=_hint)
-
-
-def _hint(fault: str) -> str:
-    if "missing" in fault:
-        return (
-            'A chunk is missing. Fetch it again; or pass missing="fill", if chunks were left out because '
-            "all their voxels have the fill value."
-        )
-    return "A chunk is damaged. Fetch it again."
-
-
-def _told_axes(path: Path, *, second: bool) -> list[str] | None:
-    """The names of the axes that the array's metadata tell, if x, y and z are among them."""
-    told: Any = None
-    if second and (path / ".zattrs").is_file():
-        told = read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS")
-    elif not second:
-        metadata = read_json(path / "zarr.json")
-        attributes = metadata.get("attributes") or {}
-        told = metadata.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS")
-    return told if told is not None and {"x", "y", "z"} <= {*told} else None
-
-
-def _check_chunks(path: Path, store: Any) -> None:
-    """Raises for chunks for which no memory should be taken: a chunk is decoded as a whole, even if it
-    reaches beyond the array."""
-    chunk = [c or n for c, n in zip(store.chunk_layout.read_chunk.shape, store.shape, strict=True)]
-    of_chunk, whole = (math.prod(shape) * store.dtype.numpy_dtype.itemsize for shape in (chunk, store.shape))
-    if of_chunk > max(LARGE, BEYOND * whole):
-        raise ValueError(
-            f"path: {path} must have chunks that are not much larger than it; got chunks of {tuple(chunk)} "
-            f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
-        )
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file. **Raises** `ValueError` if it holds anything else."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as fault:
-        raise ValueError(f"path: {path} cannot be read as JSON ({fault}).") from fault
-    if not isinstance(content, dict):
-        raise ValueError(f"path: {path} must hold a JSON object; got {described(content)}.")
-    return content
-
-
-def triple(name: str, value: Any) -> Triple | None:
-    """`value` as three finite numbers; None stays None."""
-    if value is None:
-        return None
-    finite_array(name, value, (3,))
-    x, y, z = np.asarray(value, float).tolist()
-    if name == "spacing" and min(x, y, z) <= 0:
-        raise ValueError(f"spacing must be positive along every axis; got {value!r}.")
-    return x, y, z
 
 
 def _refuse(what: str, options: dict[str, Any], allowed: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from .._util.axes import XYZ, Axes, permuted
-from .._util.checks import described, integer, is_traced
+from .._util.checks import described, finite_array, integer, is_traced
 from .._util.voxels import check_shape
 from ..volume import Volume
 from .dtypes import Box, converted, voxel_type
@@ -330,6 +330,17 @@ def empty_box(low: Corner, high: Corner, axes: Axes, dtype: np.dtype) -> np.ndar
     memory = np.empty(size + ALIGNED, np.uint8)
     start = -memory.ctypes.data % ALIGNED
     return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def triple(name: str, value: Any) -> Triple | None:
+    """`value` as three finite numbers; None stays None."""
+    if value is None:
+        return None
+    finite_array(name, value, (3,))
+    x, y, z = np.asarray(value, float).tolist()
+    if name == "spacing" and min(x, y, z) <= 0:
+        raise ValueError(f"spacing must be positive along every axis; got {value!r}.")
+    return x, y, z
 
 
 def check_known(thing: Any) -> None:
