@@ -515,7 +515,7 @@ FILES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [real_scenes.PHANTOM, "engine", "lidc0314_airway"])
+@pytest.mark.parametrize("name", [real_scenes.PHANTOM, "lidc0314_airway"])
 def test_leaps_do_not_show_in_gradients_of_the_scenes_of_the_experiments(name, real_volume):
     folder = None if name == real_scenes.PHANTOM else real_volume(FILES[name]).parent
     scene = real_scenes.SCENES[name](folder, 128)

@@ -145,8 +145,8 @@ def test_bad_probes_are_named(case):
 def test_a_probe_is_found_from_images_twenty_percent_off_within_half_a_percent():
     """Spheres, wires and speckle, from two known cameras, with noise of 1 %, in converged references; from
     coarse to fine. The covariance says how far off the numbers are, and that the scene determines them."""
-    scene, truth = experiment.phantom(64, seed=0)
-    targets = experiment.views(scene, truth, 32, experiment.NOISE, 0, 8)
+    scene, truth = experiment.phantom(48, seed=0)
+    targets = experiment.views(scene, truth, 24, experiment.NOISE, 0, 8)
     start = experiment.moved(truth, np.array([1, -1, -1, 1, 1, 1, -1]))
     row = experiment.recovered(scene, targets, truth, start)
     assert row["worst"] < 0.005
