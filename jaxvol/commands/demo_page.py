@@ -1,13 +1,13 @@
-"""How does the page of `jaxvol demo` look? Pictures, what they show, and the code that makes them; no
+"""What stands on the page of `jaxvol demo`? Pictures, what they show, and the code that makes them; no
 network."""
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 
 class Section(NamedTuple):
-    """A part of the page: pictures in a row, each with a caption, and the code that makes them, where
+    """A part of the page: pictures in a row, each with a caption, and the code that writes them, where
     RESOLUTION and SIZE stand for the numbers that were given."""
 
     title: str
@@ -15,9 +15,13 @@ class Section(NamedTuple):
     pictures: Mapping[str, str]
     code: str
 
+    def with_numbers(self, resolution: int, size: tuple[int, ...]) -> "Section":
+        """The section with the numbers in its code."""
+        return self._replace(code=self.code.replace("RESOLUTION", str(resolution)).replace("SIZE", str(size)))
 
-SECTIONS: Sequence[Section] = (
-    Section(
+
+SECTIONS: Mapping[str, Section] = {
+    "head": Section(
         "A shaded volume",
         "A phantom of a head: the skull under translucent skin and muscle, shaded by the gradient of "
         "the values.",
@@ -45,7 +49,7 @@ rendering = jv.render(
 )
 jv.save_png("head.png", rendering.image(background=(1, 1, 1)))""",
     ),
-    Section(
+    "grain": Section(
         "Wood grain, before and after",
         "A translucent cube at far too long a step. Each ray's last cell reaches past the cube by another "
         "fraction of a step, which shows as terraces. Cutting that cell where the ray leaves the cube makes "
@@ -61,7 +65,7 @@ for name, transforms in (("before", ()), ("after", (jv.AlphaCorrection(),))):
     rendering = jv.render(cube, look, camera, jv.March(0.25, transforms))
     jv.save_png(f"{name}.png", rendering.image(background=(0, 0, 0)))""",
     ),
-    Section(
+    "fit": Section(
         "A fit by gradients, in seconds",
         "Given were two images of an engine, of 48 x 48 pixels, but not the transfer function that made "
         "them. From flat grey, the method of Levenberg and Marquardt finds one by derivatives of the "
@@ -80,10 +84,11 @@ views = [(c, jv.render(engine, true, c, march).image(background=(1, 1, 1))) for 
 residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
 found = jv.fit(residual, jv.flat_grey(engine, points=8), max_steps=12)
 unseen = jv.Camera.looking_at(engine, (0.8, 0.9, 0.7), size=SIZE).zoom(1.4)
-rendering = jv.render(engine, found.parameters, unseen, march)
-jv.save_png("fit_found.png", rendering.image(background=(1, 1, 1)))""",
+for name, transfer in (("start", jv.flat_grey(engine, points=8)), ("found", found.parameters), ("true", true)):
+    image = jv.render(engine, transfer, unseen, march).image(background=(1, 1, 1))
+    jv.save_png(f"fit_{name}.png", image)""",
     ),
-)
+}
 
 STYLE = """\
 body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; margin: 2rem auto; padding: 0
@@ -91,36 +96,30 @@ body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; m
 h1 { font-weight: 600 } h2 { margin-top: 3rem; border-top: 1px solid #ddd; padding-top: 1.5rem; font-weight:
 600 } .row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; flex: 0 1 auto; max-width: 32rem
 } .three figure { flex: 1 1 18rem; max-width: 23rem } img { max-width: 100%; border: 1px solid #ddd; display:
-block } figcaption { font-size: 0.95rem } figcaption small { color: #666 }
+block } figcaption { font-size: 0.95rem }
 pre { background: #f5f5f5; padding: 0.8rem 1rem; overflow-x: auto; font-size: 0.85rem }
 """
 
 
-def page(said: Mapping[str, str], resolution: int, size: tuple[int, int]) -> str:
-    """The page. `said`: the names of the pictures that there are, each with what it took. `resolution` and
-    `size`: with which they were made."""
+def page(sections: Mapping[str, Section], took: Mapping[str, float]) -> str:
+    """The page of these sections, which took so many seconds."""
     body = [
         "<h1>What jaxvol does</h1>",
         "<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render "
-        "FILE</code>, and "
-        "<code>jaxvol animate FILE</code>.</p>",
+        "FILE</code>, and <code>jaxvol animate FILE</code>.</p>",
     ]
-    for section in SECTIONS:
-        there = {name: text for name, text in section.pictures.items() if name in said}
-        if there:
-            body.append(f"<h2>{section.title}</h2>\n<p>{html.escape(section.text)}</p>")
-            figures = "".join(_figure(name, text, said[name]) for name, text in there.items())
-            body.append(f'<div class="row{" three" if len(there) > 2 else ""}">{figures}</div>')
-            code = section.code.replace("RESOLUTION", str(resolution)).replace("SIZE", str(size))
-            body.append(f"<pre>{html.escape(code)}</pre>")
+    for name, section in sections.items():
+        figures = "".join(
+            f'<figure><img src="{picture}.png" alt="{html.escape(text)}">'
+            f"<figcaption>{html.escape(text)}</figcaption></figure>"
+            for picture, text in section.pictures.items()
+        )
+        body += [
+            f"<h2>{section.title}</h2>\n<p>{html.escape(section.text)} {took[name]:.1f} s, compilation "
+            "included.</p>",
+            f'<div class="row{" three" if len(section.pictures) > 2 else ""}">{figures}</div>',
+            f"<pre>{html.escape(section.code)}</pre>",
+        ]
     head = f'<meta charset="utf-8"><title>jaxvol demo</title><style>{STYLE}</style>'
     text = "\n".join(body)
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{text}\n</body></html>\n'
-
-
-def _figure(name: str, caption: str, took: str) -> str:
-    small = f"<br><small>{html.escape(took)}</small>" if took else ""
-    return (
-        f'<figure><img src="{name}.png" alt="{html.escape(caption)}">'
-        f"<figcaption>{html.escape(caption)}{small}</figcaption></figure>"
-    )
