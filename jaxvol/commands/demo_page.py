@@ -82,9 +82,10 @@ sides = (0.5, -1, 0.4), (-1, -0.3, 0.5)
 cameras = [jv.Camera.looking_at(engine, side, size=(48, 48)).zoom(1.4) for side in sides]
 views = [(c, jv.render(engine, true, c, march).image(background=(1, 1, 1))) for c in cameras]
 residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
-found = jv.fit(residual, jv.flat_grey(engine, points=8), max_steps=12)
+grey = jv.flat_grey(engine, points=8)
+found = jv.fit(residual, grey, max_steps=12)
 unseen = jv.Camera.looking_at(engine, (0.8, 0.9, 0.7), size=SIZE).zoom(1.4)
-for name, transfer in (("start", jv.flat_grey(engine, points=8)), ("found", found.parameters), ("true", true)):
+for name, transfer in (("start", grey), ("found", found.parameters), ("true", true)):
     image = jv.render(engine, transfer, unseen, march).image(background=(1, 1, 1))
     jv.save_png(f"fit_{name}.png", image)""",
     ),
