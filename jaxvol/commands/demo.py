@@ -39,10 +39,13 @@ def _demo(options: argparse.Namespace) -> None:
     with whole_folder(options.output) as folder:
         for name, section in chosen.items():
             begun = time.perf_counter()
-            with working(f"compiling and rendering {name}"), contextlib.chdir(folder):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # two images leave open what no image shows
-                    exec(compile(section.code, f"{name}.py", "exec"), {"__name__": name})
+            with (
+                working(f"compiling and rendering {name}"),
+                contextlib.chdir(folder),
+                warnings.catch_warnings(),
+            ):
+                warnings.simplefilter("ignore")  # two images leave open what no image shows
+                exec(compile(section.code, f"{name}.py", "exec"), {"__name__": name})
             took[name] = time.perf_counter() - begun
             print(f"{options.output}: {', '.join(section.pictures)} in {took[name]:.1f} s")
         (folder / "index.html").write_text(page(chosen, took), encoding="utf-8")
