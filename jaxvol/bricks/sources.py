@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any, TypeAlias, TypeVar
 
+import jax
 import numpy as np
 
 from .._util.axes import XYZ, Axes, permuted
@@ -83,6 +84,8 @@ class VoxelSource:
         hint: Callable[[str], str] = lambda fault: "",
     ):
         check_known(array)
+        if isinstance(array, jax.Array):
+            array = np.asarray(array)  # JAX would compile a program for each box
         self.array, self.name, self._hint = array, name, hint
         self.spacing, self.origin, self.direction = spacing, origin, direction
         shape = tuple(map(int, array.shape))
