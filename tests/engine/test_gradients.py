@@ -286,6 +286,7 @@ def test_nan_and_infinity_reach_image_and_gradient():
             assert np.isnan(found["[0].data"]).any()
 
 
+@pytest.mark.slow
 def test_the_gradient_does_not_march_with_a_nan_step():
     """Without leaping, each ray would take the maximum of 131 072 cells, which takes several minutes."""
     calls = []

@@ -249,6 +249,7 @@ def test_nan_in_light_or_material_reaches_the_sample():
 # ---------------------------------------------------------------- brightness
 
 
+@pytest.mark.slow
 def test_a_half_space_is_about_as_bright_as_by_multiple_scattering():
     """Samples along its normal, weighted by what each shows, under uniform and under parallel light, relative
     to the closed forms: what many templates are known to give, whatever their seed. Nodes are close

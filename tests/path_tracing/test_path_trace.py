@@ -242,6 +242,7 @@ def test_light_and_view_may_change_places():
     assert np.all(abs(fluxes[0] - fluxes[1]) < 3.5 * np.hypot(*errors))
 
 
+@pytest.mark.slow
 def test_lights_add_up():
     camera, transfer = around(NOISE), spiky(3)
     each = [trace(NOISE, transfer, camera, lights, key=7) for lights in (lit(SUN, LAMP), lit(SKY))]

@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, strategies
+from hypothesis import given, settings, strategies
 
 import jaxvol as jv
 from jaxvol.compositing import Over
@@ -99,6 +99,7 @@ def square(factor: float) -> Callable[[float], float]:
     return lambda step: factor * step**2
 
 
+@settings(max_examples=25)
 @given(strategies.floats(-6, 4), strategies.floats(1, 2.5))
 def test_the_longest_step_within_the_goal_is_found(exponent, power):
     """To within 15 %, on the safe side."""

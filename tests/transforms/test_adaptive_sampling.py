@@ -158,6 +158,7 @@ def test_long_stretches_heed_what_lies_farther_away():
     assert strides(jv.Volume(data), RAMP, jv.AdaptiveSampling(1e3, 8), 4.0).max() == 4
 
 
+@pytest.mark.slow
 def test_samples_must_find_what_integrals_hold():
     """The value is linear. A ramp of the extinction suits the midpoint rule; a peak does not; the rule of the
     front errs by half of what changes."""
@@ -432,6 +433,7 @@ def line(n=33):
     return jv.Volume(np.broadcast_to(x[:, None, None], (n, n, n)).copy())
 
 
+@pytest.mark.slow
 def test_long_cells_do_not_reach_past_the_exit():
     """In a constant, where all cells may be long, and which no `AlphaCorrection` cuts."""
     volume = jv.Volume(np.full((33, 33, 33), 0.5, np.float32))
