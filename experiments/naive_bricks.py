@@ -19,6 +19,8 @@ def each_at_once(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[
     """Each brick with all its cells of each ray, whatever other bricks the ray meets between them:
     `render_bricks(..., method=each_at_once)`."""
     for brick in stream.order:
+        if not stream.visible[brick]:
+            continue
         outside = np.ones(stream.grid.number + 1, bool)
         outside[brick] = False
         own = ~outside
@@ -26,7 +28,7 @@ def each_at_once(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[
         others = jnp.asarray(outside)
         turn = Turn(jnp.asarray(brick, jnp.int32), others, jnp.asarray(own), others)
         reached, load = jnp.zeros(rays.length.shape, jnp.int32), None
-        while stream.visible[brick]:
+        while True:
             found = stream.cells_in(turn, rays, living[0], reached)
             if found is None:
                 break

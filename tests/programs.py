@@ -66,6 +66,9 @@ class Programs:
         terminalreporter.section(f"{self.total} programs compiled in {sum(self.seconds.values()):.0f} s")
         for file, count in self.compiled.most_common(SHOWN):
             write(f"{count:5} {self.seconds[file]:6.0f} s  {file}")
+        rest = self.compiled.most_common()[SHOWN:]
+        if rest:
+            write(f"{sum(n for _, n in rest):5}           in {len(rest)} other files")
         others = self.total - sum(self.compiled.values())  # less those that two workers compiled at once
         if others > 0:
             write(f"{others:5}           in kernels and subprocesses")

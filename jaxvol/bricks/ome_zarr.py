@@ -72,7 +72,8 @@ def _first_image(path: Path) -> Any:
     file = path / ("zarr.json" if third else ".zattrs")
     metadata = read_json(file) if file.is_file() else {}
     if third:
-        metadata = (metadata.get("attributes") or {}).get("ome") or {}
+        attributes = metadata.get("attributes")
+        metadata = attributes.get("ome") if isinstance(attributes, dict) else None
     if not isinstance(metadata, dict) or "multiscales" not in metadata:
         several = isinstance(metadata, dict) and "bioformats2raw.layout" in metadata
         raise ValueError(

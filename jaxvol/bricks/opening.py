@@ -61,7 +61,7 @@ def levels_of(
       | | read |
       |---|---|
       | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
-      | an xarray `DataArray` | its axes and coordinates as in `Volume` |
+      | an xarray `DataArray` | whole, its axes and coordinates as in `Volume`; of a lazy one pass `.data` |
       | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
       | path of a `.npy` file, data[x, y, z] | by `np.load(mmap_mode="r")` |
       | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
@@ -70,8 +70,8 @@ def levels_of(
 
     - `spacing`, `origin`: as in `Volume`, of the finest level; by default what the source says.
     - `shape`, `dtype`: of a raw file, as in `jv.load`.
-    - `axes`, `index`: of arrays and of Zarr; see `VoxelSource`. By default Zarr's own (`dimension_names`, or
-      xarray's `_ARRAY_DIMENSIONS`).
+    - `axes`, `index`: of arrays, .npy files and Zarr; see `VoxelSource`. By default Zarr's own
+      (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS`).
     - `missing`: what it means if a chunk of a path's Zarr array is not there. `"error"`: that the data are
       incomplete. `"fill"`: that all its voxels have the fill value, which is why many programs leave out such
       chunks (zarr and tensorstore among them, unless they are told otherwise).
@@ -95,7 +95,7 @@ def levels_of(
                 f"spacing and origin are those of {described(thing)}; got {place} as well. Leave them out."
             )
         return (source,)
-    _refuse(described(thing), options, OF_ARRAY)
+    _refuse(described(thing), options, () if is_named(thing) else OF_ARRAY)
     if is_named(thing):
         thing, told = along_xyz(thing)
         place = {name: triple(name, told.get(name)) if at is None else at for name, at in place.items()}
@@ -113,13 +113,14 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
     if name.endswith((".raw", ".raw.gz")):
         _refuse(str(path), options, OF_RAW)
         return (_raw(path, **options, **place),)
-    _refuse(str(path), options, ())
     if name.endswith(".npy"):
-        return (_npy(path, **place),)
+        _refuse(str(path), options, OF_ARRAY)
+        return (_npy(path, **options, **place),)
+    _refuse(str(path), options, ())
     raise ValueError(
         f"path: {path} is not of a kind that is read in parts: .raw, .npy, or the folder of a Zarr array or "
         "an OME-Zarr image. If it fits into memory, pass jv.load(path), or for ultrasound the volume and "
-        "the map that jv.load_ultrasound(path) returns; of others, an array that reads boxes."
+        "the map that jv.load_ultrasound(path) returns; of HDF5, the array h5py.File(path)[name]."
     )
 
 
@@ -142,13 +143,13 @@ def _raw(
     return VoxelSource(mapped, spacing, origin, name=str(path))
 
 
-def _npy(path: Path, spacing: Triple | None, origin: Triple | None) -> VoxelSource:
+def _npy(path: Path, **options: Any) -> VoxelSource:
     size = file_size(path)
     with decoding(path), path.open("rb") as stream:
         shape, _, stored = npy_header(path, stream)
         start = stream.tell()
     check_size(path, size - start, math.prod(shape) * stored.itemsize)
-    return VoxelSource(np.load(path, mmap_mode="r"), spacing, origin, name=str(path))
+    return VoxelSource(np.load(path, mmap_mode="r"), name=str(path), **options)
 
 
 def _of_folder(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tuple[VoxelSource, ...]:
@@ -168,5 +169,5 @@ def _refuse(what: str, options: dict[str, Any], allowed: tuple[str, ...]) -> Non
     if unused := [name for name in options if name not in allowed]:
         raise ValueError(
             f"{', '.join(unused)}: {what} takes no such option; {', '.join(OF_RAW)} belong to raw files, "
-            f"{', '.join(OF_ARRAY)} to arrays, {', '.join(OF_ZARR)} to Zarr arrays."
+            f"{', '.join(OF_ARRAY)} to arrays and .npy files, {', '.join(OF_ZARR)} to paths of Zarr arrays."
         )

@@ -155,8 +155,6 @@ def plan(
     how = {"compositing": compositing, **options}
     if isinstance(volume, Volume) and memory is None:
         return plan_in_memory(volume, transfer, camera, tolerance, **how)
-    if isinstance(volume, Volume) and volume.direction is not None:
-        raise ValueError("volume must lie along the axes of the world to be planned with memory.")
     begun, room = time.perf_counter(), budget(memory)
     place = {name: value for name, value in (("spacing", spacing), ("origin", origin)) if value is not None}
     if not isinstance(source, dict | None) or {*(source or ())} - {*OF_RAW, *OF_ZARR}:
@@ -164,6 +162,8 @@ def plan(
             f"source must be a dictionary of options, of {', '.join((*OF_RAW, *OF_ZARR))}; got {source!r}."
         )
     opened, *_ = levels_of(volume, **place, **(source or {}))
+    if opened.direction is not None:
+        raise ValueError("volume must lie along the axes of the world to be planned with memory.")
     # before anything takes time
     check_smallest(opened.shape, opened.dtype, room)
     stride = 1

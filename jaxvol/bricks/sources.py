@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from .._util.axes import XYZ, Axes, permuted
-from .._util.checks import described, finite_array, integer, is_traced
+from .._util.checks import Arrayable, described, finite_array, integer, is_traced
 from .._util.voxels import check_shape
 from ..volume import Volume
 from .dtypes import Box, converted, voxel_type
@@ -31,10 +31,10 @@ AT_ONCE = 2**23
 """Bytes of storage that are read at a time: a box that takes more is read in layers."""
 
 PAGE = 2**12
-"""Bytes: a row of a memory map that is not read whole costs as much more, at its ends."""
+"""Bytes that a row of a memory map costs beside its own if it is read in part: the pages at its ends."""
 
 ALIGNED = 64
-"""Bytes, of whose multiples the addresses of JAX's arrays are."""
+"""JAX's arrays lie at addresses that are multiples of so many bytes."""
 
 _READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
@@ -51,7 +51,7 @@ class VoxelSource:
 
     - `array`: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
       axis: an array or a memory map of NumPy, an array of JAX, zarr, h5py, dask or tensorstore, or an object
-      of your own. It is read from other threads.
+      of your own. It is read from other threads, and possibly by several at once.
     - `spacing`, `origin`, `direction`: as in `Volume`; None where nobody knows them.
     - `axes`: the name of each of its axes, such as "tczyx" or ["z", "y", "x"]; x, y and z among them. By
       default it is array[x, y, z], as in `Volume`.
@@ -64,7 +64,8 @@ class VoxelSource:
 
     - `shape`: number of voxels.
     - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`). `stored_type`: of those of the array.
-    - `chunks`: voxels of the parts in which it is stored. Reading part of one costs as much as reading all.
+    - `chunks`: voxels of the parts in which it is stored, or of a plane where it is stored as a whole. What
+      is read at a time is cut between them.
     - `order`: axes in the order of storage: along the first one, neighbours lie farthest apart.
 
     **Raises:** `ValueError` for a shape or type that no volume has, for axes or an index that the array does
@@ -74,8 +75,8 @@ class VoxelSource:
     def __init__(
         self,
         array: Any,
-        spacing: Triple | None = None,
-        origin: Triple | None = None,
+        spacing: Arrayable | None = None,
+        origin: Arrayable | None = None,
         *,
         direction: Any = None,
         axes: str | Sequence[str] | Any | None = None,
@@ -84,10 +85,12 @@ class VoxelSource:
         hint: Callable[[str], str] = lambda fault: "",
     ):
         check_known(array)
-        if isinstance(array, jax.Array):
+        self._immutable = isinstance(array, jax.Array)
+        if self._immutable:
             array = np.asarray(array)  # JAX would compile a program for each box
         self.array, self.name, self._hint = array, name, hint
-        self.spacing, self.origin, self.direction = spacing, origin, direction
+        self.spacing, self.origin = triple("spacing", spacing), triple("origin", origin)
+        self.direction = direction
         shape = tuple(map(int, array.shape))
         if len(shape) < 3:
             check_shape(shape)
@@ -101,11 +104,13 @@ class VoxelSource:
         self.shape: tuple[int, int, int] = permuted([shape[axis] for axis in place], XYZ)
         self.stored_type = np.dtype(_dtype_of(array))
         self.dtype = voxel_type(self.stored_type)
-        chunks, order = _layout_of(array, shape)
+        chunks, order = _layout_of(array, shape, place)
         x, y, z = (min(chunks[axis], n) for axis, n in zip(place, self.shape, strict=True))
         self.chunks: tuple[int, int, int] = x, y, z
         slow, middle, fast = (place.index(axis) for axis in order if axis in place)
         self.order: Axes = slow, middle, fast
+        begin = getattr(getattr(array, "domain", None), "origin", None)
+        self._begin = tuple(begin) if begin is not None else (0,) * len(shape)
         self._map = _map_under(array)
         self._summary: Any = None  # found by `summary.summary_of`
 
@@ -124,8 +129,7 @@ class VoxelSource:
         (dx, dy, dz), (x, y, z) = (
             np.asarray(part, float).tolist() for part in (volume.spacing, volume.origin)
         )
-        data = np.asarray(volume.data)
-        return cls(data, (dx, dy, dz), (x, y, z), direction=volume.direction, name="volume")
+        return cls(volume.data, (dx, dy, dz), (x, y, z), direction=volume.direction, name="volume")
 
     @property
     def nbytes(self) -> int:
@@ -139,9 +143,14 @@ class VoxelSource:
 
     @property
     def is_constant(self) -> bool:
-        """Whether nobody is known to write to it, so that what was found out of it stays true: it is no array
-        in memory, and no memory map that is open for writing."""
-        return not self.in_memory and (self._map is None or self._map.read_only)
+        """Whether what was found out of it is taken to stay true: it is no array of NumPy, which anybody may
+        write to, and no memory map that is open for writing."""
+        return self._immutable or (not self.in_memory and (self._map is None or self._map.read_only))
+
+    def check_unchanged(self) -> None:
+        """**Raises** `ValueError` if the file under a memory map was written to since the source was made."""
+        if self._map is not None:
+            self._map.check_unchanged(self.name)
 
     def bytes_touched(self, size: tuple[int, int, int]) -> int:
         """About how many bytes of storage, uncompressed, are read for a box of so many voxels."""
@@ -174,8 +183,7 @@ class VoxelSource:
         box = self._box(low, high)
         if self.in_memory:
             return converted(self._stored(box, axes), box, axes, self.name)
-        if self._map is not None:
-            self._map.check_unchanged(self.name)
+        self.check_unchanged()
         voxels = empty_box(*box, axes, self.dtype)
         for layer in self._layers_of(box):
             place = [slice(a - x, b - x) for a, b, x in zip(*layer, box[0], strict=True)]
@@ -193,14 +201,29 @@ class VoxelSource:
         index: list[Any] = list(self._fixed)
         for a, b, axis in zip(*box, self._axes, strict=True):
             index[self._spatial[axis]] = slice(a, b)
+        # views of tensorstore count from where they begin in the whole
+        index = [
+            i + start if isinstance(i, int) else slice(i.start + start, i.stop + start)
+            for i, start in zip(index, self._begin, strict=True)
+        ]
         try:
-            found = np.asarray(self.array[tuple(index)])
+            given = self.array[tuple(index)]
+            found = np.asarray(given)
         except Exception as fault:  # of whatever library
             hint = self._hint(str(fault)) or "Check what it is stored in."
             raise ValueError(
                 f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). {hint}"
             ) from fault
-        return found.transpose(permuted(self._axes, axes))
+        if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
+            raise ValueError(f"{self.name}: voxels from {box[0]} to {box[1]} are masked. Fill them first.")
+        moved = found.transpose(permuted(self._axes, axes)) if found.ndim == 3 else found
+        size = permuted([b - a for a, b in zip(*box, strict=True)], axes)
+        if moved.shape != size:
+            raise ValueError(
+                f"{self.name}: the box from {box[0]} to {box[1]} must have the shape {size}, along the axes "
+                f"{''.join(SPACE[axis] for axis in axes)}; its array returns {moved.shape}."
+            )
+        return moved
 
     def _layers_of(self, box: Box) -> Iterator[Box]:
         """A box, cut between chunks, along the axis on which it touches the most of them, into parts of no
@@ -274,11 +297,15 @@ def _map_under(array: Any) -> _Map | None:
 
 def _dtype_of(array: Any) -> np.dtype:
     found = array.dtype
-    return np.dtype(getattr(found, "numpy_dtype", found))  # tensorstore has types of its own
+    try:
+        return np.dtype(getattr(found, "numpy_dtype", found))  # tensorstore has types of its own
+    except TypeError as fault:
+        raise ValueError(f"source must have a dtype that NumPy knows; got {found!r}.") from fault
 
 
-def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[list[int], list[int]]:
-    """Voxels of a chunk along each axis, and the axes in the order of storage, the slowest first."""
+def _layout_of(array: Any, shape: tuple[int, ...], place: tuple[int, ...]) -> tuple[list[int], list[int]]:
+    """Voxels of a chunk along each axis, and the axes in the order of storage, the slowest first. `place`:
+    the axes of space, of which planes are the chunks of what has none."""
     axes = list(range(len(shape)))
     strides = getattr(array, "strides", None)
     if isinstance(array, np.ndarray) and strides is not None:
@@ -290,7 +317,7 @@ def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[list[int], list[int]
         )
     chunks = getattr(array, "chunks", None)
     if chunks is None:
-        slowest = next((axis for axis in axes if shape[axis] > 1), 0)
+        slowest = next(axis for axis in axes if axis in place)
         return [1 if axis == slowest else n for axis, n in enumerate(shape)], axes
     # of zarr and h5py a number for each axis, of dask all numbers
     return [int(np.max(c)) for c in chunks], axes
@@ -354,6 +381,8 @@ def check_known(thing: Any) -> None:
             "voxels by bricks (jv.render has them), and none inside jax.jit and jax.vmap. For gradients to "
             "spacing and origin, pass these to render_bricks, beside an array."
         )
+    if isinstance(thing, VoxelSource):
+        raise ValueError(f"array must be one, not a source; got {described(thing)}.")
     if isinstance(thing, type) or (not isinstance(thing, Volume) and not _is_array(thing)):
         raise ValueError(
             "source must be an array, a Volume, a VoxelSource, or the path of a file or folder; got "

@@ -85,8 +85,9 @@ class Summary:
 
 
 def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress | None = None) -> Summary:
-    """The summary of a source: from one pass over its voxels, kept by the source for the next images, unless
-    it is an array in memory or a memory map that is open for writing, which anybody may write to.
+    """The summary of a source, from one pass over its voxels. The source keeps it for the next images, unless
+    it is an array of NumPy or a memory map that is open for writing. Of arrays of other libraries it is taken
+    that nobody writes to them: open a source anew after that.
 
     **Arguments:** `source`: the voxels. `memory`, `progress`: see `scan`.
 
@@ -95,6 +96,7 @@ def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress |
     **Raises:** as `scan` does.
     """
     if source._summary is not None:
+        source.check_unchanged()
         return source._summary
     cell = CELL if min(source.shape) > CELL else BLOCK
     found = scan(source, cell, memory=memory, progress=progress)
@@ -183,23 +185,12 @@ def _along(
 ) -> np.ndarray:
     """Along one axis, of which there are the nodes from `begin` to `end`."""
 
-    def nodes(low: int, high: int, step: int = 1) -> np.ndarray:
-        return voxels[(slice(None),) * axis + (slice(low - begin, high - begin, step),)]
-
-    # blocks of which all nodes are there, by strides: a node of each at a time
-    whole = [b for b in blocks if b * cell >= begin and (b + 1) * cell < end]
-    found = []
-    for block in blocks:
-        if block not in whole:
-            low, high = max(block * cell, begin), min((block + 1) * cell + 1, end)
-            found.append(combine.reduce(nodes(low, high), axis, keepdims=True))
-        elif block == whole[0]:
-            start, last = whole[0] * cell, whole[-1] * cell
-            part = nodes(start, last + 1, cell).copy()
-            for node in range(1, cell + 1):
-                combine(part, nodes(start + node, last + node + 1, cell), out=part)
-            found.append(part)
-    return np.concatenate(found, axis)
+    at = np.arange(blocks.start, blocks.stop) * cell + np.arange(cell + 1)[:, None]
+    at = np.clip(at, begin, end - 1) - begin  # a node that is not there becomes one of the same block
+    found = voxels.take(at[0], axis)
+    for nodes in at[1:]:
+        combine(found, voxels.take(nodes, axis), out=found)
+    return found
 
 
 @eqx.filter_jit

@@ -84,9 +84,14 @@ def _told_axes(path: Path, *, second: bool) -> list[str] | None:
         told = read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS")
     elif not second:
         metadata = read_json(path / "zarr.json")
-        attributes = metadata.get("attributes") or {}
-        told = metadata.get("dimension_names") or attributes.get("_ARRAY_DIMENSIONS")
-    return told if told is not None and {*SPACE} <= {*told} else None
+        attributes = metadata.get("attributes")
+        told = metadata.get("dimension_names")
+        if told is None and isinstance(attributes, dict):
+            told = attributes.get("_ARRAY_DIMENSIONS")
+    if not isinstance(told, list) or not all(isinstance(name, str) for name in told):
+        return None
+    names = [name.lower() for name in told]
+    return names if {*SPACE} <= {*names} else None
 
 
 def _check_chunks(path: Path, store: Any) -> None:

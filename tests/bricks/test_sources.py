@@ -13,7 +13,7 @@ import tensorstore
 import zarr
 
 import jaxvol as jv
-from jaxvol.bricks import source_of, sources
+from jaxvol.bricks import VoxelSource, source_of, sources
 
 from ..scenes import in_float64
 
@@ -83,6 +83,7 @@ def test_arrays_and_files_of_every_type(dtype, tmp_path):
     for order in ("C", "F"):
         np.save(tmp_path / "data.npy", np.asarray(data, order=order))
         assert_reads(source_of(str(tmp_path / "data.npy")), data)
+        assert_reads(source_of(tmp_path / "data.npy", axes="zyx"), data.T)
 
 
 class OfOurOwn:
@@ -132,6 +133,41 @@ def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatc
     monkeypatch.setattr(OfOurOwn, "__getitem__", lambda _, box: fails(box))
     with pytest.raises(ValueError, match=r"array: the voxels from \(0, 0, 0\) .* cannot be read \(no disk\)"):
         source_of(ours).read((0, 0, 0), SHAPE)
+
+
+def test_axes_beside_space_are_not_what_is_read_in_layers(monkeypatch):
+    """A stack of channels, of which one is read plane by plane."""
+    stack = OfOurOwn(voxels("uint8", (3, 40, 30, 20)))
+    source = source_of(stack, axes="czyx", index={"c": 1})
+    assert source.chunks == (20, 30, 1)
+    monkeypatch.setattr(sources, "AT_ONCE", 2000)
+    assert_reads(source, stack.data[1].T)
+
+
+def test_what_an_array_returns_is_checked():
+    data = voxels("uint8", (8, 8, 8))
+
+    class Clipped(OfOurOwn):
+        def __getitem__(self, box):
+            return self.data[box][:1]
+
+    with pytest.raises(ValueError, match=r"must have the shape \(4, 4, 4\).*its array returns \(1, 4, 4\)"):
+        source_of(Clipped(data)).read((0, 0, 0), (4, 4, 4))
+    masked = OfOurOwn(np.ma.masked_equal(data, data[1, 2, 3]))
+    with pytest.raises(ValueError, match=r"from \(0, 0, 0\) to \(8, 8, 8\) are masked"):
+        source_of(masked).read((0, 0, 0), (8, 8, 8))
+    view = tensorstore.array(data)[2:, 1:]  # whose domain begins at 2 and 1
+    assert_reads(source_of(view), data[2:, 1:])
+    bad: list[tuple[Any, dict[str, Any], str]] = [
+        (data, {"spacing": (1, 2)}, "spacing must have"),
+        (source_of(data), {}, "array must be one, not a source"),
+    ]
+    for array, options, message in bad:
+        with pytest.raises(ValueError, match=message):
+            VoxelSource(array, **options)
+    named = pytest.importorskip("xarray").DataArray(data, dims=("z", "y", "x"))
+    with pytest.raises(ValueError, match=r"^axes: .* takes no such option"):
+        source_of(named, axes="zyx")
 
 
 def test_chunks_are_touched_whole_and_rows_of_a_map_by_pages(tmp_path):
@@ -244,7 +280,12 @@ def test_what_is_no_box_is_refused():
 
 def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_path):
     (tmp_path / "folder").mkdir()
-    for name, content in (("data.raw", bytes(99)), ("data.raw.gz", b"1"), ("data.nii", b"1")):
+    for name, content in (
+        ("data.raw", bytes(99)),
+        ("data.raw.gz", b"1"),
+        ("data.nii", b"1"),
+        ("data.h5", b"1"),
+    ):
         (tmp_path / name).write_bytes(content)
     np.save(tmp_path / "cut.npy", np.zeros((4, 5, 6)))
     os.truncate(tmp_path / "cut.npy", 300)
@@ -264,6 +305,7 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
         (3, {}, "source must be an array, a Volume, a VoxelSource, or the path"),
         (jv.Volume(np.zeros(SHAPE), labels=np.zeros(SHAPE, np.uint8)), {}, "a Volume with labels"),
         ("data.npy", {"shape": SHAPE}, "^shape: .* takes no such option"),
+        ("data.h5", {}, r"h5py\.File\(path\)\[name\]"),
         (np.zeros(SHAPE), {"axes": "xyc"}, "axes must name each of the 3 axes of array once"),
         (np.zeros(SHAPE), {"missing": "fill"}, "^missing: .* takes no such option"),
         ([[[1, 2], [3, 4]]], {}, "source must be an array, .* got "),

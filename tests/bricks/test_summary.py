@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -67,11 +68,15 @@ def test_the_pass_is_kept_by_a_source_that_nobody_writes_to(tmp_path, monkeypatc
     monkeypatch.setattr(summary, "scan", lambda *given, **more: passes.append(1) or scan(*given, **more))
     of_file = source_of(x_fastest(tmp_path / "data.raw", data), shape=SHAPE, dtype="int16")
     writable = np.memmap(tmp_path / "data.raw", np.int16, "r+", shape=SHAPE, order="F")
-    for source, number in ((of_file, 1), (source_of(data), 3), (source_of(writable), 3)):
+    immutable = source_of(jnp.asarray(data))
+    for source, number in ((of_file, 1), (immutable, 1), (source_of(data), 3), (source_of(writable), 3)):
         passes.clear()
         for _ in range(3):
             assert_ranges(summary_of(source), data)
         assert len(passes) == number
+    x_fastest(tmp_path / "data.raw", data + 1)  # what is kept is not told of another file
+    with pytest.raises(ValueError, match="changed after it was opened"):
+        summary_of(of_file)
 
 
 def test_a_pass_that_is_interrupted_is_begun_anew(tmp_path):
