@@ -357,3 +357,23 @@ def test_ten_thousand_samples_in_float32_lose_nothing_that_is_seen():
             truth = reference_rays(to_float64(volume), to_float64(transfer), *rays, exact)
         assert int(np.asarray(truth.samples).max()) > 8000
         np.testing.assert_allclose(rendering.rgba, truth.rgba, atol=2e-5, rtol=0)
+
+
+def test_a_beam_holds_all_pixels_of_its_cell():
+    """Small cubes under pixels as large as blocks: each is seen by a few pixels, often those at the end of a
+    cell of the image alone."""
+    transfer = jv.TransferFunction([0, 0.2, 1], np.ones((3, 3)), [0, 0, 5.0])
+    seen = 0
+    for seed in range(30):
+        data = np.zeros((96, 96, 96), np.float32)
+        x, y, z = np.random.default_rng(seed).integers(2, 91, 3)
+        data[x : x + 3, y : y + 3, z : z + 3] = 1
+        volume = jv.Volume(data)
+        camera = jv.Camera.looking_at(volume, (0.5, -1, 0.4), size=(40, 32))
+        found, expected = (
+            np.asarray(jv.render(volume, transfer, camera, jv.March(0.5, (jv.Jitter(0), *leaps))).rgba)
+            for leaps in ((jv.SpaceLeaping("beam", cell=8),), ())
+        )
+        np.testing.assert_allclose(found, expected, atol=1e-4, err_msg=f"seed {seed}")
+        seen += np.sum(expected[..., 3] > 0)
+    assert seen > 10
