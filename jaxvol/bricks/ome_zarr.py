@@ -24,7 +24,7 @@ def levels_in(
 ) -> tuple[VoxelSource, ...]:
     """The levels of the first image in an OME-Zarr group, finest first, with their spacing and origin in the
     unit of the file; or with the finest at another place and of another `spacing`, and the others moved with
-    it. `index`, `options`: as for `opening.zarr_array`.
+    it. `index`, `options`: as for `zarr.zarr_array`.
 
     **Raises:** `ValueError` for a group without `multiscales` of version 0.4 or 0.5, for metadata that do not
     follow them, such as levels in another order, and for axes of different units; `ImportError` without

@@ -161,7 +161,8 @@ def _of_folder(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tu
     _refuse(str(path), options, OF_ZARR)
     if is_zarr_array(path):
         return (zarr_array(path, **options, **place),)
-    _refuse(str(path), options, ("index", "missing"))
+    if "axes" in options:
+        raise ValueError(f"axes: the metadata of the OME-Zarr image {path} name its axes. Leave it out.")
     return levels_in(path, **options, **place)
 
 

@@ -113,7 +113,7 @@ def scan(
     **Arguments:**
 
     - `cell`: cells along the side of a block. A summary takes 2 / `cell`³ of the voxels' memory.
-    - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk of the source does.
+    - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk takes more.
     - `progress`: called after each part; what it raises ends the pass.
 
     **Raises:** `ValueError` for what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
