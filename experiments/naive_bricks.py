@@ -12,7 +12,7 @@ import numpy as np
 from jaxvol.bricks.cells import Turn
 from jaxvol.bricks.stream import Load, Stream
 from jaxvol.reference import Progress
-from jaxvol.space import Ray
+from jaxvol.scene.space import Ray
 
 
 def each_at_once(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[Load]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 import jaxvol as jv
 from jaxvol.bricks.split import COPIES
 from jaxvol.lighting import Deferred, Lighting, Phong
-from jaxvol.march import Quadrature
+from jaxvol.march.march import Quadrature
 
 from . import accuracy, peer_vtk
 from .accuracy import LEFT

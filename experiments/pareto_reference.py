@@ -17,7 +17,7 @@ import numpy as np
 
 import jaxvol as jv
 from jaxvol.lighting import Lighting
-from jaxvol.march import Quadrature
+from jaxvol.march.march import Quadrature
 from jaxvol.metrics import rmse
 
 from .pareto_programs import Image, lighting_of, program

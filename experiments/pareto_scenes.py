@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, Lighting, Phong, ScattererTemplates
-from jaxvol.march import Quadrature
+from jaxvol.march.march import Quadrature
 
 from . import peer_vtk, scenes
 from .accuracy import peaked

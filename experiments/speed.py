@@ -33,9 +33,9 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 import jaxvol as jv
-from jaxvol._util.xla import OPTIONS
 from jaxvol.metrics import rmse
-from jaxvol.occupancy import Blocks, Sums
+from jaxvol.scene.occupancy import Blocks, Sums
+from jaxvol.xla.xla import OPTIONS
 
 from . import common, fresh, marches, peer_vtk, timing
 from .common import plt

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.viewer.tiles import SIDE
+from jaxvol.app.viewer.tiles import SIDE
+from tests.app.viewer.notebook_server import notebook
 from tests.browser import Page, opened
-from tests.viewer.notebook_server import notebook
 
 from . import common
 from .common import plt
@@ -67,8 +67,8 @@ START = """
 import sys, time
 begun = float(sys.argv[1])
 import jaxvol as jv
-from jaxvol.viewer.model import Model
-from jaxvol.viewer.start import begin
+from jaxvol.app.viewer.model import Model
+from jaxvol.app.viewer.start import begin
 jv.keep_programs(sys.argv[3])
 volume = jv.load(sys.argv[2])
 how = {"lighting": None, "lit": True, "compositing": "over", "background": (1, 1, 1), "size": (640, 480)}

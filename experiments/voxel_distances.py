@@ -14,8 +14,8 @@ from jaxtyping import Array, Shaped, UInt8
 from scipy.ndimage import distance_transform_cdt
 
 import jaxvol as jv
-from jaxvol.march import EmptySpaceIndex, View
-from jaxvol.occupancy import FARTHEST, ROUNDING, Blocks, Occupancy
+from jaxvol.march.march import EmptySpaceIndex, View
+from jaxvol.scene.occupancy import FARTHEST, ROUNDING, Blocks, Occupancy
 
 
 class Measured(Occupancy):

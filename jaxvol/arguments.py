@@ -4,11 +4,11 @@ from types import NoneType
 from typing import Any
 
 from ._util.checks import described
-from .camera import Camera
 from .lighting.shading import Lighting
-from .march import March
-from .transfer import Transfer
-from .volume import Volume
+from .march.march import March
+from .scene.camera import Camera
+from .scene.transfer import Transfer
+from .scene.volume import Volume
 
 
 EXPECTED: dict[str, tuple[tuple[type, ...], str, str]] = {

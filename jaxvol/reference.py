@@ -15,22 +15,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.checks import Arrayable, all_finite, check_answer, finite_array, is_traced
-from ._util.sharding import varying
-from ._util.trees import PyTree
+from ._util.checks import Arrayable, all_finite, check_answer, finite_array
 from ._util.vec3 import Scalar, Vec3, apart
-from ._util.xla import in_memory
 from .arguments import check_arguments
-from .compositing import Compositing, Fragment, Outputs, Weighting
+from .compositing.compositing import Compositing, Fragment, Outputs, Weighting
+from .compositing.modes import Mode, compositing_of
+from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
-from .march import Cell, March
-from .modes import Mode, compositing_of
-from .rendering import Details, Rendering
-from .selection import RaySampler, Selection
-from .space import Line, Ray, Space, enter, invalid, world_gradient
-from .transfer import Classification, Measured, Transfer, classification_of
-from .variation import Windows
-from .volume import Volume, without_voxels
+from .march.march import Cell, March
+from .scene.rendering import Details, Rendering
+from .scene.space import Line, Ray, Space, enter, invalid, world_gradient
+from .scene.transfer import Classification, Measured, Transfer, classification_of
+from .scene.variation import Windows
+from .scene.volume import Volume, without_voxels
+from .xla.platform import is_traced
+from .xla.sharding import varying
+from .xla.trees import PyTree
+from .xla.xla import in_memory
 
 
 class Pipeline(NamedTuple):

@@ -9,22 +9,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, require
-from ._util.sharding import shard_number
 from .arguments import check_arguments
-from .camera import Camera
-from .compositing import Compositing
+from .compositing.compositing import Compositing
+from .compositing.modes import Mode, compositing_of
 from .engine.adjoints import Adjoint
 from .engine.devices import Devices
 from .engine.driver import Asked, render_scene
 from .engine.rays import OwnRays
 from .engine.scene import Scene
 from .lighting.shading import Lighting
-from .march import March
-from .modes import Mode, compositing_of
+from .march.march import March
 from .planning import plan
-from .rendering import Rendering
-from .transfer import Transfer
-from .volume import Volume
+from .scene.camera import Camera
+from .scene.rendering import Rendering
+from .scene.transfer import Transfer
+from .scene.volume import Volume
+from .xla.sharding import shard_number
 
 
 PLANNED = 1 / 255

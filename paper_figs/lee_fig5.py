@@ -17,9 +17,9 @@ import numpy as np
 import jaxvol as jv
 from experiments.lighting import march
 from experiments.scenes import Scene
+from jaxvol.io.phantoms.canvas import FAR, Canvas
+from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, Phong, ScattererTemplates
-from jaxvol.phantoms.canvas import FAR, Canvas
-from jaxvol.phantoms.shapes import Shape, capsule, ellipsoid, tube
 
 from .common import BLACK, Page, figure
 

@@ -114,7 +114,7 @@ def programs_of_this_session():
 @pytest.fixture(autouse=True)
 def no_progress(monkeypatch):
     """No lines on stderr of what takes long, which depends on how busy the machine is."""
-    monkeypatch.setattr("jaxvol.commands.progress.PATIENCE", 1e6)
+    monkeypatch.setattr("jaxvol.app.commands.progress.PATIENCE", 1e6)
 
 
 @pytest.fixture

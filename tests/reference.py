@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def entries() -> dict[str, Any]:
-    """By path, such as `jaxvol.camera.Camera`, the objects that the pages of docs/api show."""
+    """By path, such as `jaxvol.scene.camera.Camera`, the objects that the pages of docs/api show."""
     found: dict[str, Any] = {}
     for page in sorted((ROOT / "docs" / "api").glob("*.md")):
         for line in page.read_text(encoding="utf-8").splitlines():

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-import jaxvol.march
+from jaxvol.march.march import Quadrature
 
 
-QUADRATURES = get_args(jv.march.Quadrature)
+QUADRATURES = get_args(Quadrature)
 RESOLUTION = 24
 SIZE = (20, 16)
 

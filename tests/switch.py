@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from jaxtyping import Array, Bool
 
 import jaxvol as jv
-from jaxvol.march import EmptySpaceIndex
-from jaxvol.space import Space
+from jaxvol.march.march import EmptySpaceIndex
+from jaxvol.scene.space import Space
 
 from .scenes import BOX, PLANE
 

@@ -8,17 +8,15 @@ from pathlib import Path
 
 import jaxvol as jv
 from jaxvol.lighting import Light
-from jaxvol.march import Transform
-from jaxvol.space import Path as RayPath
+from jaxvol.march.march import Transform
+from jaxvol.scene.space import Path as RayPath
 
 
 ROOT = Path(jv.__file__).parent
 
 NAMES = """
-    _util programs volume occupancy variation space transfer labels transfer2d display presets camera
-    automatic beams march transforms scan_conversion lighting compositing selection projections isosurface
-    modes rendering arguments reference engine planning render path_tracing metrics phantoms formats datasets
-    bricks fitting unseen viewer figures commands cli __main__ __init__
+    xla _util scene march lighting compositing arguments reference engine planning render path_tracing metrics
+    io bricks fitting app __main__ __init__
 """
 ORDER = [str(name) for name in NAMES.split()]
 """Order of imports, from the volume to the command line: a file imports only entries before its own."""

@@ -27,7 +27,7 @@ def test_what_faults_replace_and_the_tests_that_must_see_it_are_there():
 
 def test_a_fault_is_replaced_wherever_it_was_imported():
     from jaxvol import metrics
-    from jaxvol.viewer import drawing
+    from jaxvol.app.viewer import drawing
 
     from .faults import Fault
 

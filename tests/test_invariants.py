@@ -11,7 +11,7 @@ from scipy.special import erf
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
-from jaxvol.space import Affine, enter
+from jaxvol.scene.space import Affine, enter
 
 from . import oracle
 from .scenes import around, in_float64, scaled_phantom, slow, uniform_transfer

@@ -11,19 +11,12 @@ from jaxvol._util.piecewise_means import mean_by_rows, mean_by_spans, span_rows
 from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import Tiling
-from jaxvol.march import Cell
-from jaxvol.transfer import Transfer
+from jaxvol.march.march import Cell
+from jaxvol.scene.transfer import Transfer
 
 from . import oracle
 from .modes import Rays, ball_in_a_corner, classified, numbers, scaled_transfer
-from .scenes import (
-    around,
-    in_float64,
-    scaled_phantom,
-    slow,
-    soft_transfer,
-    to_float64,
-)
+from .scenes import around, in_float64, scaled_phantom, slow, soft_transfer, to_float64
 
 
 # ---- means ----

@@ -10,8 +10,8 @@ import pytest
 from jaxtyping import Array, Bool
 
 import jaxvol as jv
+from jaxvol.march.transforms.jitter import Noise
 from jaxvol.metrics import boundary_noise, comb_frequency, low_frequency_energy, rmse, wood_grain_energy
-from jaxvol.transforms.jitter import Noise
 
 from .switch import switch
 

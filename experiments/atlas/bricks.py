@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, overlap_of
-from jaxvol.space import enter
+from jaxvol.scene.space import enter
 
 from ..naive_bricks import each_at_once
 from .entry import Entry, colors

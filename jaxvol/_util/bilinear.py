@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..xla.xla import gather
 from .piecewise_linear import points_below
 from .vec3 import Scalar
-from .xla import gather
 
 
 Lines = tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]

@@ -15,13 +15,13 @@ from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .sharding import varies_over
-from .trees import PyTree
+from ..xla.platform import is_traced
+from ..xla.sharding import varies_over
+from ..xla.trees import PyTree
 
 
 T = TypeVar("T")
@@ -29,11 +29,6 @@ T = TypeVar("T")
 Arrayable: TypeAlias = Any
 """What a caller may pass for an array: an array of any library, nested sequences, a number. It is `Any`
 because the value is checked at run time, with an error that names the argument."""
-
-
-def is_traced(*values: Any) -> bool:
-    """Whether any of the values is a tracer."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def described(value: Any) -> str:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
-from .checks import described, integer, is_traced
+from ..xla.platform import is_traced
+from .checks import described, integer
 from .vec3 import Vec3
 
 

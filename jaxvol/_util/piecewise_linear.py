@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .platform import on_gpu
+from ..xla.platform import on_gpu
+from ..xla.xla import gather
 from .vec3 import Scalar, Vec3
-from .xla import gather
 
 
 FEW = 16

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .checks import Arrayable, described, finite, is_traced, require
+from ..xla.platform import is_traced
+from .checks import Arrayable, described, finite, require
 from .files import MOST_VOXELS
 
 

@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Vec3
 from ..engine.batch import CellRange
 from ..engine.rays import vmap_rays
-from ..march import RUN, March
+from ..march.march import RUN, March
 from ..reference import Progress
-from ..space import Ray, Straight, slab_interval
+from ..scene.space import Ray, Straight, slab_interval
 from .grid import BrickGrid
 
 

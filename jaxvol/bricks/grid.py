@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from .._util.vec3 import Vec3, apart
-from ..camera import Camera, axes_of
-from ..space import Space, Straight
+from ..scene.camera import Camera, axes_of
+from ..scene.space import Space, Straight
 
 
 Node = tuple[int, int, int]

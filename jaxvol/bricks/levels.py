@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..camera import Camera, axes_of
+from ..scene.camera import Camera, axes_of
 from .sources import VoxelSource
 
 

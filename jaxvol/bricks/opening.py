@@ -13,8 +13,8 @@ from .._util.files import Header, check_size, decoding, file_size
 from .._util.named_axes import along_xyz, is_named
 from .._util.npy import npy_header
 from .._util.voxels import check_shape
-from ..formats.raw import raw_header
-from ..volume import Volume
+from ..io.formats.raw import raw_header
+from ..scene.volume import Volume
 from .ome_zarr import levels_in
 from .sources import Triple, VoxelSource, triple
 from .zarr import is_zarr_array, zarr_array

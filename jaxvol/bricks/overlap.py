@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from ..transforms import ToroidalMap
+from ..march.transforms import ToroidalMap
 from .grid import BrickGrid, Node
 
 

@@ -20,16 +20,16 @@ from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Int, Shaped
 
 from .._util.axes import permuted
-from .._util.trees import PyTree
-from .._util.xla import compiled
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.batch import CellRange
 from ..engine.devices import AXIS, DEALT, WHOLE
 from ..engine.image import RenderOptions
 from ..engine.parts import Underway, arrive, joined, march_part, set_out
 from ..engine.scene import Scene
-from ..rendering import Rendering
-from ..volume import part_of, with_voxels
+from ..scene.rendering import Rendering
+from ..scene.volume import part_of, with_voxels
+from ..xla.trees import PyTree
+from ..xla.xla import compiled
 from .cells import behind_straight, of_straight
 from .grid import BrickGrid, Node
 from .stream import Stream

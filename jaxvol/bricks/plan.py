@@ -8,17 +8,17 @@ import jax
 import numpy as np
 
 from .._util.checks import Arrayable
-from ..camera import Camera
-from ..compositing import Compositing
+from ..compositing.compositing import Compositing
+from ..compositing.modes import Mode
 from ..lighting.shading import Lighting
-from ..march import March
-from ..modes import Mode
+from ..march.march import March
+from ..march.transforms import AlphaCorrection, SpaceLeaping
 from ..planning import Part, Plan, plan as plan_in_memory
 from ..render import render
-from ..rendering import Rendering
-from ..transfer import Transfer
-from ..transforms import AlphaCorrection, SpaceLeaping
-from ..volume import Volume
+from ..scene.camera import Camera
+from ..scene.rendering import Rendering
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
 from .opening import OF_RAW, OF_ZARR, Openable, levels_of
 from .render import bricks_of, budget, render_bricks
 from .sources import VoxelSource

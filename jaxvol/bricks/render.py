@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from .._util.checks import Arrayable, described, integer, is_traced, shortened
+from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
-from .._util.trees import PyTree, strong
-from .._util.xla import compiled, forward_mode, transformations
 from ..arguments import check_arguments
-from ..camera import Camera
-from ..compositing import Compositing
+from ..compositing.compositing import Compositing
+from ..compositing.modes import Mode, compositing_of
+from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.batch import CellRange
 from ..engine.devices import Devices, check_not_sharded, mesh_of, number_of, on_all
@@ -28,15 +27,17 @@ from ..engine.parts_gradient import Pulled, end_pull, pull_part, start_pull
 from ..engine.resolve import resolve_image
 from ..engine.scene import Scene
 from ..engine.tiling import Tiling
-from ..labels import LabelTransferFunction
 from ..lighting.shading import Lighting
-from ..march import March
-from ..modes import Mode, compositing_of
-from ..rendering import Details, Rendering
-from ..selection import Selection
-from ..transfer import Transfer
-from ..transforms import SpaceLeaping, ToroidalMap
-from ..volume import Volume, part_of
+from ..march.march import March
+from ..march.transforms import SpaceLeaping, ToroidalMap
+from ..scene.camera import Camera
+from ..scene.labels import LabelTransferFunction
+from ..scene.rendering import Details, Rendering
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume, part_of
+from ..xla.platform import is_traced
+from ..xla.trees import PyTree, strong
+from ..xla.xla import compiled, forward_mode, transformations
 from .grid import is_straight
 from .levels import level_for
 from .opening import OF_RAW, OF_ZARR, levels_of

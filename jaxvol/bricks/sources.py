@@ -13,9 +13,10 @@ import jax
 import numpy as np
 
 from .._util.axes import XYZ, Axes, permuted
-from .._util.checks import Arrayable, described, finite_array, integer, is_traced
+from .._util.checks import Arrayable, described, finite_array, integer
 from .._util.voxels import check_shape
-from ..volume import Volume
+from ..scene.volume import Volume
+from ..xla.platform import is_traced
 from .dtypes import Box, converted, voxel_type
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from .._util.checks import integer
 from .._util.files import MOST_VOXELS
 from ..engine.scene import Scene
-from ..march import RUN, March
-from ..occupancy import BLOCK
-from ..space import Space
-from ..transforms import ToroidalMap
-from ..transforms.adaptive_sampling import FARTHEST
+from ..march.march import RUN, March
+from ..march.transforms import ToroidalMap
+from ..march.transforms.adaptive_sampling import FARTHEST
+from ..scene.occupancy import BLOCK
+from ..scene.space import Space
 from .cells import reach
 from .grid import BrickGrid, Node, is_straight
 from .overlap import most

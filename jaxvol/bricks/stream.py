@@ -14,19 +14,19 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
 from .._util.memory import give_back
-from .._util.xla import compiled
-from ..camera import Camera
 from ..engine import devices
 from ..engine.batch import CellRange
 from ..engine.image import RenderOptions
 from ..engine.scene import Scene
-from ..march import March
-from ..occupancy import BLOCK
+from ..march.march import March
+from ..march.transforms import ToroidalMap
 from ..reference import Progress
-from ..rendering import BrickReport
-from ..space import Ray, Space
-from ..transforms import ToroidalMap
-from ..volume import Volume, part_of, with_voxels
+from ..scene.camera import Camera
+from ..scene.occupancy import BLOCK
+from ..scene.rendering import BrickReport
+from ..scene.space import Ray, Space
+from ..scene.volume import Volume, part_of, with_voxels
+from ..xla.xla import compiled
 from .cells import Found, Turn, of_curved, of_straight, widened
 from .choice import cheapest, counts as counted, visible
 from .dtypes import range_of

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import integer
 from .._util.memory import give_back
-from ..occupancy import BLOCK, Blocks, widened
+from ..scene.occupancy import BLOCK, Blocks, widened
 from .dtypes import Box, is_half
 from .sources import Corner, VoxelSource
 

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
 from .._util.checks import check_answer
+from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
-from ..march import EmptySpaceIndex, March, View
-from ..occupancy import Blocks
+from ..march.march import EmptySpaceIndex, March, View
 from ..reference import Pipeline, end
-from ..selection import FirstVisible
-from ..transfer import Transfer, classification_of
-from ..variation import Windows
-from ..volume import Volume
+from ..scene.occupancy import Blocks
+from ..scene.transfer import Transfer, classification_of
+from ..scene.variation import Windows
+from ..scene.volume import Volume
 from .batch import Beams
 from .packing import slopes_of, with_words, words_of
 from .rays import OwnRays, RayTiles, lines, vmap_rays

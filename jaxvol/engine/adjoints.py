@@ -11,12 +11,12 @@ import equinox as eqx
 import jax
 from jaxtyping import Array
 
-from .._util.checks import is_traced
-from .._util.xla import compiled, forward_mode, forward_only, recomputed, transformations
-from ..march import March
+from ..march.march import March
 from ..reference import steps_across
-from ..rendering import Rendering
-from ..volume import Volume
+from ..scene.rendering import Rendering
+from ..scene.volume import Volume
+from ..xla.platform import is_traced
+from ..xla.xla import compiled, forward_mode, forward_only, recomputed, transformations
 from .acceleration import VolumeAcceleration
 from .gradients import render_vjp
 from .image import RenderOptions, march_image, scan_image

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.sharding import varying
-from .._util.trees import PyTree
-from .._util.xla import gather, in_memory
-from ..beams import Box
-from ..march import EmptySpaceIndex, March
-from ..occupancy import Occupancy
+from ..march.beams import Box
+from ..march.march import EmptySpaceIndex, March
 from ..reference import Pipeline, Progress, front, move, with_stride
-from ..space import Ray
+from ..scene.occupancy import Occupancy
+from ..scene.space import Ray
+from ..xla.sharding import varying
+from ..xla.trees import PyTree
+from ..xla.xla import gather, in_memory
 from .segment import Samples, SampleVisitor, always, begins, march_segment, regular_from_here
 from .tiling import Tiling
 

@@ -17,10 +17,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
-from .._util.checks import described, is_traced
-from .._util.memo import memoized
-from .._util.sharding import varies_over
-from .._util.trees import PyTree
+from .._util.checks import described
+from ..xla.memo import memoized
+from ..xla.platform import is_traced
+from ..xla.sharding import varies_over
+from ..xla.trees import PyTree
 
 
 P = ParamSpec("P")

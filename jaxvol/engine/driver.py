@@ -5,11 +5,11 @@ from typing import Any, Literal, get_args
 
 import jax
 
-from .._util.sharding import varying
-from .._util.trees import strong
+from ..compositing.selection import Selection
 from ..reference import resolves
-from ..rendering import Rendering
-from ..selection import Selection
+from ..scene.rendering import Rendering
+from ..xla.sharding import varying
+from ..xla.trees import strong
 from .acceleration import VolumeAcceleration
 from .adjoints import AbstractAdjoint, Adjoint, adjoint_of
 from .devices import check_not_sharded, mesh_of, on_all

@@ -12,15 +12,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.sharding import varying
-from .._util.trees import PyTree, added, floats, zeros_of
-from .._util.voxel_fetch import Fetch
 from ..lighting.shading import Shader, Surroundings
-from ..march import EmptySpaceIndex
+from ..march.march import EmptySpaceIndex
 from ..reference import Pipeline
-from ..rendering import Rendering
-from ..space import Ray
-from ..volume import Volume, with_voxels, without_voxels
+from ..scene.rendering import Rendering
+from ..scene.space import Ray
+from ..scene.volume import Volume, with_voxels, without_voxels
+from ..scene.voxel_fetch import Fetch
+from ..xla.sharding import varying
+from ..xla.trees import PyTree, added, floats, zeros_of
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange
 from .devices import on_devices

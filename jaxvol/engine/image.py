@@ -8,12 +8,12 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, Int
 
-from .._util.sharding import varying
-from ..compositing import Outputs
+from ..compositing.compositing import Outputs
 from ..lighting.shading import lit_classification
 from ..reference import Pipeline, begin, end, has_fault, step
-from ..rendering import Rendering
-from ..space import Ray, Space
+from ..scene.rendering import Rendering
+from ..scene.space import Ray, Space
+from ..xla.sharding import varying
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, VisibleRangeRecorder
 from .devices import on_devices

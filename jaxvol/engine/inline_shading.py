@@ -12,15 +12,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.trees import PyTree
 from .._util.vec3 import Vec3, along
-from .._util.xla import in_memory
+from ..compositing.selection import Selection
 from ..lighting.shading import Sample, Shader
-from ..march import Cell
+from ..march.march import Cell
 from ..reference import Pipeline
-from ..selection import Selection
-from ..space import Ray
-from ..volume import with_fetch
+from ..scene.space import Ray
+from ..scene.volume import with_fetch
+from ..xla.trees import PyTree
+from ..xla.xla import in_memory
 
 
 def inline_shader(pipeline: Pipeline) -> Shader | None:

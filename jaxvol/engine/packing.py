@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Shaped, UInt32
 
-from .._util.checks import is_traced
-from .._util.memo import memoized
-from .._util.voxel_fetch import SLOPE_BITS, Packed
-from ..volume import Volume, read_as
+from ..scene.volume import Volume, read_as
+from ..scene.voxel_fetch import SLOPE_BITS, Packed
+from ..xla.memo import memoized
+from ..xla.platform import is_traced
 
 
 LIMIT = 2**30

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..march import March
+from ..march.march import March
 from ..reference import Pipeline, Progress, begin, end, front, stopped
-from ..rendering import Rendering
-from ..space import Ray
+from ..scene.rendering import Rendering
+from ..scene.space import Ray
 from .acceleration import VolumeAcceleration, empty_space_of
 from .batch import Beams, CellRange, with_fields
 from .devices import on_devices

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Int
 
-from .._util.trees import PyTree
 from ..reference import begin
-from ..rendering import Rendering
+from ..scene.rendering import Rendering
+from ..xla.trees import PyTree
 from .acceleration import VolumeAcceleration
 from .batch import CellRange, with_fields
 from .devices import on_devices

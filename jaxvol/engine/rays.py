@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
-from .._util.trees import PyTree, added
-from .._util.xla import in_memory
-from ..beams import Box
-from ..camera import Camera
-from ..occupancy import Occupancy
-from ..space import Line, Ray, Space, enter
+from ..march.beams import Box
+from ..scene.camera import Camera
+from ..scene.occupancy import Occupancy
+from ..scene.space import Line, Ray, Space, enter
+from ..xla.trees import PyTree, added
+from ..xla.xla import in_memory
 from . import devices
 from .tiling import Tiling
 

@@ -27,16 +27,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.trees import PyTree, added, floats, zeros_of
 from .._util.vec3 import Scalar, Vec3, along
-from .._util.voxel_fetch import Cube, Fetch, Recording, cubes_of_zeros, scatter_add
-from ..compositing import Weighting
+from ..compositing.compositing import Weighting
 from ..lighting.shading import Shader
 from ..reference import Pipeline, Progress, measure, pieces
-from ..rendering import Rendering
-from ..space import Ray
-from ..transfer import Transfer, classification_of
-from ..volume import Volume, with_fetch, with_voxels, without_voxels
+from ..scene.rendering import Rendering
+from ..scene.space import Ray
+from ..scene.transfer import Transfer, classification_of
+from ..scene.volume import Volume, with_fetch, with_voxels, without_voxels
+from ..scene.voxel_fetch import Cube, Fetch, Recording, cubes_of_zeros, scatter_add
+from ..xla.trees import PyTree, added, floats, zeros_of
 from .inline_shading import lit_colors
 from .scene import Scene
 from .segment import Samples, SampleVisitor, vmap_cells

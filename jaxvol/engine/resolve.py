@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.compaction import in_front, in_place
-from .._util.trees import PyTree
 from .._util.vec3 import Scalar
+from ..compositing.selection import Selection
 from ..reference import resolve
-from ..selection import Selection
-from ..space import Line
+from ..scene.space import Line
+from ..xla.compaction import in_front, in_place
+from ..xla.trees import PyTree
 from . import devices
 from .acceleration import VolumeAcceleration
 from .devices import on_devices

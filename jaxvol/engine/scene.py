@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
-from ..camera import Camera
-from ..compositing import Compositing, Over
+from ..compositing.compositing import Compositing, Over
 from ..lighting.shading import Lighting
-from ..march import March
-from ..transfer import Transfer
-from ..volume import Volume
+from ..march.march import March
+from ..scene.camera import Camera
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
 from .rays import OwnRays
 
 

@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
-from .._util.xla import in_memory
-from ..march import RUN, Cell, March
+from ..compositing.selection import Selection
+from ..march.march import RUN, Cell, March
 from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
-from ..selection import Selection
-from ..space import Ray
-from ..transfer import Classification, Measured
+from ..scene.space import Ray
+from ..scene.transfer import Classification, Measured
+from ..xla.trees import PyTree
+from ..xla.xla import in_memory
 from .inline_shading import inline_shader, light_terms, lit_colors
 from .tiling import Tiling
 from .visible_samples import shaded_colors

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._util.sharding import varying
-from .._util.trees import PyTree, added
 from .._util.vec3 import Scalar, Vec3
-from .._util.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
 from ..reference import Pipeline
-from ..space import Ray
-from ..volume import read_as
+from ..scene.space import Ray
+from ..scene.volume import read_as
+from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from ..xla.sharding import varying
+from ..xla.trees import PyTree, added
 from .segment import Samples
 from .visible_samples import Weights, samples_of, visible
 

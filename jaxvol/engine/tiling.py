@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from jax.sharding import Mesh
 
-from .._util.compaction import CHUNK
-from .._util.platform import on_gpu
+from ..xla.compaction import CHUNK
+from ..xla.platform import on_gpu
 
 
 class Tiling(NamedTuple):

@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.compaction import Chosen
 from .._util.vec3 import Scalar, Vec3, along
-from ..compositing import Composite, Weighting
+from ..compositing.compositing import Composite, Weighting
 from ..lighting.shading import Sample, Shader
-from ..march import Cell
+from ..march.march import Cell
 from ..reference import Pipeline, Progress, stopped
-from ..space import Ray
-from ..transfer import Measured
+from ..scene.space import Ray
+from ..scene.transfer import Measured
+from ..xla.compaction import Chosen
 
 
 class Weights(NamedTuple):

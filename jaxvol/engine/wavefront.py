@@ -19,22 +19,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.compaction import in_front
-from .._util.sharding import varying
-from ..compositing import Outputs, Weighting
-from ..march import EmptySpaceIndex
-from ..reference import (
-    Pipeline,
-    Progress,
-    begin,
-    is_sample,
-    measure,
-    move,
-    opacity,
-    pieces,
-    with_stride,
-)
-from ..space import Ray
+from ..compositing.compositing import Outputs, Weighting
+from ..march.march import EmptySpaceIndex
+from ..reference import Pipeline, Progress, begin, is_sample, measure, move, opacity, pieces, with_stride
+from ..scene.space import Ray
+from ..xla.compaction import in_front
+from ..xla.sharding import varying
 from .batch import Beams, Job, State, finished_after, march_batch, over_transparent, with_fields
 from .rays import vmap_rays
 from .segment import SampleVisitor

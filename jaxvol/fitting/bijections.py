@@ -18,7 +18,7 @@ from jax.scipy.special import logit
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, number, require
-from ..camera import Camera, axes_of
+from ..scene.camera import Camera, axes_of
 
 
 MARGIN = 1e-3

@@ -8,9 +8,9 @@ import equinox as eqx
 import numpy as np
 
 from .._util.checks import described, integer
-from .._util.trees import PyTree
 from ..lighting import Material
-from ..transfer import TransferFunction
+from ..scene.transfer import TransferFunction
+from ..xla.trees import PyTree
 from .constraints import Where
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from .._util.checks import described, integer, number, require
-from .._util.trees import PyTree
+from ..xla.trees import PyTree
 from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, Outcome, fit

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .._util.checks import Arrayable, described
-from .._util.trees import PyTree
+from ..xla.trees import PyTree
 from .driver import Fit, fit
 from .residuals import ImageResidual
 

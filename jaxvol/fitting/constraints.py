@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.trees import PyTree
-from ..camera import Camera
-from ..labels import LabelTransferFunction
 from ..lighting import Material
-from ..march import March
-from ..transfer import TransferFunction
-from ..transfer2d import TransferFunction2D
-from ..transforms import ToroidalMap
-from ..volume import Volume
+from ..march.march import March
+from ..march.transforms import ToroidalMap
+from ..scene.camera import Camera
+from ..scene.labels import LabelTransferFunction
+from ..scene.transfer import TransferFunction
+from ..scene.transfer2d import TransferFunction2D
+from ..scene.volume import Volume
+from ..xla.trees import PyTree
 from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInterval
 from .probe_geometry import ProbeGeometry
 

@@ -15,7 +15,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._util.trees import PyTree
+from ..xla.trees import PyTree
 
 
 FLOOR = 0.1

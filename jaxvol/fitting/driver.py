@@ -19,7 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .._util.checks import integer, output_file
-from .._util.trees import PyTree
+from ..xla.trees import PyTree
 from . import checkpoints
 from .constraints import Free, FreeVariables, Where
 from .damping import LevenbergMarquardt

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._util.checks import described
+from .._util.srgb import from_srgb
 from .._util.whole_files import whole_file
-from ..camera import Camera
-from ..display import from_srgb
-from ..transfer import TransferFunction
+from ..scene.camera import Camera
+from ..scene.transfer import TransferFunction
 
 
 CAMERA = ("position", "focal_point", "view_up", "view_angle", "parallel_scale", "window")

@@ -19,8 +19,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from .._util.trees import PyTree
-from ..camera import Camera
+from ..scene.camera import Camera
+from ..xla.trees import PyTree
 from .residuals import ImageResidual, OwnResidual, Residual, Tiles, check_residual
 
 

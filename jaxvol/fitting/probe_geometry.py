@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._util.checks import described, require
-from ..transforms import ToroidalMap
+from ..march.transforms import ToroidalMap
 from .bijections import MARGIN, Bijection, Positive
 
 

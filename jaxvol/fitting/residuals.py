@@ -23,15 +23,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._util.checks import Arrayable, described, finite, finite_array, require
-from .._util.trees import PyTree
-from ..camera import Camera, rows_of
-from ..compositing import Compositing
+from ..compositing.compositing import Compositing
+from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
-from ..march import March
-from ..modes import Mode, compositing_of
+from ..march.march import March
 from ..render import Adjoint, render
-from ..transfer import Transfer
-from ..volume import Volume
+from ..scene.camera import Camera, rows_of
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
+from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
 
 

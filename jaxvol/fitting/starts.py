@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._util.checks import Arrayable, finite_array, integer, require
-from ..transfer import TransferFunction
-from ..volume import Volume
+from ..scene.transfer import TransferFunction
+from ..scene.volume import Volume
 
 
 def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = None) -> TransferFunction:

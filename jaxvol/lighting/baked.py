@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from .._util.compaction import Chosen
 from .._util.memory import require_room
 from .._util.vec3 import Vec3
-from .._util.voxel_fetch import corners
-from .._util.xla import gather
-from ..volume import Volume
+from ..scene.volume import Volume
+from ..scene.voxel_fetch import corners
+from ..xla.compaction import Chosen
+from ..xla.xla import gather
 from .shading import Lighting, Sample, Shader, Shading, Surroundings
 
 

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._util.vec3 import Scalar, along
-from ..march import March
-from ..space import Line, Space
-from ..transfer import Classification, Transfer
-from ..volume import Volume
+from ..march.march import March
+from ..scene.space import Line, Space
+from ..scene.transfer import Classification, Transfer
+from ..scene.volume import Volume
 from .shading import Lighting, Sample, Shading, Simpler, Surroundings
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, integer, number, require, unit_interval
 from .._util.vec3 import Scalar, Vec3
-from ..volume import Volume
+from ..scene.volume import Volume
 
 
 class Optics(NamedTuple):

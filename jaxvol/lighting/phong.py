@@ -8,7 +8,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._util.checks import Arrayable, finite_array, require
 from .._util.vec3 import Vec3, apart, dot, plus, scaled, times
-from ..space import world_gradient
+from ..scene.space import world_gradient
 from .lights import HeadLight, Light, LocatedLight, lights_of
 from .shading import Lighting, Sample, Shading, Surroundings
 

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int
 
 from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along, scaled
-from .._util.xla import gather
-from ..transfer import Measured
+from ..scene.transfer import Measured
+from ..xla.xla import gather
 from .lights import ConstantLight, Light, LocatedLight
 from .materials import Material, Optics, shares, smoothstep, step
 from .shading import Sample, Shading, Surroundings

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import flag, integer, is_flag, is_traced, number
-from .._util.memo import memoized
-from .._util.xla import computed_now
-from ..march import March, Transform
-from ..transfer import Transfer
-from ..volume import Volume, without_voxels
+from .._util.checks import flag, integer, is_flag, number
+from ..march.march import March, Transform
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume, without_voxels
+from ..xla.memo import memoized
+from ..xla.platform import is_traced
+from ..xla.xla import computed_now
 from .baked import BakedLighting, bake, nodes_for
 from .deferred import Deferred
 from .growth import scatterer_templates

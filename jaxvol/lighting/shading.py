@@ -16,15 +16,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.sharding import varying
-from .._util.trees import PyTree
 from .._util.vec3 import Scalar, Vec3
-from .._util.voxel_fetch import OneByOne
-from .._util.xla import in_memory
-from ..march import March
-from ..space import Line, Space
-from ..transfer import Classification, Measured, Transfer, classification_of
-from ..volume import Volume, read_as, with_fetch, with_voxels, without_voxels
+from ..march.march import March
+from ..scene.space import Line, Space
+from ..scene.transfer import Classification, Measured, Transfer, classification_of
+from ..scene.volume import Volume, read_as, with_fetch, with_voxels, without_voxels
+from ..scene.voxel_fetch import OneByOne
+from ..xla.sharding import varying
+from ..xla.trees import PyTree
+from ..xla.xla import in_memory
 
 
 T = TypeVar("T")

@@ -6,7 +6,8 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from .._util.checks import integer, is_traced, number
+from .._util.checks import integer, number
+from ..xla.platform import is_traced
 from .materials import Material, Optics
 
 

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from .._util.xla import gather
 from ..lighting.materials import Material
-from ..occupancy import BLOCK, Blocks
-from ..space import Affine
-from ..transfer import Transfer
-from ..volume import Volume
+from ..scene.occupancy import BLOCK, Blocks
+from ..scene.space import Affine
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
+from ..xla.xla import gather
 
 
 Block: TypeAlias = Int[Array, "..."]

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.materials import Material, shares
-from ..transfer import Measured, Transfer
-from ..volume import Volume
+from ..scene.transfer import Measured, Transfer
+from ..scene.volume import Volume
 
 
 class Medium(NamedTuple):

@@ -13,20 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32
 
-from .._util.checks import Arrayable, all_finite, described, flag, integer, is_traced, number
+from .._util.checks import Arrayable, all_finite, described, flag, integer, number
 from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
-from .._util.xla import compiled
 from ..arguments import check_arguments
-from ..camera import Camera
 from ..engine.packing import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
-from ..occupancy import Blocks
-from ..space import Affine, enter
-from ..transfer import Transfer
-from ..volume import Volume, without_voxels
+from ..scene.camera import Camera
+from ..scene.occupancy import Blocks
+from ..scene.space import Affine, enter
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume, without_voxels
+from ..xla.platform import is_traced
+from ..xla.xla import compiled
 from .lanes import PathResults, walk_all
 from .majorants import Majorants
 from .medium import Medium

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._util.vec3 import Scalar, Vec3, along
-from ..occupancy import BLOCK
+from ..scene.occupancy import BLOCK
 from .majorants import Block, Majorants
 
 

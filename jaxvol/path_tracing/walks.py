@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.noise import hashed_uniforms_4
 from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, select, times
-from .._util.xla import in_memory
 from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
-from ..space import Affine
-from ..volume import Volume
+from ..scene.space import Affine
+from ..scene.volume import Volume
+from ..xla.xla import in_memory
 from .majorants import Majorants
 from .medium import Medium
 from .phase import phase, sample_phase, scattered

@@ -8,19 +8,20 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from .._util.checks import described, flag, integer, is_traced
+from .._util.checks import described, flag, integer
 from ..arguments import check_arguments
-from ..camera import Camera
-from ..compositing import Compositing, Over
+from ..compositing.compositing import Compositing, Over
+from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
-from ..march import March, Transform
-from ..modes import Mode, compositing_of
-from ..occupancy import Blocks
-from ..rendering import Rendering
-from ..space import Space, median_node_distance
-from ..transfer import Transfer
-from ..transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
-from ..volume import Volume
+from ..march.march import March, Transform
+from ..march.transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
+from ..scene.camera import Camera
+from ..scene.occupancy import Blocks
+from ..scene.rendering import Rendering
+from ..scene.space import Space, median_node_distance
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
+from ..xla.platform import is_traced
 from .probe import Probe, Setting, Truth
 from .storage import stored
 from .trials import COARSEST, RAY, Trial, Trials

@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import along
-from ..camera import Camera
-from ..compositing import Compositing
+from ..compositing.compositing import Compositing
 from ..engine.driver import render_scene
 from ..engine.rays import OwnRays
 from ..engine.scene import Scene
 from ..lighting.shading import Lighting
-from ..march import March
-from ..occupancy import BLOCK
-from ..rendering import Rendering
-from ..space import Space
-from ..transfer import Transfer
-from ..volume import Volume
+from ..march.march import March
+from ..scene.camera import Camera
+from ..scene.occupancy import BLOCK
+from ..scene.rendering import Rendering
+from ..scene.space import Space
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
 
 
 SIDE = 8

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 
-from ..march import March
+from ..march.march import March
 from .probe import Probe, Setting
 
 

@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..compositing import Over
-from ..march import March, Quadrature, Transform
-from ..rendering import Rendering
-from ..transfer import Transfer
-from ..transforms import AdaptiveSampling
-from ..variation import Windows
+from ..compositing.compositing import Over
+from ..march.march import March, Quadrature, Transform
+from ..march.transforms import AdaptiveSampling
+from ..scene.rendering import Rendering
+from ..scene.transfer import Transfer
+from ..scene.variation import Windows
 from .probe import Probe, Setting, Truth
 
 

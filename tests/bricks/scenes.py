@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxvol as jv
 from jaxvol._util.vec3 import along
-from jaxvol.space import Affine, Path as RayPath, Space, slab_interval
+from jaxvol.scene.space import Affine, Path as RayPath, Space, slab_interval
 
 from ..scenes import SIZE
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol._util import platform
 from jaxvol.engine.driver import render_scene
 from jaxvol.engine.scene import Scene
 from jaxvol.engine.tiling import GPU, Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
+from jaxvol.xla import platform
 
 from ..round_trips import counted
 from ..scenes import slow

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.occupancy import Blocks
+from jaxvol.scene.occupancy import Blocks
 
 from ..scenes import around, soft_transfer
 from ..test_agreement import oracle_image

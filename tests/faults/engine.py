@@ -40,17 +40,17 @@ def later(visit):
     return visited
 
 
-MARCH = "test_march.py::"
+MARCH = "march/test_march.py::"
 FAULTS: list[Fault] = [
     Fault(
         "quadrature: midpoint samples at the front of cells",
-        "march:March.sample",
+        "march.march:March.sample",
         lambda _: lambda self, cell: cell.front,
         (f"{MARCH}test_midpoint_samples_only_inside",),
     ),
     Fault(
         "start: offsets of transforms are ignored",
-        "march:March.start",
+        "march.march:March.start",
         lambda _: lambda self, ray: jnp.zeros_like(ray.length),
         (f"{MARCH}test_cells_reach_past_the_exit_unless_they_are_cut_there",),
     ),
@@ -71,57 +71,61 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "stop: rays end while their transmittance is high",
-        "transforms.early_termination:EarlyTermination.stop",
+        "march.transforms.early_termination:EarlyTermination.stop",
         lambda _: lambda self, stopped, transmittance: stopped | (transmittance >= self.opacity_left),
         (f"{MARCH}test_early_termination_stops_where_little_is_left",),
     ),
     Fault(
         "stride: what lies in front does not count",
-        "march:March.strides",
+        "march.march:March.strides",
         lambda f: lambda self, *to: f(self, *to[:4], jnp.ones_like(to[4]), *to[5:]),
-        ("transforms/test_adaptive_sampling.py::test_runs_are_the_same_however_a_ray_comes_to_them",),
+        ("march/transforms/test_adaptive_sampling.py::test_runs_are_the_same_however_a_ray_comes_to_them",),
     ),
     Fault(
         "adaptive sampling: looked up where a run begins, not in its middle",
-        "march:Run.middle",
+        "march.march:Run.middle",
         lambda _: property(lambda run: run.front),
-        ("transforms/test_adaptive_sampling.py::test_the_error_of_a_run_is_that_of_a_window_that_holds_it",),
+        (
+            "march/transforms/test_adaptive_sampling.py::test_the_error_of_a_run_is_that_of_a_window_that_holds_it",
+        ),
     ),
     Fault(
         "cut: the last cell reaches past the exit",
-        "transforms.alpha_correction:AlphaCorrection.cut",
+        "march.transforms.alpha_correction:AlphaCorrection.cut",
         lambda _: lambda self, cell, ray, volume: (cell,),
-        ("transforms/test_alpha_correction.py::test_a_cell_is_cut_at_the_exit",),
+        ("march/transforms/test_alpha_correction.py::test_a_cell_is_cut_at_the_exit",),
     ),
     Fault(
         "cut: a cell that ends at the exit does not move with it",
-        "transforms.alpha_correction:AlphaCorrection.cut",
+        "march.transforms.alpha_correction:AlphaCorrection.cut",
         whole_at_the_exit,
-        ("transforms/test_alpha_correction.py::test_the_gradient_by_an_exit_at_the_end_of_a_cell",),
+        ("march/transforms/test_alpha_correction.py::test_the_gradient_by_an_exit_at_the_end_of_a_cell",),
     ),
     Fault(
         "jitter: pixels of a row have the same number",
-        "transforms.jitter:Noise.__call__",
+        "march.transforms.jitter:Noise.__call__",
         lambda f: lambda self, pixel, dtype: f(self, (0 * pixel[0], pixel[1]), dtype),
-        ("transforms/test_jitter.py::test_numbers_are_uniform_and_depend_on_seed_stream_and_pixel_alone",),
+        (
+            "march/transforms/test_jitter.py::test_numbers_are_uniform_and_depend_on_seed_stream_and_pixel_alone",
+        ),
     ),
     Fault(
         "clip: cells whose middle is cut away are taken as empty",
-        "transforms.clip:HalfSpace.over",
+        "march.transforms.clip:HalfSpace.over",
         lambda f: lambda self, grid: (f(self, grid)[0], 0 * f(self, grid)[1]),
-        ("transforms/test_clip.py::test_no_cell_that_holds_anything_seen_is_taken_as_empty",),
+        ("march/transforms/test_clip.py::test_no_cell_that_holds_anything_seen_is_taken_as_empty",),
     ),
     Fault(
         "NaN: a parameter that is NaN gives a finite image",
         "engine.image:fault_of",
         lambda _: lambda scene: jnp.zeros((), bool),
-        ("transforms/test_clip.py::test_nan_in_a_plane_shows",),
+        ("march/transforms/test_clip.py::test_nan_in_a_plane_shows",),
     ),
     Fault(
         "leap: a voxel too far",
         "engine.batch:_leap",
         lambda f: lambda *given: f(*given) + 4,
-        ("transforms/test_space_leaping.py::test_no_ray_misses_what_is_seen",),
+        ("march/transforms/test_space_leaping.py::test_no_ray_misses_what_is_seen",),
     ),
     Fault(
         "leap: the second march begins four cells too late",
@@ -131,7 +135,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "vmap: the batch in reverse order",
-        "_util.xla:_batch",
+        "xla.xla:_batch",
         lambda f: lambda *given: jax.tree.map(lambda leaf: leaf[::-1], f(*given)),
         ("engine/test_gradients.py::test_vmap_is_a_loop_for_image_and_gradient",),
     ),

@@ -40,7 +40,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "probe geometry: samples lie behind the motor axis",
-        "transforms.toroidal_map:ToroidalMap.nearest_to_axis",
+        "march.transforms.toroidal_map:ToroidalMap.nearest_to_axis",
         lambda nearest: property(lambda self: nearest.fget(self) + self.b),
         ("fitting/test_probe_geometry.py::test_every_free_number_is_a_valid_probe_with_a_finite_slope",),
     ),
@@ -70,15 +70,15 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "plan: faces that a clip cuts are not looked at",
-        "transforms.clip:_Clipped.visible_at_faces",
+        "march.transforms.clip:_Clipped.visible_at_faces",
         lambda faces: lambda self, visible: faces(self, visible)[:6],
         ("planning/test_plan.py::test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible",),
     ),
     Fault(
         "scan conversion: the grid begins at the middle of the sector",
-        "scan_conversion:_grid",
+        "io.scan_conversion:_grid",
         lambda grid: lambda probe, *how: (grid(probe, *how)[0], probe.center),
-        ("test_scan_conversion.py::test_the_grid_encloses_the_sector_and_is_centred_on_it",),
+        ("io/test_scan_conversion.py::test_the_grid_encloses_the_sector_and_is_centred_on_it",),
     ),
     Fault(
         "wood grain: what noise has by chance counts",

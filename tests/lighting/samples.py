@@ -10,7 +10,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.lighting.shading import Sample, Shader, Surroundings
-from jaxvol.space import Affine
+from jaxvol.scene.space import Affine
 
 
 def surroundings(volume, transfer):

@@ -16,7 +16,7 @@ from jaxvol.engine.acceleration import VolumeAcceleration
 from jaxvol.engine.packing import slopes_of, with_words, words_of
 from jaxvol.lighting import Deferred, DirectionalLight, HeadLight, Phong, PointLight
 from jaxvol.lighting.shading import shade_sample
-from jaxvol.space import Affine, world_gradient
+from jaxvol.scene.space import Affine, world_gradient
 
 from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, slow
 from .samples import check_gradient, image_of_reference, in_double, sample_at, surroundings

@@ -11,10 +11,10 @@ from jaxvol._util.noise import hashed_uniforms_4
 from jaxvol._util.piecewise_linear import upper_bound_between
 from jaxvol._util.vec3 import apart
 from jaxvol.lighting import Material
-from jaxvol.occupancy import Blocks
 from jaxvol.path_tracing.majorants import Majorants
 from jaxvol.path_tracing.medium import Medium
 from jaxvol.path_tracing.tracking import Flight, fly
+from jaxvol.scene.occupancy import Blocks
 
 from ..scenes import anisotropic_noise
 

@@ -10,10 +10,10 @@ import pytest
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
 from jaxvol.metrics import rmse
-from jaxvol.occupancy import Blocks
 from jaxvol.planning import trials
 from jaxvol.planning.plan import _checked, _proven
-from jaxvol.space import Affine
+from jaxvol.scene.occupancy import Blocks
+from jaxvol.scene.space import Affine
 
 from ..scenes import scaled_phantom, slow, soft_transfer, uniform_transfer
 

@@ -6,7 +6,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.planning.probe import PATCHES, SIDE, Probe, Truth
-from jaxvol.space import Affine
+from jaxvol.scene.space import Affine
 
 from ..scenes import scaled_phantom
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing import Over
+from jaxvol.compositing.compositing import Over
 from jaxvol.planning.probe import Probe, Setting
 from jaxvol.planning.storage import stored
-from jaxvol.space import Affine
+from jaxvol.scene.space import Affine
 
 from ..scenes import scaled_phantom, soft_transfer
 

@@ -13,14 +13,14 @@ import pytest
 from hypothesis import given, settings, strategies
 
 import jaxvol as jv
-from jaxvol.compositing import Over
+from jaxvol.compositing.compositing import Over
+from jaxvol.compositing.projections import Average
 from jaxvol.lighting.shading import Simpler
 from jaxvol.planning import trials
 from jaxvol.planning.plan import Part, _brightest, _lit, _marched
 from jaxvol.planning.probe import Probe, Setting
 from jaxvol.planning.trials import Trial, Trials
-from jaxvol.projections import Average
-from jaxvol.rendering import Details
+from jaxvol.scene.rendering import Details
 
 from ..scenes import scaled_phantom, soft_transfer
 

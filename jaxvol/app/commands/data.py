@@ -1,0 +1,78 @@
+"""Which options say what a volume file holds, where the file and its name do not?"""
+
+import argparse
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from ...bricks import VoxelSource, levels_of
+from ...bricks.plan import IN_MEMORY, copied
+from ...io.formats import files_of, load
+from ...scene.volume import Volume
+from ..automatic.sampling import SAMPLED
+
+
+def add_data_options(parser: argparse.ArgumentParser) -> None:
+    """Add the file and its options to a parser."""
+    parser.add_argument(
+        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
+    )
+    data = parser.add_argument_group("data", "needed if the file and its name do not specify it")
+    data.add_argument(
+        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
+    )
+    data.add_argument("--dtype", help="such as uint8 or uint16le")
+    data.add_argument(
+        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
+    )
+
+
+def volume_of(options: argparse.Namespace) -> Volume:
+    """The volume in the file."""
+    return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
+
+
+def source_of(options: argparse.Namespace) -> VoxelSource:
+    """The volume in the file, of which parts are read."""
+    given = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
+    return levels_of(options.file, **{name: value for name, value in given.items() if value is not None})[0]
+
+
+def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
+    """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, one of
+    its slices, or one of the others."""
+    slices = files_of(options.file) if options.file.is_dir() else []
+    kept = {"the volume": [options.file], "a slice of the volume": slices}
+    for name in names:
+        path = getattr(options, name)
+        if path is None:
+            continue
+        for what, others in kept.items():
+            if path.resolve() in [other.resolve() for other in others]:
+                raise ValueError(f"--{name}: {path} is {what}, which it would replace. Write another file.")
+        kept[f"what --{name} writes"] = [path]
+
+
+MIDDLE = 128
+"""Voxels along each axis, at most, that are looked at as they are."""
+
+
+def middle_of(source: VoxelSource) -> Shaped[np.ndarray, "nx ny nz"]:
+    """Voxels in the middle of a volume, data[x, y, z]."""
+    low = [max(0, (n - MIDDLE) // 2) for n in source.shape]
+    return source.read(low, [min(n, begin + MIDDLE) for n, begin in zip(source.shape, low, strict=True)])
+
+
+def copy_of(source: VoxelSource, memory: int) -> Volume:
+    """A copy of every n-th voxel, stretched to the bounds of the whole. It has those voxels by which
+    colours are chosen for the whole, if they fit into so many bytes, and fewer if not."""
+    most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
+    stride = 1
+    while math.prod(-(-n // stride) for n in source.shape) > most and min(source.shape) // (stride + 1) >= 2:
+        stride += 1
+    copy = copied(source, stride)
+    spacing = source.spacing or (1.0, 1.0, 1.0)
+    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, spacing, copy.shape, strict=True)]
+    return Volume(copy.data, whole, copy.origin)

@@ -1,0 +1,98 @@
+"""`jaxvol fit`: a transfer function that makes given images of a volume."""
+
+import argparse
+import re
+import warnings
+from pathlib import Path
+from typing import Any, get_args
+
+from ..._util.checks import output_file
+from ...fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
+from ...fitting.driver import UNDETERMINED, Solver
+from ...fitting.uncertainty import Uncertainty
+from ...march.march import March
+from .data import refuse_to_replace, volume_of
+from .frames import FAST
+from .options import add_clim, add_output, scene_options
+from .progress import working
+from .scene import background_of
+
+
+def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
+    """Add the subcommand. `commands`: what `add_subparsers` returned."""
+    parser = commands.add_parser(
+        "fit",
+        parents=[shared, scene_options()],
+        help="fit a transfer function to images of a volume",
+        description="Fit a transfer function to images of a volume.",
+    )
+    parser.add_argument("--images", type=Path, nargs="+", required=True, metavar="IMAGE", help="sRGB, as PNG")
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        required=True,
+        metavar="JSON",
+        help="a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
+        "parallel_scale, window",
+    )
+    add_output(parser, "transfer.json", "JSON to write")
+    start = parser.add_argument_group("start")
+    start.add_argument(
+        "--start", type=Path, metavar="JSON", help="a transfer function written by this command"
+    )
+    start.add_argument(
+        "--points", type=int, default=8, help="else, flat grey with this many points (default: 8)"
+    )
+    add_clim(start, "range of their values (default: all)")
+    solver = parser.add_argument_group("solver")
+    solver.add_argument("--solver", choices=get_args(Solver), default="levenberg_marquardt")
+    solver.add_argument("--max-steps", type=int, default=100)
+    solver.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="save every step here; resume from here after an interruption",
+    )
+    parser.set_defaults(run=_fit)
+
+
+def _fit(options: argparse.Namespace) -> None:
+    refuse_to_replace(options, "output", "checkpoint")
+    output_file("--output", options.output)
+    # what is wrong with these is told before the volume is read
+    views = read_views(options.images, options.cameras)
+    start = read_transfer(options.start) if options.start else None
+    background = background_of(options)
+    with working(f"reading {options.file}"):
+        volume = volume_of(options)
+    # half a voxel
+    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
+    march = March(step, FAST, "midpoint")
+    if start is None:
+        start = flat_grey(volume, options.points, options.clim)
+    with working("fitting, steps") as told, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=UNDETERMINED)  # told below, of points
+        result = fit(
+            ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
+            start,
+            solver=options.solver,
+            max_steps=options.max_steps,
+            checkpoint=options.checkpoint,
+            checkpoint_seconds=0,  # Ctrl-C may come at any time, and a checkpoint is small
+            callback=lambda step, parameters, loss: told(step, options.max_steps),
+        )
+    path = write_transfer(options.output, result.parameters)
+    error = (2 * result.loss) ** 0.5
+    print(f"{path}: RMSE {error:.5f} in linear RGB after {len(result.losses)} steps. {result.message}")
+    if points := _undetermined(result.uncertainty):
+        values = ", ".join(f"{float(result.parameters.values[point]):g}" for point in points)
+        print(
+            f"{path}: what the images do not determine is arbitrary: colours or extinction of "
+            f"{len(points)} of {len(result.parameters.values)} points, those of the values {values}"
+        )
+
+
+def _undetermined(found: Uncertainty | None) -> list[int]:
+    """Points of a transfer function with numbers that the images do not determine."""
+    names = [] if found is None else [name for each in found.undetermined for name in each]
+    return sorted({int(index) for name in names for index in re.findall(r"\[(\d+)", name)})

@@ -1,0 +1,120 @@
+"""Looks at volumes: `view` in a notebook, and `serve` as a page of its own, which `jaxvol view FILE` shows.
+
+One small model (`model`: camera, transfer function, march and light in a `State`, drawn by a thread, coarse
+while it changes and fine at rest) has two faces, `notebook` and `page`, which only show and ask.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from ..._util.checks import integer
+from ...compositing.compositing import Compositing
+from ...compositing.modes import Mode
+from ...lighting.shading import Lighting
+from ...march.march import March
+from ...scene.camera import Camera
+from ...scene.transfer import TransferFunction
+from ...scene.volume import Volume
+from ...xla.programs import keep_programs_by_default
+from .start import begin
+
+
+if TYPE_CHECKING:
+    from .notebook import NotebookView
+    from .page import Page
+
+
+def view(
+    volume: Volume | Any,
+    transfer: TransferFunction | Any | None = None,
+    camera: Camera | Any | None = None,
+    march: March | Any | None = None,
+    *,
+    lighting: Lighting | Any | None = None,
+    lit: bool = True,
+    compositing: Mode | Compositing[Any] | Any = "over",
+    background: Any = (1.0, 1.0, 1.0),
+    size: tuple[int, int] | Any = (640, 480),
+) -> "NotebookView":
+    """Shows a volume in a notebook, to be turned and changed by the pointer.
+
+    Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
+    return. Beside the image are window and level, the points of the transfer function in front of the
+    volume's histogram, or its labels, the step, and every transform and the light to be turned on and off.
+    While something changes, the image is as coarse as it must be to follow within some 150 ms
+    (`viewer.pace`); at rest it has all pixels. Its time, its step and an estimate of its error are shown
+    live. It needs `pip install jaxvol[notebooks]`.
+
+    The first image, and the first one with another set of transforms, is compiled, which takes seconds;
+    compiled programs are kept for the next time, as by `keep_programs`.
+
+    **Arguments:**
+
+    - `volume`: what is looked at.
+    - `transfer`: a `TransferFunction`, by default one that is found from the volume's values; one of 16
+      points or fewer can be edited point by point. A `TransferFunction2D` is moved and stretched along the
+      values. Labels of a `LabelTransferFunction` are hidden, and made fainter or denser; such a one is the
+      default for voxels that seem to be labels, each in its own colour.
+    - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
+      it. Its size does not count.
+    - `march`: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
+      voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection`
+      and `EarlyTermination`.
+    - `lighting`: the light that can be turned on, by default `Phong`; none where an average is composited,
+      which lies nowhere. `lit`: whether it is on at first.
+    - `compositing`: as for `render`.
+    - `background`: linear RGB.
+    - `size`: (width, height) of the image in the notebook's pixels.
+
+    **Returns:** a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a
+    widget `v` renders what it shows.
+
+    **Raises:** `ValueError` as `render` does, for another kind of transfer function, an orthographic camera,
+    a step below 1/16 of a voxel or above 16 voxels, and a background that is not linear RGB; `ImportError` if
+    rendercanvas or ipywidgets are missing.
+    """
+    try:
+        from .notebook import NotebookView
+    except ImportError as fault:
+        raise ImportError(f"view needs {fault.name}: pip install jaxvol[notebooks]") from fault
+    keep_programs_by_default()
+    how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
+    return NotebookView(*begin(volume, transfer, camera, march, size=size, **how))
+
+
+def serve(
+    volume: Volume | Any,
+    transfer: TransferFunction | Any | None = None,
+    camera: Camera | Any | None = None,
+    march: March | Any | None = None,
+    *,
+    lighting: Lighting | Any | None = None,
+    lit: bool = True,
+    compositing: Mode | Compositing[Any] | Any = "over",
+    background: Any = (1.0, 1.0, 1.0),
+    port: int | Any = 8080,
+    title: str = "jaxvol",
+) -> "Page":
+    """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
+
+    Only this machine can connect, and only pages that this server sent (others that a browser shows may not).
+    What a browser sends are numbers and colors of controls; nothing of it is evaluated or used as a path. It
+    needs `pip install jaxvol[view]`.
+
+    **Arguments:** as for `view`, except:
+
+    - `volume`, `transfer`, `camera`, `march`, `lighting`, `lit`, `compositing`, `background`: the same.
+    - `port`: from 1 to 65535; if it is taken, the next free one.
+    - `title`: of the page's panel.
+
+    **Returns:** the `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
+
+    **Raises:** as `view`; `ImportError` if viser is missing.
+    """
+    try:
+        from .page import Page
+    except ImportError as fault:
+        raise ImportError(f"serve needs {fault.name}: pip install jaxvol[view]") from fault
+    port = integer("port", port, 1, 65535)
+    keep_programs_by_default()
+    how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
+    return Page(*begin(volume, transfer, camera, march, size=(640, 480), **how), port=port, title=title)

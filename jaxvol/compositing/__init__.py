@@ -1,0 +1,1 @@
+"""How the cells of a ray become a pixel."""

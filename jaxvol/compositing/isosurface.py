@@ -1,0 +1,161 @@
+"""Where does a ray first meet an isosurface?"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._util.checks import number
+from .._util.vec3 import Scalar, Vec3
+from ..march.march import March, within
+from ..march.transforms.alpha_correction import AlphaCorrection
+from ..scene.occupancy import Blocks
+from ..scene.transfer import Classify, Measured, Transfer
+from ..scene.volume import Volume
+from .compositing import Fragment, Outputs
+from .selection import RaySampler, Selection
+
+
+class Crossing(NamedTuple):
+    """The depths at both ends of the first cell within which the value is crossed, infinite if there is none
+    so far; and whether values rise through it."""
+
+    front: Scalar
+    back: Scalar
+    rises: Bool[Array, ""]
+
+
+class Isosurface(Selection[Crossing]):
+    """The surface on which the volume has a value, where a ray first crosses it: opaque, in the colour that
+    the transfer function has for the value, shaded by the lighting, if there is one.
+
+    A cell holds the surface if the value lies between those at its two ends: one is below it, the other is
+    not. There the root of the interpolated field along the ray is found by bisection, down to the rounding of
+    depths (in float32 and grids of 256³ voxels, some 10⁻⁴ of a voxel). The volume's faces are no surface.
+    `Rendering.depth` is that of the root, `Rendering.normal` the unit vector -∇v / |∇v| there, which points
+    to lower values; ∇v is `Volume.gradient` by central differences, with an error of O(spacing²).
+
+    Cells are judged by both ends whatever `March.quadrature` says, and are cut at the exit even without
+    `AlphaCorrection`. They compose with all transforms. Cells without a crossing are the empty ones, in which
+    `EmptySpaceJitter` shifts; `SpaceLeaping` leaps over blocks whose range does not hold the value.
+
+    **What is missed:** a ray that crosses the value twice within a cell, as in a sheet thinner than a step,
+    sees neither; of three crossings within a cell, any may be found. `Jitter` begins its cells up to a step
+    behind the entry, and misses what lies before (not with `front_residual`).
+
+    **Arguments:**
+
+    - `value`: of the volume, on the surface. It has a gradient.
+
+    Gradients follow from the implicit function theorem, by one step of Newton's method at the root: of depth
+    and normal, by the value, the voxels, spacing and camera. They are those of a fixed crossing: the jumps at
+    silhouettes, where a ray loses the surface, have none, and where a ray only touches it, the gradient of
+    depth grows without bound. Inside a plane of voxels, where the interpolated field has an edge, they are
+    those of one side.
+
+    Where it fails, and where not: `experiments/stability.py`, "isosurfaces of thin sheets".
+
+    **Raises:** `ValueError` for a value that is not a finite number.
+    """
+
+    value: Float[Array, ""]
+
+    def __init__(self, value: Any):
+        self.value = number("value", value)
+
+    def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
+        """What is looked for, by cells whose two ends are measured, up to the exit."""
+        cut = () if march.ends_at_exit else (AlphaCorrection(),)
+        integrated = March(1.0, (*march.transforms, *cut), "preintegrated", max_samples=march.max_samples)
+        # not as an argument, which would be checked once more
+        return _Crossings(self.value), eqx.tree_at(lambda march: march.step, integrated, march.step)
+
+    def begin(self, zero: Scalar, outputs: Outputs | None) -> Crossing:
+        return Crossing(zero + jnp.inf, zero + jnp.inf, jnp.zeros(zero.shape, bool))
+
+    def add(self, state: Crossing, fragment: Fragment) -> Crossing:
+        *_, (before,), (_,) = fragment.measured
+        front, back = fragment.cell.front, fragment.cell.front + fragment.cell.width
+        found = Crossing(front, back, before < self.value)
+        first = (state.back == jnp.inf) & ~(fragment.alpha <= 0)  # NaN is a find, too
+        return jax.tree.map(lambda new, old: jnp.where(first, new, old), found, state)
+
+    def depth(self, state: Crossing) -> Scalar:
+        return state.back
+
+    def finished(self, state: Crossing) -> Bool[Array, ""]:
+        return state.back < jnp.inf
+
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        return transfer.visible(blocks)
+
+    def pixel(self, sampler: RaySampler, state: Crossing) -> tuple[Float[Array, "4"], Scalar]:
+        depth = self._implicit(sampler, jax.lax.stop_gradient(self._root(sampler, state)))
+        classification = sampler.classification
+        # the value itself rather than that at the root, which is rounded
+        measured = self.value, *classification.beside(sampler.coordinate(depth))
+        measured = classification.searched(measured)
+        color = sampler.color(depth, measured, classification.classify(measured), jnp.ones_like(depth))
+        known = jnp.where(jnp.isnan(depth), jnp.nan, jnp.ones_like(depth))
+        return jnp.stack([*color, known]) * known, depth
+
+    def normal(self, sampler: RaySampler, depth: Scalar) -> Float[Array, "3"]:
+        assert sampler.gradient is not None
+        slopes = jnp.stack(sampler.gradient(sampler.point(depth)))
+        square = jnp.sum(slopes * slopes)
+        # where values do not change, there is no direction
+        return -slopes * jnp.where(square == 0, 0, jax.lax.rsqrt(jnp.where(square == 0, 1, square)))
+
+    def _root(self, sampler: RaySampler, state: Crossing) -> Scalar:
+        """Depth at which the value is crossed, to the precision of depths."""
+        front, back = (within(sampler.ray, depth) for depth in (state.front, state.back))
+
+        def halved(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+            near, far = bracket
+            middle = (near + far) / 2
+            # by the march's own direction: values at the ends, computed again, may round to the other side
+            behind = (sampler.value(middle) >= self.value) == state.rises
+            return jnp.where(behind, near, middle), jnp.where(behind, middle, far)
+
+        near, far = jax.lax.fori_loop(0, jnp.finfo(front.dtype).nmant, halved, (front, back))
+        # of both ends the one below the value: the other may lie where all values are equal to it
+        return jnp.where(state.rises, near, far)
+
+    def _implicit(self, sampler: RaySampler, root: Scalar) -> Scalar:
+        """The same root, with its derivatives: of v(s) = value, ds = (dvalue - dv) / v'."""
+        found, slope = jax.jvp(sampler.value, (root,), (jnp.ones_like(root),))
+        slope = jax.lax.stop_gradient(slope)
+        missing = self.value - found
+        missing = missing - jax.lax.stop_gradient(missing)  # 0, since the root is known better than that
+        return root + jnp.where(slope == 0, 0, missing / jnp.where(slope == 0, 1, slope))
+
+
+class _Crossings(Transfer):
+    """Of positive extinction where the value is crossed between the two ends of a cell, and transparent
+    elsewhere."""
+
+    value: Float[Array, ""]
+
+    def classifier(self) -> Classify:
+        """A point crosses nothing."""
+
+        def nothing(measured: Measured) -> tuple[Vec3, Scalar]:
+            none = jnp.zeros_like(measured[0])
+            return (none, none, none), none
+
+        return nothing
+
+    def integrator(self) -> Classify:
+        def crossed(measured: Measured) -> tuple[Vec3, Scalar]:
+            mean, (front,), (back,) = measured
+            crosses = ((front >= self.value) != (back >= self.value)).astype(mean.dtype)
+            none = jnp.zeros_like(mean)
+            return (none, none, none), jnp.where(jnp.isnan(mean), jnp.nan, crosses)
+
+        return crossed
+
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        value = self.value.astype(blocks.low.dtype)
+        return ((blocks.low <= value) & (value <= blocks.high)).astype(blocks.low.dtype)

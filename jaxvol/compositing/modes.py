@@ -1,0 +1,42 @@
+"""Which compositing mode does `compositing=` name?"""
+
+from typing import Any, Literal, TypeAlias
+
+import jax
+
+from .._util.checks import described
+from .compositing import Compositing, Over, Weighting
+from .projections import Average, Maximum, Minimum
+from .selection import Selection
+
+
+Mode: TypeAlias = Literal["over", "maximum", "minimum", "average"]
+"""The keys of `MODES`."""
+
+MODES: dict[str, type[Compositing[Any]]] = {
+    "over": Over,
+    "maximum": Maximum,
+    "minimum": Minimum,
+    "average": Average,
+}
+
+
+def compositing_of(given: Mode | Any) -> Compositing[Any]:
+    """The mode of this name, or the mode itself.
+
+    **Raises:** `ValueError`, naming the argument, for anything else, and for a `Weighting` whose fields are
+    not all static although its weights may depend on them."""
+    if isinstance(given, Weighting | Selection):
+        if isinstance(given, Weighting) and not given.resolves and jax.tree.leaves(given):
+            raise ValueError(
+                "compositing must be a Weighting with static fields only, eqx.field(static=True); "
+                f"{described(given)} has others."
+            )
+        return given
+    if isinstance(given, str) and given in MODES:
+        return MODES[given]()
+    names = ", ".join(f'"{name}"' for name in MODES)
+    raise ValueError(
+        f"compositing must be one of {names}, a jaxvol.Isosurface, or another Weighting or Selection; "
+        f"got {described(given)}."
+    )

@@ -1,0 +1,201 @@
+"""Which single value of a ray does a pixel show? Its greatest, its least, or its mean.
+
+A projection turns all values along a ray into one number, and looks that up in the transfer function. The
+opacity is that of a layer of a `thickness`. VTK and PyVista show the opacity of a layer of the unit distance;
+so do these modes by default, since both lengths are 1.
+"""
+
+from abc import abstractmethod
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._util.checks import number
+from .._util.vec3 import Scalar, Vec3
+from ..march.march import March
+from ..scene.occupancy import Blocks
+from ..scene.transfer import Classification, Classify, Measured, Transfer
+from ..scene.volume import Volume
+from .compositing import Fragment, Outputs, Weighting
+from .selection import RaySampler, Selection
+
+
+Chosen: TypeAlias = tuple[Scalar, Scalar]
+"""Rank and depth of the sample that is chosen."""
+
+
+class Extreme(Selection[Chosen]):
+    """A mode that shows the sample of the highest rank. `Maximum` says what holds for all of them."""
+
+    thickness: Float[Array, ""]
+
+    def __init__(self, thickness: Any = 1.0):
+        self.thickness = number("thickness", thickness, above=0)
+
+    @abstractmethod
+    def rank(self, value: Scalar) -> Scalar:
+        """The highest for the sample that is shown."""
+
+    def begin(self, zero: Scalar, outputs: Outputs | None) -> Chosen:
+        return zero - jnp.inf, zero + jnp.inf
+
+    def add(self, state: Chosen, fragment: Fragment) -> Chosen:
+        (best, depth), rank = state, self.rank(fragment.value)
+        higher = fragment.valid & ~(rank <= best) & ~jnp.isnan(best)
+        return jnp.where(higher, rank, best), jnp.where(higher, fragment.depth, depth)
+
+    def depth(self, state: Chosen) -> Scalar:
+        return state[1]
+
+    def pixel(self, sampler: RaySampler, state: Chosen) -> tuple[Float[Array, "4"], Scalar]:
+        _, depth = state
+        rgba = layer(*sampler.shaded(depth), self.thickness)
+        return rgba, jnp.where(rgba[3] <= 0, jnp.inf, depth)
+
+
+class Maximum(Extreme):
+    """The greatest value along a ray (maximum intensity projection), looked up in the transfer function.
+
+    Values are compared at the samples of the march: at a smooth peak the greatest of them is less than that
+    of the ray by O(step²), and a peak thinner than a step may be missed. Of equal values, the nearest is
+    chosen. NaN ranks above all numbers, so that a fault of the volume shows. Where cells are integrated
+    (`quadrature="preintegrated"`), the means of the values at their two ends are compared, and what lies in
+    the middle of the cell is shown.
+
+    `Rendering.depth` is that of the sample, infinite where it is transparent.
+
+    `SpaceLeaping` leaps over blocks in which neither the values nor any that are less are visible: air, under
+    most transfer functions. A ray still takes samples of all other blocks, also of those that cannot raise
+    the greatest value it has found. `"min_distance"` is refused.
+
+    **Arguments:**
+
+    - `thickness`: of a layer of the value, world length, > 0. Its opacity, `1 - exp(-extinction thickness)`,
+      is that of the pixel: if it is equal to the `unit_distance` of the transfer function, the opacity that
+      was given for the value.
+
+    Gradients, also that of the thickness, are those of the sample that is chosen: of the voxels around it,
+    the transfer function, the camera (`Selection`). Where the choice changes, the value is the same on both
+    sides, and the image has a kink; depth and light jump there.
+
+    **Raises:** `ValueError` for a thickness that is not a positive finite number.
+
+    Source: VTK's MAXIMUM_INTENSITY_BLEND; Wallis et al. 1989.
+    """
+
+    def __init__(self, thickness: Any = 1.0):
+        super().__init__(thickness)
+
+    def rank(self, value: Scalar) -> Scalar:
+        return value
+
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """Blocks in which some value is visible, or any that is less: where a ray's maximum lies in another
+        block, it is invisible."""
+        return transfer.visible(Blocks(jnp.full_like(blocks.low, jnp.nanmin(blocks.low)), blocks.high, None))
+
+
+class Minimum(Extreme):
+    """The least value along a ray (minimum intensity projection), looked up in the transfer function.
+
+    All else is as in `Maximum`, with less for greater: rays leap over blocks in which neither the values nor
+    any that are greater are visible.
+
+    **Arguments:** `thickness`: as for `Maximum`.
+
+    **Raises:** `ValueError` for a thickness that is not a positive finite number.
+
+    Source: VTK's MINIMUM_INTENSITY_BLEND.
+    """
+
+    def __init__(self, thickness: Any = 1.0):
+        super().__init__(thickness)
+
+    def rank(self, value: Scalar) -> Scalar:
+        return -value
+
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """Blocks in which some value is visible, or any that is greater."""
+        return transfer.visible(Blocks(blocks.low, jnp.full_like(blocks.high, jnp.nanmax(blocks.high)), None))
+
+
+class Average(Weighting):
+    """The mean value along a ray, as classified by the transfer function.
+
+    With the values v_k in cells of widths e_k, the mean is Σ e_k v_k / Σ e_k over what lies in the volume. It
+    is classified once. What is transparent counts like all else, so nothing is leapt over, and
+    `EmptySpaceJitter`, which waits for a transparent cell, does not shift. `Rendering.depth` is the middle of
+    the part of the ray that is in the volume.
+
+    With `AlphaCorrection`, the mean of values that are linear along the ray is exact but for rounding by the
+    quadratures `"midpoint"` and `"preintegrated"`; by `"left"` it errs by half their change over one step.
+    In general the error falls with the order of the quadrature. Without `AlphaCorrection`, the last cell
+    counts as a whole.
+
+    **Arguments:**
+
+    - `thickness`: of a layer of the mean value, world length, > 0, as in `Maximum`. It has a gradient.
+
+    Gradients are complete with `AlphaCorrection`: of the voxels, transfer function, camera, spacing and step,
+    in every adjoint. Without, they miss the jumps of the exit (`render`).
+
+    **Raises:** `ValueError` for a thickness that is not a positive finite number. In a render, for a lighting
+    and for a transfer function that reads more than the value: a mean lies nowhere.
+
+    Source: VTK's AVERAGE_INTENSITY_BLEND.
+    """
+
+    thickness: Float[Array, ""]
+
+    def __init__(self, thickness: Any = 1.0):
+        self.thickness = number("thickness", thickness, above=0)
+
+    def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
+        """Through a fog of constant extinction that shows the values as colours. The optical depths of its
+        cells are their widths."""
+        if type(transfer).beside is not Transfer.beside:
+            raise ValueError(
+                "compositing by an average needs a transfer function that depends on the value alone; "
+                f"{type(transfer).__name__} reads more."
+            )
+        # of all cells of a ray, also of one that reaches past the exit, the optical depth is at most 1, where
+        # float32 resolves it well
+        longest = march.locate(volume).diagonal + march.step
+        return _Values(jax.lax.stop_gradient(1 / longest)), march
+
+    def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
+        return -jnp.log1p(-alpha)  # the optical depth
+
+    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
+        return worth
+
+    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+        if classification.light is not None:
+            raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
+        # the entries that fill up a chunk of pixels may be 0, and a derivative there must not be NaN
+        mean = sums[0] / jnp.where(sums[3] == 0, 1, sums[3])
+        return layer(*classification.classify(classification.searched((mean,))), self.thickness)
+
+
+class _Values(Transfer):
+    """A fog that shows the volume's values: the value is the red part of its colour."""
+
+    extinction: Float[Array, ""]
+
+    def classifier(self) -> Classify:
+        def shown(measured: Measured) -> tuple[Vec3, Scalar]:
+            value, none = measured[0], jnp.zeros_like(measured[0])
+            return (value, none, none), none + self.extinction
+
+        return shown
+
+    def integrator(self) -> Classify:
+        return self.classifier()  # a mean of values comes first of what is measured
+
+
+def layer(color: Vec3, extinction: Scalar, thickness: Scalar) -> Float[Array, "4"]:
+    """Premultiplied colour and opacity of a layer."""
+    opacity = -jnp.expm1(-extinction * thickness)
+    return opacity * jnp.stack([*color, jnp.ones_like(opacity)])

@@ -1,0 +1,141 @@
+"""Which place on a ray does a pixel show? Modes that select a depth, and what they may ask for there."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._util.vec3 import Scalar, Vec3, along
+from ..lighting.shading import Sample
+from ..scene.occupancy import Blocks
+from ..scene.space import Ray
+from ..scene.transfer import Classification, Measured, Transfer
+from .compositing import Compositing, Fragment, Outputs, State
+
+
+class RaySampler(NamedTuple):
+    """Measures, classifies and shades what is on a ray. Depths are past the entry.
+
+    - `depth_scale`: a factor for depths that stand for a number of steps. It is 1, and grows with the step.
+    - `gradient`: of the volume's value at a world point, by that point; None during the march.
+    """
+
+    ray: Ray
+    classification: Classification
+    depth_scale: Scalar | int = 1
+    gradient: Callable[[Vec3], Vec3] | None = None
+
+    def value(self, depth: Scalar) -> Scalar:
+        """The volume's value at this depth."""
+        return self.classification.measure(self.coordinate(depth))[0]
+
+    def measured(self, depth: Scalar) -> Measured:
+        """The measured values at this depth, the volume's value first."""
+        return self.classification.at(self.coordinate(depth))
+
+    def coordinate(self, depth: Scalar) -> Vec3:
+        """The grid coordinate at this depth."""
+        return self.ray.path(self.differentiable_depth(depth))
+
+    def point(self, depth: Scalar) -> Vec3:
+        """The world point at this depth."""
+        return along(self.ray.entry, self.ray.direction, self.differentiable_depth(depth))
+
+    def differentiable_depth(self, depth: Scalar) -> Scalar:
+        """The same depth, as a number to compute with, as in a fog: its derivative by the step is that of so
+        many steps."""
+        return depth * self.depth_scale
+
+    def color(
+        self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
+    ) -> Vec3:
+        """The colour of what was measured and classified at this depth, or around it, shaded where there is a
+        lighting. `transmittance`: between the place and the camera."""
+        color, extinction = classified
+        if self.classification.light is None:
+            return color
+        ray = self.ray
+        return self.classification.light(
+            Sample(self.point(depth), ray.direction, measured, color, extinction, transmittance, ray.pixel)
+        )
+
+    def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
+        """Colour, shaded where there is a lighting, and extinction at this depth, which nothing hides."""
+        measured = self.measured(depth)
+        classified = self.classification.classify(measured)
+        return self.color(depth, measured, classified, jnp.ones_like(depth)), classified[1]
+
+
+class Selection(Compositing[State]):
+    """A mode that compares the samples of a ray and chooses a depth. The pixel is computed from what is
+    there, once for each ray, after the march.
+
+    Gradients are those of `pixel`. What the march found is constant to them: the depths in its state stay the
+    same number of steps past the entry, while the ray, the step and what the ray meets change. They miss that
+    a pixel jumps where the choice does, and how the sample of a cell that is cut at a face moves with that
+    face. Parameters may have gradients, through `pixel`. The gradient of voxels takes an array of their size
+    for each fetch of `pixel`, for each chunk of 2048 pixels: slow for large volumes.
+    """
+
+    @abstractmethod
+    def depth(self, state: State) -> Scalar:
+        """The depth that is chosen, past the entry; infinite as long as there is none."""
+
+    @abstractmethod
+    def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
+        """Premultiplied colour and opacity, and the depth that is reported (infinite where nothing is
+        visible), of a ray for which a depth was chosen. It is differentiated by JAX. Depths, of the state and
+        in the answer, are numbers of steps to it: to compute with one, take
+        `sampler.differentiable_depth(depth)`."""
+
+    def normal(self, sampler: RaySampler, depth: Scalar) -> Float[Array, "3"] | None:
+        """The unit normal, in the world, of what is shown at the depth that `pixel` reports; by default None.
+        It is differentiated by JAX, too."""
+        return None
+
+    @property
+    def has_normal(self) -> bool:
+        """Whether `normal` is not None."""
+        return type(self).normal is not Selection.normal
+
+    @property
+    def resolves(self) -> bool:
+        return True
+
+    def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
+        depth = self.depth(state)
+        none, chosen = jnp.zeros_like(depth), (~jnp.isinf(depth)).astype(depth.dtype)
+        return jnp.stack([none, none, none, chosen]), depth
+
+    def transmittance(self, state: State) -> Scalar:
+        """1: what is in front hides nothing."""
+        return jnp.ones_like(self.depth(state))
+
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """By default all blocks: what is transparent may still be chosen."""
+        return jnp.ones(blocks.low.shape, bool)
+
+
+class FirstVisible(Selection[Scalar]):
+    """The first sample of positive opacity, shown opaque."""
+
+    def begin(self, zero: Scalar, outputs: Outputs | None) -> Scalar:
+        return jnp.full_like(zero, jnp.inf)
+
+    def add(self, state: Scalar, fragment: Fragment) -> Scalar:
+        return jnp.where((state == jnp.inf) & ~(fragment.alpha <= 0), fragment.depth, state)
+
+    def depth(self, state: Scalar) -> Scalar:
+        return state
+
+    def finished(self, state: Scalar) -> Bool[Array, ""]:
+        return state < jnp.inf
+
+    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        return transfer.visible(blocks)
+
+    def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
+        color, _ = sampler.shaded(state)
+        return jnp.stack([*color, jnp.ones_like(state)]), state

@@ -1,0 +1,1 @@
+"""What comes from files and goes into them: volumes, datasets, phantoms, images."""

@@ -1,0 +1,216 @@
+"""How is linear colour shown, and saved as an image file? The sRGB curve, and the file formats."""
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from .._util.checks import Arrayable, described, integer, output_file
+from .._util.srgb import to_srgb
+from .._util.whole_files import whole_file
+
+
+def save_image(
+    path: str | os.PathLike[str] | Any, linear: Arrayable, *, text: Mapping[str, str] | None = None
+) -> Path:
+    """Write an image, in the format given by the file extension:
+
+    | extension | contents |
+    |---|---|
+    | `.png` | 8-bit sRGB; with opacity, transparent (straight alpha) |
+    | `.jpg`, `.jpeg` | 8-bit sRGB, no opacity |
+    | `.tif`, `.tiff` | linear float32, unchanged; with opacity, premultiplied (associated alpha) |
+    | `.npy` | linear float32, unchanged; read it with `numpy.load` |
+
+    **Arguments:**
+
+    - `path`: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
+    - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
+      (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
+      may be infinite. 8-bit formats clip to [0, 1].
+    - `text`: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries beside the image, as
+      `Image.info` of Pillow has them; other formats carry none.
+
+    **Returns:** the path. Its folder is created if it does not exist. The file appears whole or not at all.
+
+    **Raises:** `ValueError` for input that is not an array, an unknown extension, a shape that the format
+    does not hold, NaN, infinite colours, and a path that cannot be written.
+
+    A viewer blends a transparent PNG over its background in sRGB, `Rendering.image` blends in linear light;
+    the two look different where the opacity lies between 0 and 1.
+    """
+    if not isinstance(path, str | os.PathLike):
+        swapped = isinstance(linear, str | os.PathLike)
+        raise ValueError(
+            f"path must be a str or a path; got {described(path)}."
+            + (" That is the image: the path comes first, as in save_png(path, image)." if swapped else "")
+        )
+    try:
+        image = np.asarray(linear, np.float32)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(
+            f"linear must be an array of numbers; got {described(linear)}. For a Rendering, pass "
+            "rendering.image() or rendering.rgba."
+        ) from fault
+    channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else None
+    held = CHANNELS.get(Path(path).suffix.lower(), (0, 3, 4))
+    shapes = [SHAPES[count] for count in sorted(held, key=(3, 4, 0).index)]
+    if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in held):
+        where = f" for a {Path(path).suffix.lower()}" if len(held) < len(SHAPES) else ""
+        hint = (
+            " One channel is written as .tif or .npy; repeat it for a grey picture of three."
+            if channels == 0
+            else ""
+        )
+        raise ValueError(f"image{where} must have shape {' or '.join(shapes)}; got {image.shape}.{hint}")
+    path = image_file("path", path, channels)
+    bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
+    if bad.any():
+        raise ValueError(f"image must not be NaN or infinite; {bad.sum()} of its {image.size} values are.")
+    ending = path.suffix.lower()
+    with whole_file(path) as part:
+        if ending == ".npy":
+            np.save(part, image)
+        elif ending in (".tif", ".tiff"):
+            _save_tiff(part, image)
+        else:
+            _save_display(part, image, text or {})
+    return path
+
+
+def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
+    """`save_image` for a path that must end in `.png`.
+
+    **Arguments:** `path`: of the file; it comes first, unlike in `save`, of volumes. `linear`: RGB (height,
+    width, 3), which is written as 8-bit sRGB, or premultiplied RGBA (height, width, 4), which is written with
+    alpha.
+
+    **Returns:** the path.
+
+    **Raises:** `ValueError` as `save_image` does, and for another ending.
+    """
+    if isinstance(path, str | os.PathLike) and Path(path).suffix.lower() != ".png":
+        raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")
+    return save_image(path, linear)
+
+
+GAP, TITLE, INSET = 6, 20, 1e-3
+"""Pixels between images that are shown side by side, and of the line above each that names it; and
+by how much an image is drawn smaller on each side, since versions of matplotlib before 3.11 may draw one row
+more or less where an edge lies exactly between two pixels."""
+
+
+def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -> None:
+    """Draw linear images side by side, each under its name, with matplotlib: one pixel of the page for each
+    of theirs, since resampling would hide what samples do. It is for notebooks, where the picture appears
+    under the cell.
+
+    **Arguments:**
+
+    - `images`: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
+      Values outside of [0, 1] are clipped. Sizes may differ.
+    - `columns`: how many images stand in a row at most.
+
+    **Raises:** `ValueError` for no image, an image of another shape, NaN, and a number of columns below 1.
+    """
+    if not isinstance(images, Mapping) or not images:
+        raise ValueError(
+            f"images must be a dict of at least one image, such as {{'head': ...}}; got {described(images)}."
+        )
+    shown = {str(name): _displayed(name, image) for name, image in images.items()}
+    columns = min(integer("columns", columns, 1), len(shown))
+    rows = math.ceil(len(shown) / columns)
+    height, width = (max(image.shape[axis] for image in shown.values()) for axis in (0, 1))
+    across, down = columns * (width + GAP) + GAP, rows * (height + TITLE + GAP)
+
+    import matplotlib.pyplot as plt  # here: slow to import, and only pictures need it
+
+    figure = plt.figure(figsize=(across / 100, down / 100), dpi=100)
+    for place, (name, image) in enumerate(shown.items()):
+        row, column = divmod(place, columns)
+        left, top = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE
+        box = left + INSET, down - top - image.shape[0] + INSET, *(n - 2 * INSET for n in image.shape[1::-1])
+        axes = figure.add_axes(np.divide(box, (across, down, across, down)).tolist())
+        axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="none")
+        axes.set_axis_off()
+        axes.set_title(name, fontsize=9, loc="left", pad=3)
+    plt.show()
+
+
+def _displayed(name: Any, image: Any) -> Float[np.ndarray, "height width *channels"]:
+    try:
+        linear = np.asarray(image, np.float32)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(
+            f"images[{name!r}] must be an array of numbers; got {described(image)}. For a Rendering, pass "
+            "rendering.image()."
+        ) from fault
+    if 0 in linear.shape or (linear.ndim != 2 and linear.shape[2:] != (3,)):
+        raise ValueError(
+            f"images[{name!r}] must have shape (height, width, 3) or (height, width); got {linear.shape}."
+        )
+    if np.isnan(linear).any():
+        raise ValueError(f"images[{name!r}] must not be NaN; {np.isnan(linear).sum()} of its values are.")
+    return np.asarray(to_srgb(linear))
+
+
+SHAPES = {0: "(height, width)", 3: "(height, width, 3)", 4: "(height, width, 4)"}
+"""Of images, by their number of channels."""
+
+CHANNELS: dict[str, tuple[int, ...]] = {
+    ".png": (3, 4),
+    ".jpg": (3,),
+    ".jpeg": (3,),
+    ".tif": (0, 3, 4),
+    ".tiff": (0, 3, 4),
+    ".npy": (0, 3, 4),
+}
+"""Numbers of channels that each format can hold; 0 means no channel axis."""
+
+
+def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
+    """Check that an image with this many channels can be written to `path`, before it is rendered."""
+    path, what = Path(path), {0: "one channel", 3: "colours", 4: "colours and opacity"}[channels]
+    allowed = [ending for ending, counts in CHANNELS.items() if channels in counts]
+    if path.suffix.lower() not in allowed:
+        raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(allowed)}; got {path}.")
+    return output_file(name, path)
+
+
+def _save_tiff(path: Path, image: Float[np.ndarray, "..."]) -> None:
+    from tifffile import imwrite
+
+    extra = ["assocalpha"] if image.shape[2:] == (4,) else None
+    imwrite(path, image, photometric="rgb" if image.ndim == 3 else "minisblack", extrasamples=extra)
+
+
+def displayed(
+    image: Float[np.ndarray, "height width channels"],
+) -> UInt8[np.ndarray, "height width channels"]:
+    """Linear RGB, or premultiplied RGBA, as 8-bit sRGB with straight alpha."""
+    color, opacity = image[..., :3], image[..., 3:]
+    # straight alpha: viewers multiply by the opacity
+    color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
+    display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
+    return np.asarray(jnp.round(display * 255)).astype(np.uint8)
+
+
+def _save_display(
+    path: Path, image: Float[np.ndarray, "height width channels"], text: Mapping[str, str]
+) -> None:
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    picture = Image.fromarray(displayed(image))
+    if path.suffix.lower() != ".png":
+        picture.save(path)
+        return
+    chunks = PngInfo()
+    for keyword, content in text.items():
+        chunks.add_itxt(keyword, content, zip=True)
+    picture.save(path, pnginfo=chunks)

@@ -1,0 +1,133 @@
+"""Writes volumes to files that `load` reads again as they were."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..._util.checks import described, output_file
+from ..._util.files import reason
+from ..._util.whole_files import whole_file
+from ...scene.volume import Volume
+from ...xla.platform import is_traced
+from .metaimage import metaimage_data
+
+
+def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
+    """Write a volume to a file, in the format of its ending; `jv.load` reads the same volume.
+
+    | ending | written |
+    |---|---|
+    | `.npz` | voxels, spacing, origin, direction, labels; compressed |
+    | `.nrrd`, `.mha`, `.mhd` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nii`, `.nii.gz` | the same; direction is rounded, to about 1e-7 |
+
+    Voxels are written in their own type, and read so: with the same values, spacing and origin. Medical
+    formats are read along the patient's axes: a volume whose axes are turned by more than 45 degrees comes
+    back with axes exchanged or reversed, and every voxel where it was in the world.
+
+    A file that is there is replaced, at once when the new one is whole. `.mhd` are two files: the voxels go
+    into one that ends in `.raw`, which is replaced first, and only if it belongs to the `.mhd` that is there.
+
+    **Arguments:**
+
+    - `volume`: with voxels. It comes first; `save_png`, of images, has the path first. Of one that has a
+        `field`, voxels are not what is shown, and it is refused.
+    - `path`: the file to write. Folders are made where they are missing.
+
+    **Returns:** the path.
+
+    **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
+    of voxels that the format cannot hold, a file that cannot be written, and a `.raw` file beside an `.mhd`
+    that is not the `.mhd`'s own. `ImportError` if the format
+    needs SimpleITK, and it is missing.
+    """
+    if not isinstance(volume, Volume):
+        swapped = isinstance(path, Volume)
+        raise ValueError(
+            f"volume must be a Volume; got {described(volume)}."
+            + (" The volume comes first, as in save(volume, path)." if swapped else "")
+        )
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path must be a str or a path; got {described(path)}.")
+    if is_traced(volume):
+        raise ValueError("volume must not be traced: save it outside of jit and grad.")
+    if volume.field is not None:
+        raise ValueError(
+            "volume must have voxels; got one with a field. Save an array of the field's values."
+        )
+    path = Path(path)
+    ending = max((e for e in WRITERS if path.name.lower().endswith(e)), key=len, default=None)
+    if ending is None:
+        raise ValueError(f"path must end in {', '.join(sorted(WRITERS))}; got {path}.")
+    write = WRITERS[ending]
+    output_file("path", path)
+    if ending == ".mhd":
+        _check_beside(path)
+    with whole_file(path) as part, tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        write(volume, Path(folder) / path.name)
+        for file in Path(folder).iterdir():  # the header takes its place last: it names the other file of two
+            os.replace(file, part if file.name == path.name else path.parent / file.name)
+    return path
+
+
+def _check_beside(path: Path) -> None:
+    """**Raises** `ValueError` if voxels of something else lie where those of an `.mhd` are written."""
+    voxels = path.with_suffix(".raw")
+    try:
+        own = not voxels.exists() or (path.is_file() and metaimage_data(path).resolve() == voxels.resolve())
+    except ValueError:  # what is replaced is no MetaImage
+        own = False
+    if not own:
+        raise ValueError(
+            f"path: the voxels of {path.name} would replace {voxels}, which does not belong to it. Save it "
+            "under another name, or as .mha, which is one file."
+        )
+
+
+def _write_npz(volume: Volume, path: Path) -> None:
+    arrays = {"data": volume.data, "spacing": volume.spacing, "origin": volume.origin}
+    if volume.direction is not None:
+        arrays["direction"] = volume.direction
+    if volume.labels is not None:
+        arrays["labels"] = volume.labels
+    if volume.data.dtype == "bfloat16":
+        raise ValueError("volume has voxels of bfloat16, which .npz cannot hold; convert them to float32.")
+    with path.open("wb") as stream:
+        np.savez_compressed(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
+
+
+def _write_medical(volume: Volume, path: Path) -> None:
+    try:
+        import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
+    except ImportError as fault:
+        raise ImportError(f"writing {path.name} needs SimpleITK: pip install jaxvol[io]") from fault
+    if volume.labels is not None:
+        raise ValueError(
+            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
+            "and voxels as two volumes, and read them by load(path, labels=...)."
+        )
+    data = np.asarray(volume.data)
+    if data.dtype.name in ("float16", "bfloat16"):
+        raise ValueError(
+            f"volume has voxels of {data.dtype}, which {path.name} cannot hold. Convert them to float32."
+        )
+    image = sitk.GetImageFromArray(np.ascontiguousarray(data.T))
+    image.SetSpacing(np.asarray(volume.spacing, float).tolist())
+    image.SetOrigin(np.asarray(volume.origin, float).tolist())
+    if volume.direction is not None:
+        image.SetDirection(np.asarray(volume.direction, float).ravel().tolist())
+    compress = not path.name.lower().endswith((".nii", ".mhd"))
+    try:
+        sitk.WriteImage(image, str(path), compress)
+    except RuntimeError as fault:
+        raise ValueError(f"path: {path.name} cannot be written ({reason(fault)}).") from fault
+
+
+WRITERS: dict[str, Callable[[Volume, Path], None]] = {
+    ".npz": _write_npz,
+    **dict.fromkeys((".nrrd", ".mha", ".mhd", ".nii", ".nii.gz"), _write_medical),
+}

@@ -1,0 +1,225 @@
+"""Reads stacks of TIFF images with tifffile: the pages of one file, or the files of a folder."""
+
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..._util.files import MOST_VOXELS, Header, file_size
+
+
+ENDINGS = (".tif", ".tiff")
+
+MOST_COMPRESSED = 2000
+"""Bytes of pixels per byte of a compressed file, at most. A header that says more is not believed."""
+
+LENGTHS = {
+    "mm": 1.0,
+    "millimeter": 1.0,
+    "cm": 10.0,
+    "inch": 25.4,
+    "µm": 1e-3,
+    "um": 1e-3,
+    "micron": 1e-3,
+    "nm": 1e-6,
+}
+"""Units of length that ImageJ and OME write, in mm."""
+
+
+def read_tiff(path: Path, header: Header) -> dict[str, Any]:
+    """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
+    header.refuse(path)
+    pages, spacing = _pages(path)
+    if len(pages) < 2:
+        raise ValueError(
+            f"path: {path} must hold at least 2 images; got {len(pages)}. For a folder of images, give the "
+            "path of the folder."
+        )
+    # [z][y][x], as pages, rows and columns come
+    return {"data": np.stack(pages).transpose(2, 1, 0)} | spacing
+
+
+def tiff_spacing(path: Path) -> dict[str, Any]:
+    """The spacing that a file tells, as `read_tiff` has it; its images are not read."""
+    with _tifffile(path).TiffFile(path) as file:
+        return _spacing(file, file.pages[0].aspage())
+
+
+def tiff_files(folder: Path) -> list[Path]:
+    """The TIFF files in a folder, with numbers in their names in numeric order."""
+    files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS and file.is_file()]
+
+    def key(file: Path) -> list[tuple[int, str]]:
+        parts = re.split(r"([0-9]+)", file.name.lower())
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+    return sorted(files, key=key)
+
+
+def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
+    """Reader for a folder of files of one page each, in the order of the numbers in their names.
+
+    **Raises:** `ValueError` naming the files for images of different sizes or types, and for a number that is
+    missing in a sequence.
+    """
+    header.refuse(folder)
+    files = tiff_files(folder)
+    _check_numbers(folder, files)
+    slices: list[np.ndarray] = []
+    for file in files:
+        pages, _ = _pages(file)
+        if len(pages) != 1:
+            raise ValueError(f"path: {file} must hold one image, as a slice of {folder}; got {len(pages)}.")
+        (image,) = pages
+        if slices and (image.shape, image.dtype) != (slices[0].shape, slices[0].dtype):
+            raise ValueError(
+                f"path: the slices in {folder} must have the same size and type; {files[0].name} has "
+                f"{slices[0].shape} of {slices[0].dtype}, and {file.name} {image.shape} of {image.dtype}."
+            )
+        slices.append(image)
+        if len(slices) * image.size > MOST_VOXELS:
+            raise ValueError(f"path: {folder} must have fewer than 2**31 voxels.")
+    return {"data": np.stack(slices).transpose(2, 1, 0)}
+
+
+def _check_numbers(folder: Path, files: list[Path]) -> None:
+    """**Raises** `ValueError` if files' names differ in one number, and some of its values are missing."""
+    last = [re.findall(r"[0-9]+", file.stem) for file in files]
+    numbers = [int(found[-1]) for found in last if found]
+    if len(files) < 2:
+        raise ValueError(f"path: {folder} must hold at least 2 slices; got {len(files)}.")
+    if len(numbers) != len(files) or len({tuple(found[:-1]) for found in last}) > 1:
+        return
+    steps = np.diff(numbers)
+    if steps.min() != steps.max():
+        i = int(np.argmax(steps)) if steps.max() > np.median(steps) else int(np.argmin(steps))
+        raise ValueError(
+            f"path: slices are missing in {folder}, or there twice: {files[i].name} is followed by "
+            f"{files[i + 1].name}."
+        )
+
+
+def _tifffile(path: Path) -> Any:
+    try:
+        import tifffile  # pyright: ignore[reportMissingImports]
+    except ImportError as fault:
+        raise ImportError(f"reading {path} needs tifffile: pip install jaxvol[io]") from fault
+    return tifffile
+
+
+def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """The images in a file, which are of one size and type, and their spacing where it is known."""
+    tifffile = _tifffile(path)
+    n_bytes = file_size(path)
+    try:
+        with tifffile.TiffFile(path) as file:
+            if file.is_imagej or len(file.pages) == 1:  # ImageJ may hold a stack in its only page
+                pages = [page for page in file.series[0].pages if page is not None]
+                shape = file.series[0].shape
+            else:
+                pages = list(file.pages)
+                shape = (len(pages), *pages[0].shape)
+            first = pages[0].aspage()
+            _check_last(path, file)
+            _check_ome(path, file)
+            if len(shape) not in (2, 3) or first.samplesperpixel != 1:
+                raise ValueError(
+                    f"path: {path} must hold images of one value per pixel, in one stack; got shape {shape}, "
+                    f"{first.samplesperpixel} values per pixel."
+                )
+            _check_backed(path, n_bytes, shape, first)
+            if len(shape) == 3 and len(pages) == 1:
+                return list(file.series[0].asarray()), _spacing(file, first)
+            images = []
+            for number, page in enumerate(pages):
+                page = page.aspage()
+                if (page.shape, page.dtype) != (first.shape, first.dtype):
+                    raise ValueError(
+                        f"path: the images in {path} must have the same size and type; the first has "
+                        f"{first.shape} of {first.dtype}, and number {number + 1} {page.shape} of "
+                        f"{page.dtype}."
+                    )
+                images.append(page.asarray())
+            return images, _spacing(file, first)
+    except MemoryError:
+        raise
+    except Exception as fault:
+        if isinstance(fault, ValueError) and str(fault).startswith("path:"):
+            raise
+        raise ValueError(f"path: {path} cannot be read: corrupt, cut short, or {fault}") from fault
+
+
+def _check_last(path: Path, file: Any) -> None:
+    """**Raises** `ValueError` if the pages that were found are followed by others. tifffile leaves out what
+    lies beyond the end of the file."""
+    format, handle = file.tiff, file.filehandle
+    handle.seek(file.pages[-1].aspage().offset)
+    (tags,) = struct.unpack(format.tagnoformat, handle.read(format.tagnosize))
+    handle.seek(tags * format.tagsize, 1)
+    following = handle.read(format.offsetsize)
+    if len(following) < format.offsetsize or any(following):
+        raise ValueError(f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
+
+
+def _check_backed(path: Path, n_bytes: int, shape: tuple[int, ...], page: Any) -> None:
+    voxels = math.prod(shape)
+    if not 0 < voxels <= MOST_VOXELS or page.dtype is None:
+        raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels of a known type; got shape {shape}.")
+    expected = voxels * page.dtype.itemsize
+    packed = page.compression != 1 or page.bitspersample < 8 * page.dtype.itemsize
+    if n_bytes * (MOST_COMPRESSED if packed else 1) < expected:
+        raise ValueError(
+            f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces voxels of "
+            f"{expected}."
+        )
+
+
+def _check_ome(path: Path, file: Any) -> None:
+    """**Raises** `ValueError` if OME says that not all images of a file are slices of one volume."""
+    images = _ome_images(file)
+    for pixels in (image["Pixels"] for image in images):
+        counts = [int(pixels[f"Size{axis}"]) for axis in "CT"]
+        if len(images) > 1 or math.prod(counts) > 1:
+            raise ValueError(
+                f"path: {path} must hold one volume of one channel; by OME it holds {len(images)}, the first "
+                f"of {counts[0]} channels at {counts[1]} times. Save one of them alone."
+            )
+
+
+def _ome_images(file: Any) -> list[Any]:
+    """What OME tells of each volume in a file."""
+    if not file.is_ome:
+        return []
+    found = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"].get("Image", [])
+    return found if isinstance(found, list) else [found]
+
+
+def _spacing(file: Any, page: Any) -> dict[str, Any]:
+    """Spacing (x, y, z) as OME or ImageJ wrote it, in mm, or in its own unit if that is none of length."""
+    try:
+        steps = _ome_spacing(file) if file.is_ome else _imagej_spacing(file, page)
+    except (KeyError, IndexError, ZeroDivisionError, TypeError, ValueError):
+        return {}
+    return {"spacing": steps} if all(0 < step < math.inf for step in steps) else {}
+
+
+def _ome_spacing(file: Any) -> list[float]:
+    pixels = _ome_images(file)[0]["Pixels"]
+    return [
+        float(pixels[f"PhysicalSize{axis}"]) * _unit(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
+        for axis in "XYZ"
+    ]
+
+
+def _imagej_spacing(file: Any, page: Any) -> list[float]:
+    found = file.imagej_metadata or {}
+    (nx, dx), (ny, dy) = (page.tags[name].value for name in ("XResolution", "YResolution"))
+    unit = _unit(found.get("unit", ""))
+    return [dx / nx * unit, dy / ny * unit, float(found["spacing"]) * unit]
+
+
+def _unit(name: Any) -> float:
+    return LENGTHS.get(str(name).replace("\\u00B5", "µ").lower(), 1.0)

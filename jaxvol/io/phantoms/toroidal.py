@@ -1,0 +1,208 @@
+"""Synthetic ultrasound volumes of known scenes, as acquired by a swept probe.
+
+The scene lies in the world, in mm, in front of a probe whose motor axis is the x axis and whose middle beam
+points along z. It is sampled at the nodes of the probe's beams, and speckle is applied.
+"""
+
+from collections.abc import Callable, Iterable
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..._util.checks import flag, integer
+from ...march.transforms.toroidal_map import ToroidalMap
+from ...scene.volume import Volume
+from .canvas import SLAB, smooth_min
+from .shapes import Block, Shape, ball, capsule, ellipsoid, tube
+
+
+SOFT = 1.2  # mm over which a boundary falls from full to none
+GRAIN = 0.35  # mm along a beam over which speckle is correlated: half the pulse length
+DEGREES = np.pi / 180
+
+Scene = Callable[[Block, Block, Block, Block], Block]
+"""Mean echo, 0 to 255, at world points x, y, z of depth γ; all in mm."""
+
+
+def toroidal_phantom(
+    name: str,
+    shape: tuple[int, int, int] | Any = (64, 96, 160),
+    *,
+    probe: ToroidalMap | Any | None = None,
+    speckle: bool | Any = True,
+    seed: int | Any = 0,
+) -> tuple[Volume, ToroidalMap]:
+    """A synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the world.
+
+    | name | what | mean echo |
+    |---|---|---|
+    | `shells` | reverberation: echoes 2 mm thick, 12 mm apart along every beam, each weaker than the one \
+before | 220, falling by 15 % each; 8 between |
+    | `spheres` | rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
+tissue 60; cysts 4; targets 130, 160, 190 |
+    | `wires` | the spheres, and between them wires 3 mm thick, along x, along y and obliquely in depth | as \
+spheres; wires 255 |
+    | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
+90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
+
+    Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe, which only
+    determine where it is sampled; the grains of the speckle do.
+
+    **Arguments:**
+
+    - `name`: of the table.
+    - `shape`: nodes along (β, σ, γ), at least 8 each. The data are stored as acquired, `data[β, σ, γ]`,
+      depth fastest in memory.
+    - `probe`: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
+    - `speckle`: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
+      (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
+    - `seed`: of the speckle.
+
+    **Returns:** a uint8 volume, whose own spacing has no meaning, and the probe.
+
+    **Raises:** `ValueError` for an unknown name, a shape that is not three integers of at least 8, a probe
+    that is not a `ToroidalMap`, a `speckle` that is not true or false, and a seed that is not a
+    non-negative integer.
+    """
+    if name not in SCENES:
+        raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")
+    if not isinstance(shape, tuple | list) or len(shape) != 3:
+        raise ValueError(f"shape must be three numbers of nodes, along (β, σ, γ); got {shape!r}.")
+    n_beta, n_sigma, n_gamma = (integer("shape", n, 8) for n in shape)
+    rng, speckle = np.random.default_rng(integer("seed", seed, 0)), flag("speckle", speckle)
+    if probe is None:
+        probe = ToroidalMap(20.0, 30.0, _about(35), _about(40), (0.0, 100.0))
+    if not isinstance(probe, ToroidalMap):
+        raise ValueError(f"probe must be a ToroidalMap; got {probe!r}.")
+    data = np.empty((n_beta, n_sigma, n_gamma), np.uint8)
+    beta, sigma, gamma = (
+        np.linspace(float(ends[0]), float(ends[1]), n, dtype=np.float32)
+        for ends, n in zip((probe.beta_range, probe.sigma_range, probe.gamma_range), data.shape, strict=True)
+    )
+    thick = max(1, SLAB // (n_sigma * n_gamma))
+    for start in range(0, n_beta, thick):
+        nodes = np.stack(np.meshgrid(beta[start : start + thick], sigma, gamma, indexing="ij"), axis=-1)
+        x, y, z = np.moveaxis(np.asarray(probe.to_world(nodes), np.float32), -1, 0)
+        echo = SCENES[name](x, y, z, nodes[..., 2])
+        if speckle:
+            echo = echo * _speckle(rng, echo.shape, GRAIN / float(gamma[1] - gamma[0]))
+        data[start : start + thick] = _rounded(echo)
+    return Volume(data), probe
+
+
+def _about(half: float) -> tuple[float, float]:
+    """The range 90° ± `half` degrees, in radians."""
+    return (90 - half) * DEGREES, (90 + half) * DEGREES
+
+
+def _rounded(echo: Block) -> UInt8[np.ndarray, "_ _ _"]:
+    return np.rint(np.clip(echo, 0, 255)).astype(np.uint8)
+
+
+def _speckle(
+    rng: np.random.Generator, shape: tuple[int, ...], grain: float
+) -> Float[np.ndarray, "beta sigma gamma"]:
+    """Rayleigh-distributed numbers of mean 1, correlated over `grain` nodes of the last axis."""
+    from scipy.ndimage import gaussian_filter1d  # here, so that a first image does not wait for it
+
+    impulse = np.zeros(shape[-1])
+    impulse[shape[-1] // 2] = 1
+    # standard deviation of white noise of variance 1 after filtering
+    deviation = np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2))
+    re, im = (
+        gaussian_filter1d(rng.standard_normal(shape, np.float32), grain, mode="wrap") / np.float32(deviation)
+        for _ in range(2)
+    )
+    return np.sqrt(re * re + im * im) * np.float32(np.sqrt(2 / np.pi))
+
+
+def _paint(echo: Block, value: float, distance: Block) -> None:
+    """Paint a material over the present echo, where the distance to it is negative."""
+    echo += np.clip(0.5 - distance / SOFT, 0, 1) * (value - echo)
+
+
+def _shells(x: Block, y: Block, z: Block, gamma: Block) -> Block:
+    apart, thick = 12.0, 2.0
+    number = np.maximum(np.rint(gamma / apart), 1)
+    echo = 220 * 0.85 ** (number - 1)
+    return 8 + (echo - 8) * np.exp(-(((gamma - apart * number) / (thick / 2)) ** 2))
+
+
+def _spheres(x: Block, y: Block, z: Block, gamma: Block) -> Block:
+    echo = np.full_like(x, 60)
+    for radius, across, target in ((6, -30, 130), (9, -4, 160), (12, 28, 190)):
+        for value, side in ((4, -20), (target, 20)):
+            _paint(echo, value, ball((across, side, 95), radius).distance(x, y, z))
+    return echo
+
+
+def _wires(x: Block, y: Block, z: Block, gamma: Block) -> Block:
+    echo = _spheres(x, y, z, gamma)
+    for wire in WIRES:
+        _paint(echo, 255, wire.distance(x, y, z))
+    return echo
+
+
+def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
+    # origin at the navel; x from crown to rump, y from right to left, z from back to front
+    at = x, y, 100 - z
+    either_side = x, abs(y), at[2]
+    echo = np.full_like(x, 30)
+    _paint(echo, 4, ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at))
+    head, limbs = _joined(HEAD, at, 4), _joined(LIMBS, either_side, 2)
+    body = _joined(TRUNK, at, 8)
+    body = smooth_min(smooth_min(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
+    body = smooth_min(smooth_min(limbs, body, 4), _joined(CORD, at, 0), 2)
+    _paint(echo, 120, body)
+    _paint(echo, 70, body + 2)
+    _paint(echo, 170, head + 2.5)
+    _paint(echo, 40, head + 4.5)
+    _paint(echo, 170, _joined(SPINE, at, 0))
+    _paint(echo, 170, _joined(BONES, either_side, 0))
+    return echo
+
+
+def _joined(shapes: Iterable[Shape], at: tuple[Block, Block, Block], blend: float) -> Block:
+    """Distance to the union of shapes, with rounded seams."""
+    return reduce(lambda a, b: smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
+
+
+WIRES = [
+    capsule((-60, 0, 110), (60, 0, 110), 1.5),
+    capsule((0, -55, 75), (0, 55, 75), 1.5),
+    capsule((-25, -15, 65), (25, 15, 130), 1.5),
+    capsule((25, -15, 65), (-25, 15, 130), 1.5),
+]
+
+# parts of the fetus; of paired ones, that at y > 0
+SHOULDER, ELBOW, WRIST, FINGERS = (-11, 13, 0), (3, 20, 7), (-10, 13, 17), (-16, 11, 20)
+HIP, KNEE, ANKLE, TOES = (27, 8, -2), (19, 15, 19), (39, 9, 13), (43, 8, 21)
+HEAD = [ellipsoid((-33, 0, 2), (16, 13.5, 15)), ellipsoid((-27, 0, 6), (11, 9.5, 11))]
+FACE = [
+    capsule((-31, 0, 15.5), (-26.5, 0, 18.5), 1.6, 2.4),  # nose
+    ellipsoid((-22.5, 0, 15.5), (2.2, 3.5, 2.0)),  # lips
+    ball((-18.5, 0, 11.5), 4),  # chin
+]
+EARS = [ellipsoid((-29, 13.5, -1), (4, 1.5, 3))]
+TRUNK = [
+    capsule((-25, 0, -2), (-14, 0, -4), 8),  # neck
+    ellipsoid((-3, 0, -3), (17, 13, 13)),
+    ellipsoid((13, 0, -2), (17, 14.5, 14.5)),
+    ellipsoid((27, 0, -6), (12, 13, 11)),
+]
+LIMBS = [
+    capsule(SHOULDER, ELBOW, 5, 4),
+    capsule(ELBOW, WRIST, 4, 3),
+    capsule(WRIST, FINGERS, 3.5, 2.5),
+    capsule(HIP, KNEE, 8, 5.5),
+    capsule(KNEE, ANKLE, 5.5, 3.5),
+    capsule(ANKLE, TOES, 3.5, 3),
+]
+BONES = [capsule(a, b, 1.2) for a, b in ((SHOULDER, ELBOW), (ELBOW, WRIST), (HIP, KNEE), (KNEE, ANKLE))]
+SPINE = [ball((x, 0, -10 - 0.004 * (30 - abs(x - 4)) * x), 1.8) for x in range(-18, 32, 5)]
+CORD = tube([(13, 0, 12), (11, -9, 20), (18, -19, 21), (29, -25, 15), (36, -27, 4), (38, -27, -10)], 2.2)
+
+
+SCENES: dict[str, Scene] = {"shells": _shells, "spheres": _spheres, "wires": _wires, "fetus": _fetus}

@@ -1,0 +1,160 @@
+"""Which stretches of a beam of neighbouring rays are empty? Bounding boxes around beams.
+
+A beam is a group of rays that share one query. At each distance from their origins, the rays lie in a
+bounding box whose faces move linearly with the distance.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._util.vec3 import Scalar, Vec3, along
+from ..scene.occupancy import Index, Occupancy, Sums
+from ..scene.space import Ray
+from ..xla.platform import on_gpu
+from ..xla.sharding import varying
+
+
+STRETCHES = 128
+"""Maximum number of stretches of a beam. If crossing the volume takes more segments (samples taken at once)
+than this, a stretch covers several."""
+
+ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
+
+
+class Box(eqx.Module):
+    """Bounding box of a beam's rays at each distance from their origins: at the distance `near + u`, from
+    `low + u low_rate` to `high + u high_rate`, in cells of the occupancy."""
+
+    near: Float[Array, "*beams"]
+    far: Float[Array, "*beams"]
+    low: Vec3
+    high: Vec3
+    low_rate: Vec3
+    high_rate: Vec3
+
+    @classmethod
+    def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
+        """The box of rays; the last axis is that of a beam's rays. Rays that miss the volume are ignored."""
+        rays = jax.lax.stop_gradient(rays)
+        hit = rays.length > 0
+        near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
+        near = jnp.where(jnp.isfinite(near), near, 0)
+        far = jnp.max(jnp.where(hit, rays.t_in + rays.length, -jnp.inf), axis=-1)
+        entry, direction = occupancy.own_point(rays.entry), occupancy.own_direction(rays.direction)
+        start = along(entry, direction, near[..., None] - rays.t_in)
+        return cls._of(occupancy, start, direction, near, far, hit, jnp.zeros_like(near))
+
+    @classmethod
+    def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
+        """The box of all camera rays between a beam's corner rays; the last axis is that of the corners."""
+        origin, direction = jax.lax.stop_gradient((origin, direction))
+        origin, direction = occupancy.own_point(origin), occupancy.own_direction(direction)
+        spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
+        x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
+        middle = jnp.sqrt(x * x + y * y + z * z)
+        radius = jnp.sqrt(sum(span**2 for span in spans)) / 2
+        # A direction between the corners is an average of theirs, normalized, which lengthens it by at most 1
+        # minus the cosine of the widest angle to the mean direction.
+        axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
+        cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
+        bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
+        # bounds for all rays: parallel rays have different origins, hence the nearest and farthest corner
+        nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
+        spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
+        near, far = jnp.maximum(nearest - radius - spread, 0), farthest + radius + spread
+        start = along(origin, direction, near[..., None])
+        return cls._of(occupancy, start, direction, near, far, jnp.ones(start[0].shape, bool), bulge)
+
+    @classmethod
+    def _of(
+        cls,
+        occupancy: Occupancy,
+        start: Vec3,
+        direction: Vec3,
+        near: Scalar,
+        far: Scalar,
+        counts: Bool[Array, "*beams rays"],
+        bulge: Scalar,
+    ) -> "Box":
+        """`start`, `direction`: along the axes of the occupancy."""
+
+        def least(values: Array, sign: int) -> Array:
+            return sign * jnp.min(jnp.where(counts, sign * values, jnp.inf), axis=-1)
+
+        sides = []
+        for s, d, size, corner in zip(start, direction, occupancy.size, occupancy.origin, strict=True):
+            # allows for rounding a ray's start to float32 when the camera is far away
+            slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
+            s, d = (s - corner) / size, d / size
+            sides.append(
+                (
+                    least(s, 1) - slack,
+                    least(s, -1) + slack,
+                    least(d, 1) - bulge / size,
+                    least(d, -1) + bulge / size,
+                )
+            )
+        low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
+        return cls(near, far, low, high, low_rate, high_rate)
+
+    def between(self, first: Scalar, last: Scalar) -> tuple[Vec3, Vec3]:
+        """Bounding box of all rays from `near + first` to `near + last`, both ≥ 0."""
+        low = jax.tree.map(lambda s, r: s + jnp.minimum(first * r, last * r), self.low, self.low_rate)
+        high = jax.tree.map(lambda s, r: s + jnp.maximum(first * r, last * r), self.high, self.high_rate)
+        return low, high
+
+
+class Stretches(eqx.Module):
+    """Which stretches of beams are empty.
+
+    - `near`: distance from the ray origins to the first stretch. `length`: of each stretch.
+    - `following`: for each stretch, the first at or behind it that is not empty.
+    """
+
+    near: Float[Array, " beams"]
+    length: Scalar
+    following: Int[Array, "stretches beams"]
+
+
+def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
+    """Find the next occupied stretch for each stretch of each beam, from the last stretch to the first."""
+    across = jnp.maximum(box.far - box.near, 0)
+    # a whole multiple of `stretch`, the same for all beams, so that no segment is cut in two
+    multiple = jnp.ceil(jnp.max(across) / (stretch * STRETCHES))
+    length = jnp.maximum(multiple, 1) * stretch
+    number = jnp.minimum(jnp.ceil(jnp.max(across) / length).astype(jnp.int32), STRETCHES)
+
+    def occupied(at: Int[Array, ""]) -> Bool[Array, " beams"]:
+        first = at.astype(length.dtype) * length
+        low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
+        shape, inside = occupancy.occupied.shape, first < across
+        for a, b, n in zip(low, high, shape, strict=True):
+            inside &= (b >= 0) & (a <= n)
+
+        def cells(corner: Vec3) -> Index:
+            """Cell indices of a corner, clipped to the grid; arbitrary for boxes outside it."""
+            x, y, z = (
+                jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
+                for c, n in zip(corner, shape, strict=True)
+            )
+            return x, y, z
+
+        return inside & sums.any_between(cells(low), cells(high))
+
+    if on_gpu():  # all at once: a loop would take longer to launch than to run
+        at = jnp.arange(STRETCHES, dtype=jnp.int32)
+        own = jnp.where(jax.vmap(occupied)(at), at[:, None], STRETCHES)
+        return Stretches(box.near, length, jax.lax.cummin(own, axis=0, reverse=True))
+
+    def visit(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        at, next_one, table = state
+        at = at - 1
+        next_one = jnp.where(occupied(at), at, next_one)
+        return at, next_one, jax.lax.dynamic_update_slice_in_dim(table, next_one[None], at, 0)
+
+    none = jnp.full(box.near.shape, STRETCHES, jnp.int32)
+    table = jnp.full((STRETCHES, *none.shape), STRETCHES, jnp.int32)
+    _, _, table = jax.lax.while_loop(lambda state: state[0] > 0, visit, varying((number, none, table)))
+    return Stretches(box.near, length, table)

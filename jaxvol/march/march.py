@@ -1,0 +1,520 @@
+"""Where is the next sample, and which part of the ray does it stand for?
+
+A march is a step length and a tuple of transforms. Without any it is Levoy's ray casting: samples at depths
+0, d, 2d, … past the entry, each of which stands for a cell of width d behind it, up to the exit. A transform
+is one idea of one paper. It overrides one of these methods, the seams, or two, and leaves the others alone.
+At each seam the answers of all transforms are combined, so that they compose.
+
+| seam | question | default answer |
+|---|---|---|
+| `locate` | which grid coordinate is this world point? | spacing and origin |
+| `clip` | which part of the volume is seen? | all of it |
+| `start` | how many steps past the entry is the first cell? | 0 |
+| `shift` | by what part of a step do samples after the first transparent one move? | 0 |
+| `empty_space` | where is nothing visible? | unknown |
+| `prepared` | what must be known of the scene? | nothing |
+| `stride_error` | how wrong is the image if cells are so many steps long here? | unknown: 1 step |
+| `cut` | which part of its cell does a sample stand for? | all of it |
+| `stop` | is this ray finished? | not before the exit |
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial, reduce
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._util.checks import check_answer, described, integer, number, power_of_two
+from .._util.vec3 import Scalar, Vec3
+from ..scene.occupancy import Occupancy
+from ..scene.space import Affine, Ray, Space
+from ..scene.variation import Variation, Windows
+from ..scene.volume import Volume
+from .beams import Box
+
+
+Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
+
+
+class Cell(eqx.Module):
+    """The piece of a ray that one sample stands for: from depth `front`, of this `width`.
+
+    `cut` tells that it was shortened at the volume's exit.
+    """
+
+    front: Scalar
+    width: Scalar
+    cut: Bool[Array, ""]
+
+
+RUN = 4
+"""Cells in a row that are equally long. Where strides are not all 1, the cells of a ray come in such runs."""
+
+
+class Run(NamedTuple):
+    """RUN cells of a ray, in a row, each `stride` steps long.
+
+    - `front`: depth at which the first one begins. (What `Transform.shift` adds is not in it.)
+    - `stride`: a power of two, static. `step`: its unit, world length.
+    """
+
+    front: Scalar
+    stride: int
+    step: Scalar
+
+    @property
+    def middle(self) -> Scalar:
+        """Depth of the middle of the run."""
+        return self.front + RUN * self.stride / 2 * self.step
+
+    def within(self, length: Scalar) -> Bool[Array, ""]:
+        """Whether the run ends at this depth or before, up to a thousandth of a step: where rays are so many
+        steps long, rounding must not decide."""
+        return self.front + (RUN * self.stride - 1e-3) * self.step <= length
+
+
+class Strides(NamedTuple):
+    """The cells of a ray from an index on.
+
+    - `begin`: index at which one begins.
+    - `stride`: their length, in steps, up to the end of the run.
+    - `error`: what is predicted of the run, 0 if it was begun before.
+    """
+
+    begin: Int[Array, ""]
+    stride: Int[Array, ""]
+    error: Scalar
+
+
+class View(NamedTuple):
+    """The image that is rendered.
+
+    - `ray`: origin and unit direction of the ray through a column and a row.
+    - `size`: (width, height).
+    - `corner`: pixel (column, row) that keys the random numbers of the ray through column 0 and row 0.
+    - `first_hit`: distances along the rays of columns and rows to their first visible sample, infinite where
+      there is none. It marches these rays, which leap by the index that it is given.
+    """
+
+    ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
+    size: tuple[int, int]
+    corner: tuple[Int[Array, ""], Int[Array, ""]]
+    first_hit: Callable[["EmptySpaceIndex", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
+
+
+class EmptySpaceIndex(eqx.Module):
+    """Where nothing is visible. It is asked about beams of rays."""
+
+    @abstractmethod
+    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
+        """What `any_visible` and `skip_to` need to know about these beams, from the boxes around them;
+        computed once. `stretch`: the length of a segment; leaps shorter than that are of no use."""
+
+    @abstractmethod
+    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
+        """Whether anything may be visible along each beam."""
+
+    @abstractmethod
+    def skip_to(
+        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        """For some rays, of these beams: a depth of at least `depth`, before which nothing is visible."""
+
+    def within_ranges(self) -> "EmptySpaceIndex":
+        """The part of it that is of use where each ray's first and last visible cell are known."""
+        return self
+
+
+class Transform(eqx.Module):
+    """One change to a march. Override the seam that the idea is about; the defaults change nothing.
+
+    All methods see one ray. Engines batch them.
+    """
+
+    def locate(self, space: Space, volume: Volume) -> Space:
+        """The space in which rays meet the volume, in place of `space`."""
+        return space
+
+    def clip(self, space: Space) -> Space:
+        """The same space, of which a part is left out: rays are shorter, or have more gaps. Called once all
+        transforms have answered `locate`."""
+        return space
+
+    def start(self, steps: Scalar, ray: Ray) -> Scalar:
+        """Steps from the entry to the front of the first cell; negative if `cut` trims what lies before."""
+        return steps
+
+    def shift(self, ray: Ray) -> Scalar:
+        """By how many steps the samples after the ray's first transparent one move, in [-1, 0].
+
+        A march shifts each ray once, after its first cell of opacity 0, so that at most this cell is sampled
+        twice. Everywhere else rays advance by whole steps. The shifts of several transforms are summed, and
+        clipped to [-1, 0]."""
+        return jnp.zeros_like(ray.length)
+
+    def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
+        """Where nothing is visible; None if that is unknown. Called once for each image. `view`: of the
+        image; None for `render_rays`."""
+        return None
+
+    def prepared(self, march: "March", space: Space, windows: Windows, variation: Variation) -> "Transform":
+        """This transform with what `stride_error` needs to know of the scene, found once for each image, and
+        without a gradient: in fields that hold None before, and arrays of integers afterwards.
+
+        `windows`: how the volume's values vary, block by block; `variation`: how much what is
+        composited changes within their ranges."""
+        return self
+
+    @property
+    def longest_stride(self) -> int:
+        """The longest stride that `stride_error` is asked about: a static power of two, at most 64."""
+        return 1
+
+    @property
+    def subdivision(self) -> int:
+        """Into how many parts each step of the march is divided before all else; a static integer."""
+        return 1
+
+    def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
+        """By how much the image is wrong because of these cells, if nothing lies in front of them, as far as
+        can be predicted; and how much is tolerated.
+
+        Both depend on the ray and the run alone. A run is allowed if its error, times the transmittance in
+        front of it, is at most what is tolerated (if several transforms override this, by each), and always
+        if its stride is 1. A run of stride s begins at a multiple of RUN s steps, from `March.phase` steps
+        before the ray's first cell on. Where a run ends, a march takes the longest one that is allowed and
+        begins there (and ends before the exit, unless cells are cut there). Of two runs that meet one holds
+        the other, so that leaps, which only cross what is transparent, do not change which ones are taken.
+        Gradients take strides as given; the image jumps where one changes."""
+        unknown = jnp.full(jnp.shape(run.front), jnp.inf, ray.length.dtype)
+        return unknown, jnp.zeros_like(unknown)
+
+    def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+        """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
+        is fixed; where it is more than one, a piece may have width 0."""
+        return (cell,)
+
+    joins: ClassVar[bool] = False
+    """Of a transform that overrides `cut`: whether each piece begins where the one in front of it ends, also
+    from cell to cell, unless it lies past the exit. Pieces that are integrated (`quadrature="preintegrated"`)
+    then share what is measured where they meet."""
+
+    ends_at_exit: ClassVar[bool] = False
+    """Whether `cut` ends at the exit what reaches past it."""
+
+    def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
+        """Whether the ray is finished, given the answer of the transforms before this one."""
+        return stopped
+
+
+class March(eqx.Module):
+    """How rays step through a volume.
+
+    **Arguments:**
+
+    - `step`: distance d between samples, world length, > 0.
+    - `transforms`: applied in this order at every seam; none may be given twice.
+    - `quadrature`: what a cell's colour and extinction are. `"left"`: those at its front, as the papers do;
+      the error falls with d. `"midpoint"`: those in its middle; the error falls with d².
+      `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
+      along it, the colour weighted by the extinction. The error falls with d², too, and a narrow peak of the
+      transfer function counts wherever the two values lie on either side of it. A mean does not know that
+      what is in front in a cell hides what is behind: for a cell of opacity α and optical depth τ, this errs
+      by at most α τ / 8 times the difference of its colours. Where the transfer function is neither steep nor
+      has narrow peaks, `"midpoint"` may be more accurate, in half to two thirds of the time. It takes one
+      fetch for each cell and one more for each segment, or two for each piece where a transform's pieces are
+      not joined (`Transform.joins`). Extinction times the range of values must stay below the greatest number
+      of their type, 3e38 for float32: the integral over values is infinite beyond, and the image NaN.
+      Where two neighbouring control points have extinction 0, the gradient by both together is exact; how it
+      is divided between them is off by some 1e-4 of it, since the colour of a cell without extinction is not
+      weighted.
+      Of a labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take
+      it there, too, and light is computed there.
+    - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
+      2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
+      default 131 072, so that every march ends.
+
+    What is thinner than a step is missed by a part of the rays. Where a march fails, and where not:
+    `experiments/stability.py`, "sheets thinner than a step", "rays of very many samples",
+    "rays that run out of samples".
+
+    **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
+    transform, for a transform given twice, and for a `max_samples` that is no such integer.
+    """
+
+    step: Float[Array, ""]
+    transforms: tuple[Transform, ...]
+    quadrature: Quadrature = eqx.field(static=True)
+    max_samples: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        step: Any,
+        transforms: tuple[Transform, ...] | Any = (),
+        quadrature: Quadrature | Any = "left",
+        *,
+        max_samples: int | Any | None = None,
+    ):
+        self.step = number("step", step, above=0)
+        if not isinstance(transforms, tuple | list):
+            raise ValueError(
+                f"transforms must be a tuple, such as (AlphaCorrection(),); got {described(transforms)}."
+            )
+        self.transforms = tuple(transforms)
+        kinds = [type(t) for t in transforms]
+        for transform in transforms:
+            if not isinstance(transform, Transform):
+                raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
+            if kinds.count(type(transform)) > 1:
+                name = type(transform).__name__
+                raise ValueError(
+                    f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
+                )
+            _check_strides(transform)
+        if quadrature not in get_args(Quadrature):
+            names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
+            raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
+        self.quadrature = quadrature
+        self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**24)
+
+    @property
+    def most_samples(self) -> int:
+        """`max_samples`, or its default."""
+        return 2**17 if self.max_samples is None else self.max_samples
+
+    def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
+        """Where nothing is visible, as the first transform that overrides `empty_space` has it."""
+        indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
+        for transform, index in zip(self.transforms, indices, strict=True):
+            _check_kind(transform, "empty_space", index, EmptySpaceIndex | None)
+        return next((index for index in indices if index is not None), None)
+
+    def _overriding(self, seam: str) -> list[Transform]:
+        return [transform for transform in self.transforms if _overrides(transform, seam)]
+
+    @property
+    def leaps(self) -> bool:
+        """Whether any transform overrides `empty_space`."""
+        return bool(self._overriding("empty_space"))
+
+    @property
+    def may_shift(self) -> bool:
+        """Whether any transform overrides `shift`."""
+        return bool(self._overriding("shift"))
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether any transform must know the scene before it is marched."""
+        return bool(self._overriding("prepared"))
+
+    def prepared(
+        self, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
+    ) -> "March":
+        """The march, whose transforms know of the scene what they need. `windows`: of the volume, where it
+        `looks_ahead`."""
+        if windows is None:
+            return self
+        march, space, windows = jax.lax.stop_gradient((self, space, windows))
+        varies = jax.lax.stop_gradient(variation(windows))
+        known = []
+        for transform, constant in zip(self.transforms, march.transforms, strict=True):
+            if _overrides(transform, "prepared"):
+                prepared = constant.prepared(march, space, windows, varies)
+                _check_kind(transform, "prepared", prepared, type(transform))
+                # its parameters keep their gradients
+                transform = eqx.combine(eqx.filter(transform, eqx.is_inexact_array), prepared)
+            known.append(transform)
+        return eqx.tree_at(lambda march: march.transforms, self, tuple(known))
+
+    @property
+    def strides_vary(self) -> bool:
+        """Whether any transform overrides `stride_error`."""
+        return bool(self._overriding("stride_error"))
+
+    @property
+    def longest_stride(self) -> int:
+        """The longest stride of a cell, in steps."""
+        return min((transform.longest_stride for transform in self._overriding("stride_error")), default=1)
+
+    def locate(self, volume: Volume) -> Space:
+        """The space in which rays meet the volume."""
+        space: Space = Affine(volume)
+        for transform in self.transforms:
+            space = transform.locate(space, volume)
+            _check_kind(transform, "locate", space, Space)
+        for transform in self.transforms:
+            space = transform.clip(space)
+            _check_kind(transform, "clip", space, Space)
+        return space
+
+    def start(self, ray: Ray) -> Scalar:
+        """Steps from the entry to the first cell."""
+        steps = jnp.zeros_like(ray.length)
+        for transform in self.transforms:
+            steps = _checked(transform, "start", transform.start(steps, ray), steps)
+        return steps
+
+    def shift(self, ray: Ray) -> Scalar:
+        """By how many steps samples after a ray's first transparent cell move, in [-1, 0]."""
+        shift = jnp.zeros_like(ray.length)
+        for transform in self.transforms:
+            shift = shift + _checked(transform, "shift", transform.shift(ray), shift)
+        # beyond that a sample would leave the cell that was found transparent
+        return jnp.clip(shift, -1, 0)
+
+    def phase(self, ray: Ray) -> Int[Array, ""] | None:
+        """How many steps before a ray's first cell the first of all runs begins, less than the longest one:
+        at random where `start` or `shift` are. These alone move samples by less than a step, too little to
+        break the wood grain of longer cells, and of the runs themselves. None if 0 for all rays."""
+        if not self._overriding("start") and not self.may_shift:
+            return None
+        part = jax.lax.stop_gradient(self.start(ray) - self.shift(ray))
+        # its lower digits, of which the part of a step is nearly independent; all of it is exact
+        part = 32 * part
+        longest = RUN * self.longest_stride
+        return jnp.floor((part - jnp.floor(part)) * longest).astype(jnp.int32) & (longest - 1)
+
+    def divided(self) -> "March":
+        """This march with its steps as short as its transforms want them."""
+        parts = max((transform.subdivision for transform in self.transforms), default=1)
+        if parts == 1:
+            return self
+        with jax.ensure_compile_time_eval():  # a step that is known stays so inside `jax.jit`
+            step = self.step / parts
+        return eqx.tree_at(lambda march: march.step, self, step)
+
+    def strides(
+        self,
+        ray: Ray,
+        index: Int[Array, ""],
+        stride: Int[Array, ""],
+        target: Int[Array, ""],
+        transmittance: Scalar,
+        phase: Int[Array, ""] | None,
+    ) -> Strides:
+        """The cells of a ray from where the run begins that holds `target`, or from `index` on, to which the
+        ray has come, in a run of this `stride`, if `target` lies in the same run. Up to `target` all is
+        transparent. `phase`: of the ray, which does not change along it."""
+        march, ray, transmittance = jax.lax.stop_gradient((self, ray, transmittance))
+        start, chosen = march.start(ray), None
+        phase = jnp.zeros_like(index) if phase is None else phase
+        since, ahead, length = index + phase, target + phase, RUN * stride
+        end = jnp.where(since & (length - 1) == 0, since, (since | (length - 1)) + 1)
+        # before the ray's first cell there is no run
+        end = jnp.where(index == 0, phase, end)
+        for level in range(self.longest_stride.bit_length()):
+            first = ahead & -(RUN << level)
+            front = (start + (first - phase).astype(start.dtype)) * march.step
+            run = Run(front, 1 << level, march.step)
+            predicted = [_predicted(transform, ray, run) for transform in march._overriding("stride_error")]
+            greatest = reduce(jnp.maximum, [error for error, _ in predicted])
+            # what is unknown is infinite, but does not count where nothing of it is seen
+            error = jnp.where(transmittance > 0, transmittance * greatest, 0)
+            found = Strides(first - phase, jnp.full_like(index, run.stride), error)
+            if chosen is None:
+                # the first of all runs may have begun before the ray's first cell
+                chosen = found._replace(begin=jnp.maximum(found.begin, end - phase))
+                continue
+            fits = first >= end
+            if not self.ends_at_exit:
+                fits &= run.within(ray.length)
+                for left, back in ray.gaps:  # a shift may still move the run, by a step at most
+                    fits &= run.within(left) | (run.front - run.step >= back)
+            for error, tolerated in predicted:
+                fits &= transmittance * error <= tolerated
+            chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)
+        going = Strides(index, stride, jnp.zeros_like(ray.length))
+        return jax.tree.map(partial(jnp.where, ahead < end), going, chosen)
+
+    def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+        """The pieces of a cell, front to back."""
+        pieces = (cell,)
+        for transform in self.transforms:
+            pieces = tuple(part for piece in pieces for part in _cut(transform, piece, ray, volume))
+        return pieces
+
+    def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
+        """Whether a ray with this much transmittance left ends before its exit."""
+        stopped = jnp.zeros(jnp.shape(transmittance), bool)
+        for transform in self.transforms:
+            stopped = _checked(transform, "stop", transform.stop(stopped, transmittance), stopped)
+        return stopped
+
+    @property
+    def integrates(self) -> bool:
+        """Whether cells are integrated between their ends, rather than sampled."""
+        return self.quadrature == "preintegrated"
+
+    @property
+    def joins(self) -> bool:
+        """Whether each piece of a cell begins where the one in front of it ends."""
+        return all(transform.joins for transform in self._overriding("cut"))
+
+    @property
+    def ends_at_exit(self) -> bool:
+        """Whether a transform cuts cells that reach past the exit; otherwise they count as a whole."""
+        return any(transform.ends_at_exit for transform in self.transforms)
+
+    def sample(self, cell: Cell) -> Scalar:
+        """Depth at which a cell is sampled; of one that is integrated, its middle."""
+        return cell.front if self.quadrature == "left" else cell.front + cell.width / 2
+
+    def ends(self, cell: Cell, ray: Ray) -> tuple[Scalar, Scalar]:
+        """Depths of a cell's front and back, neither before the entry nor past the exit."""
+        return within(ray, cell.front), within(ray, cell.front + cell.width)
+
+
+def within(ray: Ray, depth: Scalar) -> Scalar:
+    """The depth, or that of the entry or the exit where it lies beyond."""
+    # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
+    depth = jnp.where(depth > 0, depth, 0)
+    return jnp.where(depth < ray.length, depth, ray.length)
+
+
+def _overrides(transform: Transform, seam: str) -> bool:
+    return getattr(type(transform), seam) is not getattr(Transform, seam)
+
+
+def _checked(transform: Transform, seam: str, answer: Any, expected: Array) -> Array:
+    """A transform's answer, if it is an array like the one expected."""
+    check_answer(transform, seam, answer, expected)
+    return answer
+
+
+def _check_kind(transform: Transform, seam: str, answer: Any, kind: Any) -> None:
+    if not isinstance(answer, kind):
+        wanted = getattr(kind, "__name__", str(kind))
+        raise ValueError(
+            f"{type(transform).__name__}.{seam} must return a {wanted}; got {described(answer)}."
+        )
+
+
+def _cut(transform: Transform, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+    pieces = transform.cut(cell, ray, volume)
+    _check_kind(transform, "cut", pieces, tuple)
+    if not pieces:
+        raise ValueError(f"{type(transform).__name__}.cut must return at least one cell; got ().")
+    for piece in pieces:
+        _check_kind(transform, "cut", piece, Cell)
+    return pieces
+
+
+def _predicted(transform: Transform, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
+    """A transform's `stride_error`, if it is two numbers like a depth."""
+    answer = transform.stride_error(ray, run)
+    check_answer(transform, "stride_error", answer, (run.front, run.front))
+    return answer
+
+
+def _check_strides(transform: Transform) -> None:
+    name, longest = type(transform).__name__, transform.longest_stride
+    if _overrides(transform, "stride_error") != _overrides(transform, "longest_stride"):
+        raise ValueError(
+            f"transforms: {name} must override both stride_error and longest_stride, or neither."
+        )
+    power_of_two(f"transforms: {name}.longest_stride", longest, 64)
+    integer(f"transforms: {name}.subdivision", transform.subdivision, 1, 64)

@@ -1,0 +1,205 @@
+"""How many steps long may a cell be? As many as the scene lets it be, for a tolerated error of the image."""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Int32
+
+from ..._util.checks import number, power_of_two
+from ..._util.vec3 import Scalar, Vec3
+from ...scene.occupancy import BLOCK
+from ...scene.space import Ray, Space, node_distance
+from ...scene.variation import MARGIN, Variation, Windows
+from ...xla.xla import gather, in_memory
+from ..march import RUN, March, Run, Transform
+
+
+SHARE = 1 / 20
+"""What a block's predicted error is worth in the image: errors of a ray's cells have either sign, and most
+are much smaller than predicted. Measured: `experiments.adaptive_error`."""
+
+HIDDEN = 1 / 4
+"""The same of what the front of a cell hides of its back: more, since that has one sign along a ray. With it,
+volumes of linear and of wavy values stay within their tolerance."""
+
+FARTHEST = 8
+"""Blocks around its own that a run may touch: it is at most 68 voxels long."""
+
+
+class AdaptiveSampling(Transform):
+    """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
+
+    Where the value bends little between nodes, or the transfer function changes little with it, a long cell
+    is as good as several short ones; and so it is behind what hides most of it. Take a block of 4³ voxels, of
+    side ℓ, whose values, with those up to two nodes around it, range over R, with second differences of at
+    most H (per length²). Between the ends of a cell of width w the value leaves the straight line by about
+    δ = H w² / 8 (along a diagonal up to three times as much, and more in cells shorter than a voxel that
+    cross a face between voxels). While the value passes through R once, extinction and emission change by V
+    in total, C of it by the colour, and their slopes by K; C times the extinction is D
+    (`variation.Variation`). Then the optical depth of a stretch as long as the block is wrong by about
+
+        e = ℓ V min(1, δ / R) + q
+
+    where q is what the quadrature errs by where the value is linear: 0 for `"preintegrated"`; V w / 2 for
+    `"left"`; and for `"midpoint"` K (R / ℓ) w² / 24, since it errs where emission bends, or V w / 2 where
+    that is less. The front of a cell hides of its back, in colour, at most h = min(C, D w) w / 8. Cells come
+    in runs of four that are equally long: as long as T max(e / 20, h / 4) is at most `tolerance`, with the
+    largest e and h of the blocks that may hold a part of the run, and T the transmittance in front of it
+    (`Transform.stride_error`). Without `AlphaCorrection`, only cells of one step reach past the exit.
+
+    **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes, from
+    outside and inside (`experiments.adaptive_error`). It does not know how light varies along a cell, nor
+    can cells be shorter than the shortest that it is given: an eighth of a voxel suits tolerances of 0.001, a
+    quarter larger ones; `quadrature="left"` may need less (an eighth erred by 0.0017 in a chest).
+    `Rendering.error` is the root of the summed squares of a ray's runs; where cells are too long, it is
+    greater than the tolerance.
+
+    For what it saves, in samples and in time, see `experiments/results/README.md`: on CPU it is faster only
+    where rays take many samples, since each run of four must be looked up. Under light it was not measured.
+
+    All cells are one step long, and `Rendering.error` is infinite, where nothing is known: for modes that do
+    not composite "over", and for transfer functions that do not say how they vary, such as
+    `LabelTransferFunction`.
+
+    **Arguments:**
+
+    - `tolerance`: of the image's RMSE, > 0. It may be traced: images of any tolerance are made by one
+      program.
+    - `longest`: the most steps of the march that a cell is long, a power of two up to 64.
+    - `finest`: into how many parts the march divides its steps, a power of two; with `longest` at most 64.
+      What other transforms and `max_samples` count in steps are then these parts.
+
+    Where `Jitter` or `EmptySpaceJitter` move samples, each ray's runs begin at a random depth, too, since
+    otherwise long cells, and runs, would leave a wood grain of their own.
+
+    What is known of the voxels is computed once for each array of them. Which cells may be long follows from
+    the transfer function in each image, inside `jax.jit`, too. Strides are constants to derivatives, and so
+    is `Rendering.error`; the image jumps where one changes. So compare gradients with finite differences
+    without this transform, and search along lines with care.
+
+    Where it fails, and where not: `experiments/stability.py`, "tolerances finer than the finest cell",
+    "adaptive strides under light".
+
+    **Raises:** `ValueError` for another tolerance, `longest` or `finest`.
+
+    Source: unpublished.
+    """
+
+    tolerance: Float[Array, ""]
+    longest: int = eqx.field(static=True)
+    finest: int = eqx.field(static=True)
+    errors: Int32[Array, "levels bx by bz"] | None
+    """By stride and block, the predicted error, `_coded`; None before the scene is known."""
+    first: Int[Array, "3"] | None
+    """Index of the first block, where only a part of the volume is known."""
+
+    def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
+        self.tolerance = number("tolerance", tolerance, above=0)
+        self.longest = power_of_two("longest", longest, 64)
+        self.finest = power_of_two("finest", finest, 64)
+        if self.longest * self.finest > 64:
+            raise ValueError(f"longest * finest must be at most 64; got {longest!r} * {finest!r}.")
+        self.errors = self.first = None
+
+    @property
+    def longest_stride(self) -> int:
+        return self.longest * self.finest
+
+    @property
+    def subdivision(self) -> int:
+        return self.finest
+
+    def prepared(
+        self, march: March, space: Space, windows: Windows, variation: Variation
+    ) -> "AdaptiveSampling":
+        # In a branch of its own, so that it is rounded alike in every program: an error that nearly equals
+        # the tolerance must not make different cells where an image is made in `jax.jit`, or differentiated.
+        predict = partial(_errors, self.longest_stride)
+        errors = in_memory(march.step > 0, predict, march, space, windows, variation)
+        found = errors, windows.first
+        return eqx.tree_at(lambda of: (of.errors, of.first), self, found, is_leaf=lambda leaf: leaf is None)
+
+    def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
+        # the windows around the middle hold all of the run
+        code = self._at(ray.path(run.middle), run.stride.bit_length() - 1)
+        return _decoded(code, ray.length.dtype), self.tolerance.astype(ray.length.dtype)
+
+    def _at(self, coordinate: Vec3, level: int) -> Int32[Array, ""]:
+        """The coded error of a stride in the block of a grid coordinate."""
+        assert self.errors is not None
+        _, nx, ny, nz = self.errors.shape
+        begin = (0, 0, 0) if self.first is None else self.first
+        i, j, k = (
+            jnp.clip(jnp.floor(c / BLOCK).astype(jnp.int32) - first, 0, n - 1)
+            for c, n, first in zip(coordinate, (nx, ny, nz), begin, strict=True)
+        )
+        return gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
+
+
+def _coded(error: Float[Array, "*blocks"]) -> Int32[Array, "*blocks"]:
+    """An error as the bits of a float32, which are in the same order. NaN is infinite."""
+    known = jnp.where(error >= 0, error, jnp.inf).astype(jnp.float32)
+    return jax.lax.bitcast_convert_type(known, jnp.int32)
+
+
+def _decoded(code: Int32[Array, "*blocks"], dtype: Any) -> Float[Array, "*blocks"]:
+    """The error of a code."""
+    return jax.lax.bitcast_convert_type(code, jnp.float32).astype(dtype)
+
+
+def _errors(
+    longest: int, march: March, space: Space, windows: Windows, variation: Variation
+) -> Int32[Array, "levels bx by bz"]:
+    """By stride and block, the coded error of a run with its middle there."""
+    dtype = march.step.dtype
+    low, high, bend, variation = jax.tree.map(
+        lambda leaf: leaf.astype(dtype), (windows.low, windows.high, windows.bend, variation)
+    )
+    distance = node_distance(space, low.shape, windows.first).astype(dtype)
+    spread, length, shortest = high - low, BLOCK * distance, BLOCK * _shortest(space, windows, distance)
+    levels = []
+    for stride in (2**k for k in range(longest.bit_length())):
+        width = stride * march.step
+        bent = bend * (width / distance) ** 2 / 8
+        error = length * variation.total * jnp.where(bent >= spread, 1, bent / spread)
+        if not march.integrates:
+            sampled = width * variation.total / 2
+            if march.quadrature == "midpoint":
+                # NaN where there is a step, but no spread
+                turned = variation.turns * (spread / length) * width**2 / 24
+                sampled = jnp.where(turned < sampled, turned, sampled)
+            error = error + sampled
+        # a window exceeds its block by half of one, and each block around it by one more
+        reach = RUN * width / 2 / shortest
+        rounds = jnp.maximum(jnp.ceil(reach - MARGIN / BLOCK), 0)
+        # a cell's front hides its back
+        hidden = jnp.minimum(variation.hidden * width, variation.colored) * width / 8
+        code = _coded(jnp.maximum(SHARE * error, HIDDEN * hidden))
+        code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
+        levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
+    return jnp.stack(levels)
+
+
+def _shortest(space: Space, windows: Windows, distance: Float[Array, "bx by bz"]) -> Scalar:
+    """The least distance between nodes in all of the grid, of which the windows may be a part."""
+    if windows.whole is None:
+        return jnp.min(distance)
+    bx, by, bz = windows.whole
+    zero = jnp.zeros((), jnp.int32)
+    layers = jax.lax.map(
+        lambda x: jnp.min(node_distance(space, (1, by, bz), jnp.stack([x, zero, zero]))), jnp.arange(bx)
+    )
+    return jnp.min(layers).astype(distance.dtype)
+
+
+def _dilated(_: Any, codes: Int32[Array, "bx by bz"]) -> Int32[Array, "bx by bz"]:
+    """The largest of each block and all around it."""
+    for axis in range(3):
+        ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
+        padded, n = jnp.pad(codes, ends, mode="edge"), codes.shape[axis]
+        for first in (0, 2):
+            codes = jnp.maximum(codes, jax.lax.slice_in_dim(padded, first, first + n, axis=axis))
+    return codes

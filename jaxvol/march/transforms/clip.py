@@ -1,0 +1,264 @@
+"""Which part of the volume is seen? What lies inside a box and planes, or what lies outside of them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import reduce
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..._util.checks import Arrayable, described, finite_array, flag, require
+from ..._util.vec3 import Scalar, Vec3, apart, dot
+from ...scene.frame import Frame
+from ...scene.occupancy import Occupancy
+from ...scene.space import Gap, Path, Space
+from ..march import Transform
+
+
+class Clip(Transform):
+    """Show only what lies inside a box, and on the side of each plane to which its normal points; or, inside
+    out, cut this away and show the rest.
+
+    Cut faces are faces like those of the volume. A ray enters and leaves the volume at them, so that its
+    first sample lies on the face, which `EmptySpaceJitter` keeps smooth, and `AlphaCorrection` cuts its last
+    cell there. With `inside_out`, a ray that enters or leaves the volume in what is cut away begins or ends
+    at the cut. Any other ray that meets it has a gap. There, samples are transparent, `EmptySpaceJitter`
+    shifts them, and `AlphaCorrection` cuts cells at both ends, for which it takes three samples of each
+    cell. Without `AlphaCorrection`, a face behind a gap lies where the next sample happens to be, and is as
+    noisy under jitter as any surface in the volume.
+
+    What is sampled stays the same: values and light are those of the whole volume, as if nothing were cut
+    away. The place among other transforms does not matter. Box and planes are in world coordinates, also
+    under a `ToroidalMap`.
+
+    **Arguments:**
+
+    - `box`: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
+    - `planes`: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
+      that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane`. (PyVista's `clip` keeps
+      the other side by default.)
+    - `inside_out`: cut away what is inside all of these, and show the rest.
+
+    `box`, `origins` and `normals` are differentiable: gradients include how ends of rays and gaps move.
+    Where a face of the box coincides with one of the volume, the derivative is that of moving it inwards.
+    Without `AlphaCorrection` the image jumps when a sample crosses a cut, and gradients miss these jumps.
+    With `AlphaCorrection(labels=True)`, they take the ends of gaps as fixed. Where a gap comes to reach the
+    ray's entry, the samples behind it move, and the image jumps by the error of the step.
+
+    A ray within a plane is inside; rounding decides of rays that nearly are. Inside out, a film of less than
+    2e-6 of the volume's diagonal between its face and the cut is not seen: it is rounding, where the two
+    should coincide.
+
+    Where it fails, and where not: `experiments/stability.py`, "jitter behind cuts".
+
+    **Raises:** `ValueError` without a box or a plane, for numbers that are not finite, a box whose ends do
+    not increase, and a normal of length 0.
+    """
+
+    box: Float[Array, "6"] | None
+    origins: Float[Array, "planes 3"]
+    normals: Float[Array, "planes 3"]
+    inside_out: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        box: Arrayable | None = None,
+        planes: Sequence[tuple[Arrayable, Arrayable]] | Any = (),
+        *,
+        inside_out: bool | Any = False,
+    ):
+        self.box = None if box is None else _box(box)
+        self.origins, self.normals = _planes(planes)
+        if box is None and not len(self.origins):
+            raise ValueError("Clip must be given a box, planes, or both; got neither.")
+        self.inside_out = flag("inside_out", inside_out)
+
+    def clip(self, space: Space) -> Space:
+        sides = [] if self.box is None else _faces(self.box)
+        sides += map(HalfSpace.of, self.origins, self.normals)
+        return _Clipped(space, tuple(sides), self.inside_out)
+
+
+class HalfSpace(NamedTuple):
+    """What lies on one side of a plane: that of its unit `normal`, through `point`."""
+
+    point: Vec3
+    normal: Vec3
+
+    @classmethod
+    def of(cls, origin: Float[Array, "3"], normal: Float[Array, "3"]) -> "HalfSpace":
+        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(normal)))
+        scale = normal / largest  # whose square does not underflow
+        return cls(apart(origin), apart(scale / jnp.sqrt(jnp.sum(scale * scale))))
+
+    def height(self, at: Vec3) -> Scalar:
+        """Distance of a point from the plane, negative outside."""
+        (x, y, z), (px, py, pz) = at, self.point
+        return dot(self.normal, (x - px, y - py, z - pz))
+
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        """Distances at which a line enters and leaves; infinite where it does not. Of a line that is outside
+        everywhere, the first exceeds the second."""
+        height, rate = self.height(origin), dot(self.normal, direction)
+        # Smaller rates count as parallel. Not 0: the derivative of 1/x, 1/x², must be finite.
+        parallel = jnp.abs(rate) < float(jnp.finfo(rate.dtype).tiny) ** 0.25
+        at = -height / jnp.where(parallel, 1, rate)
+        outside = parallel & (height < 0)
+        near = jnp.where(~parallel & (rate > 0), at, jnp.where(outside, jnp.inf, -jnp.inf))
+        far = jnp.where(~parallel & (rate < 0), at, jnp.where(outside, -jnp.inf, jnp.inf))
+        return near, far
+
+    def over(self, grid: Occupancy) -> tuple[Float[Array, "cx cy cz"], Scalar]:
+        """Heights of the middles of a grid's cells, and how far cells reach from there along the normal; a
+        little more, for rounding."""
+        shape = grid.occupied.shape
+        x, y, z = (
+            low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
+            for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
+        )
+        a, b, c = map(jnp.abs, grid.own_direction(self.normal))
+        # as far as coordinates go: what rounds most
+        ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
+        if isinstance(grid.frame, Frame):
+            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.origin))
+        reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
+        middle = x[:, None, None], y[None, :, None], z[None, None]
+        return self.height(middle if grid.frame is None else grid.frame.point(middle)), reach
+
+
+class _Clipped(Space):
+    """A space of which only what is inside all `sides` is seen, or only what is not."""
+
+    inner: Space
+    sides: tuple[HalfSpace, ...]
+    inside_out: bool = eqx.field(static=True)
+
+    @property
+    def searches(self) -> bool:
+        return self.inner.searches
+
+    @property
+    def diagonal(self) -> Scalar:
+        return self.inner.diagonal
+
+    @property
+    def middle(self) -> Vec3:
+        return self.inner.middle
+
+    def coordinate(self, point: Vec3) -> Vec3:
+        return self.inner.coordinate(point)
+
+    def point(self, coordinate: Vec3) -> Vec3:
+        return self.inner.point(coordinate)
+
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        return self.inner.least_distances(low, high)
+
+    def path(self, entry: Vec3, direction: Vec3) -> Path:
+        return self.inner.path(entry, direction)
+
+    def _inside(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        """Distances at which a line enters and leaves what is inside all sides; on a miss, the first is at
+        least the second."""
+        nears, fars = zip(*(side.interval(origin, direction) for side in self.sides), strict=True)
+        return reduce(_later, nears), reduce(_earlier, fars)
+
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        near, far = self.inner.interval(origin, direction)
+        enters, leaves = self._inside(origin, direction)
+        if not self.inside_out:
+            return _later(near, enters), _earlier(far, leaves)
+        film = 16 * float(jnp.finfo(near.dtype).eps) * jax.lax.stop_gradient(self.diagonal)
+        # a ray begins at its origin, if that lies in the volume
+        begin, cut = jnp.where(near > 0, near, 0), leaves > enters
+        first = jnp.where(cut & (enters <= begin + film), _later(near, leaves), near)
+        last = jnp.where(cut & (leaves >= far - film), _earlier(far, enters), far)
+        return first, last
+
+    def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
+        # Up to the exit of the whole: where a cut lies in a gap, the other end of that lies behind it.
+        _, far = self.inner.interval(entry, direction)
+        gaps = self.inner.gaps(entry, direction, _later(length, far))
+        if not self.inside_out:
+            return gaps
+        enters, leaves = self._inside(entry, direction)
+        between = (leaves > enters) & (enters > 0) & (leaves < length)
+        return *gaps, (jnp.where(between, enters, jnp.inf), jnp.where(between, leaves, jnp.inf))
+
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
+        """Without the cells of which nothing is seen."""
+        grid = self.inner.occupancy(visible, first)
+        over = [side.over(grid) for side in self.sides]
+        if self.inside_out:
+            seen = reduce(jnp.logical_or, [height <= reach for height, reach in over])
+        else:
+            seen = reduce(jnp.logical_and, [height >= -reach for height, reach in over])
+        return replace(grid, occupied=grid.occupied & seen)
+
+    def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
+        grid = self.occupancy(visible)
+        over = [side.over(grid) for side in self.sides]
+        own = [jnp.any(grid.occupied & (jnp.abs(height) <= reach)) for height, reach in over]
+        return *self.inner.visible_at_faces(visible), *own
+
+
+def _later(a: Scalar, b: Scalar) -> Scalar:
+    """The greater distance; of equal ones, the derivatives of `b`."""
+    # not by maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
+    return jnp.where(b >= a, b, a)
+
+
+def _earlier(a: Scalar, b: Scalar) -> Scalar:
+    """The smaller distance; of equal ones, the derivatives of `b`."""
+    return jnp.where(b <= a, b, a)
+
+
+def _faces(box: Float[Array, "6"]) -> list[HalfSpace]:
+    """The half-spaces inside the six faces of a box."""
+    low, high, zero = box[0::2], box[1::2], jnp.zeros_like(box[0])
+    found = []
+    for corner, sign in ((low, 1), (high, -1)):
+        for axis in range(3):
+            x, y, z = (zero + sign * (i == axis) for i in range(3))
+            found.append(HalfSpace(apart(corner), (x, y, z)))
+    return found
+
+
+def _box(box: Arrayable) -> Float[Array, "6"]:
+    return require(
+        finite_array("box", box, (6,)),
+        lambda ends: ends[0::2] < ends[1::2],
+        "box must be (x_min, x_max, y_min, y_max, z_min, z_max), each minimum below its maximum; got {got}.",
+    )
+
+
+def _is_sequence(value: Any) -> bool:
+    """Whether a value has a length and entries in order."""
+    return isinstance(value, Sequence) or (isinstance(value, np.ndarray | jax.Array) and value.ndim > 0)
+
+
+def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes 3"]]:
+    """Origins and normals."""
+    if not _is_sequence(planes):
+        raise ValueError(f"planes must be a list of pairs (origin, normal); got {described(planes)}.")
+    origins, normals = [], []
+    for i, pair in enumerate(planes):
+        if not _is_sequence(pair) or len(pair) != 2:
+            bare = len(planes) == 2 and all(_is_sequence(part) and len(part) == 3 for part in planes)
+            remedy = " For a single plane, pass [(origin, normal)]." if bare else ""
+            raise ValueError(f"planes[{i}] must be a pair (origin, normal); got {described(pair)}.{remedy}")
+        origins.append(finite_array(f"the origin of planes[{i}]", pair[0], (3,)))
+        normals.append(
+            require(
+                finite_array(f"the normal of planes[{i}]", pair[1], (3,)),
+                lambda normal: abs(normal).max() > 0,
+                f"the normal of planes[{i}] must not be 0; got {{got}}.",
+            )
+        )
+    if not origins:
+        return jnp.zeros((0, 3)), jnp.zeros((0, 3))
+    return jnp.stack(origins), jnp.stack(normals)

@@ -1,0 +1,210 @@
+"""How far ahead is nothing visible? Space leaping (Chae and Shin; KISTI report 2005).
+
+All methods query the same grid of occupied cells (`Occupancy`), which depends on the transfer function.
+They differ in the query, and in the rays that share its result:
+
+- `"hierarchy"`: for each stretch of a beam of 8 x 8 pixels, whether its bounding box is empty;
+- `"distance"`: for each ray, the distance to the nearest occupied cell;
+- `"min_distance"`, `"beam"`: the same, from a start distance that cells of R x R pixels share.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, TypeAlias, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from ..._util.checks import integer
+from ..._util.vec3 import Scalar, Vec3
+from ...scene.occupancy import FARTHEST, Occupancy, Sums
+from ...scene.space import Ray
+from ...xla.xla import gather
+from ..beams import Box, Stretches, stretches
+from ..march import EmptySpaceIndex, Transform, View
+
+
+Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
+
+LEAPS = 4
+"""Leaps from cell to cell before the next samples. Rays that have arrived wait for those that have not."""
+
+
+class SpaceLeaping(Transform):
+    """Leap over regions in which the transfer function shows nothing.
+
+    Leaps are whole steps, so every sample taken is also one of the march without leaping: the image stays
+    the same, except under `"min_distance"`. `EmptySpaceJitter` treats what is leapt over as transparent.
+
+    **Arguments:**
+
+    - `method`:
+        - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
+          bounding box holds no visible block of 4³ voxels. Summed-volume tables answer for boxes of any
+          size at once, where an octree would be traversed from coarse to fine.
+        - `"distance"`: each ray leaps as far as a map of (chessboard) distances to the nearest visible
+          block proves empty. Leaps are short where a ray runs along a surface.
+        - `"min_distance"`: as `"distance"`, from a start distance that each cell of `cell` x `cell` pixels
+          shares: the nearest of the first hits of its four corner rays. **It is not a bound**: whatever is
+          thinner than a cell, and nearer than what its corners hit, is leapt over. The image is wrong
+          there, more so the larger the cells.
+        - `"beam"`: as `"min_distance"`, but the start is proven for everything in the cell's beam.
+    - `cell`: side of a cell of the last two methods, in pixels; at least 2.
+
+    Visible blocks are determined for every image, from its transfer function. Regions that are leapt over
+    have extinction 0, so the image loses nothing. Yet an extinction of 0 has a gradient. `adjoint="direct"`,
+    which marches without leaps, includes it; `"forward"` takes it as 0 wherever rays leap, and `"replay"`
+    also in front of and behind everything that a ray sees. A fit that should make invisible regions visible
+    must start above 0, or not leap.
+
+    Where it fails, and where not: `experiments/stability.py`, "sheets thinner than a cell of rays",
+    "occupancy under steep transfer functions", "gradients of what is leapt over".
+
+    **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
+    rendering rays of one's own (`render_rays`).
+
+    Source: `"min_distance"` is the grid of Chae and Shin, over the distance map that they start from
+    (`"distance"`). Their map holds a distance per voxel, ours a chessboard distance per block of 4³ voxels;
+    they do not march the rays at the corners of cells again, we do. `"hierarchy"` replaces the octree of the
+    KISTI report 2005, which designs one and does not get it to work. `"beam"` is unpublished: it is the
+    bound that `"min_distance"` is not.
+    """
+
+    method: Method = eqx.field(static=True)
+    cell: int = eqx.field(static=True)
+
+    def __init__(self, method: Method | Any = "hierarchy", cell: int | Any = 8):
+        if method not in get_args(Method):
+            raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
+        self.method = method
+        self.cell = integer("cell", cell, 2)
+
+    def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
+        occupancy = jax.lax.stop_gradient(occupancy)
+        if self.method == "hierarchy":
+            return _Beams(occupancy, occupancy.sums())
+        distances = _Distances(occupancy, occupancy.distance(), None, None, self.cell)
+        if self.method == "distance":
+            return distances
+        if view is None:
+            raise ValueError(
+                f'SpaceLeaping("{self.method}") needs the neighbouring pixels of a camera; for rays of your '
+                'own use "hierarchy" or "distance".'
+            )
+        published = self.method == "min_distance"
+        starts = self._nearest_hits(distances, view) if published else self._beam_starts(occupancy, view)
+        return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
+
+    def _corners(self, view: View) -> tuple[Int[Array, "cols"], Int[Array, "rows"]]:
+        width, height = view.size
+        columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in (width, height))
+        return columns, rows
+
+    def _nearest_hits(self, distances: EmptySpaceIndex, view: View) -> Float[Array, "rows cols"]:
+        """The nearest of the first hits of each cell's four corner rays."""
+        columns, rows = self._corners(view)
+        hits = view.first_hit(distances, *jnp.meshgrid(columns, rows))
+        across = jnp.minimum(hits[:, 1:], hits[:, :-1])
+        return jnp.minimum(across[1:], across[:-1])
+
+    def _beam_starts(self, occupancy: Occupancy, view: View) -> Float[Array, "rows cols"]:
+        """The distance up to which each cell's beam meets no occupied cell of the grid."""
+        columns, rows = self._corners(view)
+        last = self.cell - 1
+        column = jnp.stack([columns[:-1], columns[:-1] + last])[None, :, None, :]
+        row = jnp.stack([rows[:-1], rows[:-1] + last])[:, None, :, None]
+        # (rows, cols, 4): the corner rays of each cell
+        column, row = (
+            jnp.moveaxis(i.reshape(4, *i.shape[2:]), 0, -1) for i in jnp.broadcast_arrays(column, row)
+        )
+        cast = jnp.vectorize(lambda x, y: tuple(part for end in view.ray(x, y) for part in end))
+        x, y, z, *direction = cast(column, row)
+        box = Box.within(occupancy, (x, y, z), tuple(direction))
+        box = jax.tree.map(jnp.ravel, box)
+        beams = stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
+        first = beams.following[0].astype(beams.near.dtype)
+        start = jnp.where(first < beams.following.shape[0], beams.near + first * beams.length, jnp.inf)
+        return start.reshape(column.shape[:-1])
+
+
+class _Beams(EmptySpaceIndex):
+    """Skips the stretches of a beam whose bounding boxes are empty."""
+
+    occupancy: Occupancy
+    sums: Sums
+
+    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
+        return stretches(self.occupancy, self.sums, box(self.occupancy), stretch)
+
+    def any_visible(self, prepared: Stretches) -> Bool[Array, " beams"]:
+        return prepared.following[0] < prepared.following.shape[0]
+
+    def skip_to(
+        self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        count, beams = prepared.following.shape
+        near = gather(prepared.near, beam)
+        position = (rays.t_in + depth - near) / prepared.length
+        stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
+        entry = stretch * beams + beam
+        following = gather(prepared.following.reshape(-1), entry)
+        begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in
+        return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
+
+
+class _Distances(EmptySpaceIndex):
+    """Skips, ray by ray, as far as the distance from the ray's cell to the nearest occupied one allows."""
+
+    occupancy: Occupancy
+    distance: UInt8[Array, " cells"]
+    starts: Float[Array, "rows cols"] | None
+    """For each cell of pixels, the distance from the ray origins before which nothing is visible."""
+    corner: tuple[Int[Array, ""], Int[Array, ""]] | None
+    """Pixel at the corner of the first cell."""
+    cell: int = eqx.field(static=True)
+
+    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
+        return None
+
+    def any_visible(self, prepared: None) -> Bool[Array, ""]:
+        return jnp.ones((), bool)
+
+    def within_ranges(self) -> EmptySpaceIndex:
+        # A ray's own range is tighter than a start that it shares with its neighbours.
+        return replace(self, starts=None, corner=None)
+
+    def skip_to(
+        self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        start = self.occupancy.cell(rays.entry)
+        direction = self.occupancy.own_direction(rays.direction)
+        rate = [r / size for r, size in zip(direction, self.occupancy.size, strict=True)]
+        if self.starts is not None:
+            assert self.corner is not None
+            last = (n - 1 for n in reversed(self.starts.shape))
+            # rays that only pad groups lie outside the image
+            x, y = (
+                jnp.minimum((pixel - first.astype(pixel.dtype)) // self.cell, n)
+                for pixel, first, n in zip(rays.pixel, self.corner, last, strict=True)
+            )
+            depth = jnp.maximum(depth, self.starts[y, x] - rays.t_in)
+        for _ in range(LEAPS):
+            depth = self._leap(start, rate, rays.length, depth)
+        return depth
+
+    def _leap(self, start: Vec3, rate: Any, length: Scalar, depth: Scalar) -> Scalar:
+        _, ny, nz = shape = self.occupancy.occupied.shape
+        point = [s + depth * r for s, r in zip(start, rate, strict=True)]
+        x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
+        i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))
+        flat = (i * ny + j) * nz + k
+        away = gather(self.distance, flat).astype(depth.dtype)
+        # all cells nearer than that are empty: advance to where the ray leaves their cube
+        ahead = jnp.inf
+        for p, r, corner in zip(point, rate, (x, y, z), strict=True):
+            face = jnp.where(r > 0, corner + away, corner + 1 - away)
+            ahead = jnp.minimum(ahead, jnp.where(r == 0, jnp.inf, (face - p) / jnp.where(r == 0, 1, r)))
+        ahead = jnp.where(away >= FARTHEST, jnp.inf, ahead)
+        return jnp.where((away > 0) & (depth < length), depth + jnp.maximum(ahead, 0), depth)

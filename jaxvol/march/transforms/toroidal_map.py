@@ -1,0 +1,287 @@
+"""Where does a swept ultrasound fan lie in the world? Toroidal coordinates (Kim, Kwon and Shin 2008).
+
+A mechanical probe turns a fan of beams about a motor axis. Its samples form a box in (β, σ, γ): the motor
+angle, the angle of the beam in the fan, and the depth along the beam. In the world, whose x axis is the motor
+axis and whose z axis points along the middle beam at β = σ = π/2, the box is a sector of a torus:
+
+    ρ = sqrt(y² + z²)    R = ρ - a    β = π/2 + atan2(y, z)    σ = π/2 + atan2(x, R)    γ = sqrt(x² + R²) - b
+
+with `a` from the motor axis to the fan's apex and `b` from the apex to the first sample. The volume is
+rendered as acquired, without resampling: rays that are straight in the world are curved in its grid.
+"""
+
+import math
+from functools import reduce
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..._util.checks import Arrayable, finite_array, number, require
+from ..._util.vec3 import Scalar, Vec3, along, apart
+from ...scene.occupancy import BLOCK, Occupancy, Sums
+from ...scene.space import Gap, Path, Space
+from ...scene.volume import Volume
+from ..march import Transform
+from .sector_faces import SectorFaces, hypot
+
+
+CUBES = 48
+"""Cells per side of the box around the sector, in the occupancy grid."""
+
+
+class ToroidalMap(Transform):
+    """Interpret `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, evenly spaced over the ranges.
+
+    The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
+    coordinates are the probe's, with the origin on the motor axis. The world is empty outside the swept
+    sector. A ray may leave the sector and re-enter it, as through its hollow near side. Of such gaps two are
+    found; what a third one hides is taken for material. A ray that is nowhere farther outside than 2e-6 of
+    the probe's size counts as inside, and so may one that runs along a face at less than 1e-5 of it.
+    `AlphaCorrection` cuts cells at both ends of gaps.
+
+    **Arguments:**
+
+    - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
+      behind the axis, as in probes whose array turns about a near axis. Samples that then lie behind the
+      axis, where ρ would be negative (`nearest_to_axis`), are not shown: the world has such points at
+      another β.
+    - `b`: distance from the apex to depth γ = 0, world length.
+    - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
+      [0, π], increasing.
+    - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
+      b + first > 0.
+
+    All are differentiable, once: second derivatives miss how entries, exits and gaps curve. Values and
+    gradients are finite everywhere; where an angle has no gradient, on the motor axis (y = z = 0) and at the
+    apex (x = R = 0), it is taken as 0, and so is that of an entry or exit whose ray meets its face at less
+    than 0.06 degrees.
+
+    Where it fails, and where not: `experiments/stability.py`, "gaps of rays under a toroidal map",
+    "rays near the motor axis".
+
+    **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
+
+    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), which print `atan`; `atan2` is the same where
+    z > 0 and R > 0, and elsewhere gives angles outside every sector. The paper has two misprints: (2.4) has
+    τ for γ, and the derivation of (2.2) has y/2 for y/z. ρ is our name for R + a.
+    """
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    beta_range: Float[Array, "2"]
+    sigma_range: Float[Array, "2"]
+    gamma_range: Float[Array, "2"]
+
+    def __init__(
+        self,
+        a: Arrayable,
+        b: Arrayable,
+        beta_range: Arrayable,
+        sigma_range: Arrayable,
+        gamma_range: Arrayable,
+    ):
+        self.a = number("a", a)
+        self.b = number("b", b)
+        self.beta_range = _angles("beta_range", beta_range)
+        self.sigma_range = _angles("sigma_range", sigma_range)
+        self.gamma_range = require(
+            _range("gamma_range", gamma_range),
+            lambda gamma, b: b + gamma[0] > 0,
+            "gamma_range must begin beyond the apex, b + gamma_range[0] > 0; got {got}.",
+            self.b,
+        )
+
+    def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
+        """(β, σ, γ) of world points (*points, 3)."""
+        points = jnp.stack(_components("points", points), axis=-1)
+        return jnp.vectorize(lambda p: jnp.stack(self._forward(apart(p))), signature="(k)->(k)")(points)
+
+    def to_world(self, toroidal: Arrayable) -> Float[Array, "*points 3"]:
+        """World points of (β, σ, γ), (*points, 3): the inverse of `to_toroidal` where γ > -b and ρ > 0."""
+        beta, sigma, gamma = _components("toroidal", toroidal)
+        depth = gamma + self.b
+        rho = self.a + depth * jnp.sin(sigma)  # sin σ = cos(σ - π/2)
+        world = -depth * jnp.cos(sigma), -rho * jnp.cos(beta), rho * jnp.sin(beta)
+        return jnp.stack(world, axis=-1)
+
+    @property
+    def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Lowest and highest world coordinates of the swept sector; tight."""
+        half = math.pi / 2
+        depth = self.b + self.gamma_range
+        # depth and angles are separable: extremes lie at the ends of the ranges, or where a cosine peaks
+        fan, turn = self.sigma_range - half, self.beta_range - half
+        middle_fan, middle_turn = (jnp.clip(0.0, angles[0], angles[1]) for angles in (fan, turn))
+        x = jnp.outer(depth, jnp.sin(fan))
+        rho = self.a + jnp.outer(depth, jnp.cos(jnp.append(fan, middle_fan)))
+        rho = jnp.maximum(jnp.stack([rho.min(), rho.max()]), 0)
+        y = jnp.outer(rho, jnp.sin(turn))
+        z = jnp.outer(rho, jnp.cos(jnp.append(turn, middle_turn)))
+        return jnp.stack([x.min(), y.min(), z.min()]), jnp.stack([x.max(), y.max(), z.max()])
+
+    @property
+    def bounds(self) -> Float[Array, "6"]:
+        """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the swept sector; tight."""
+        return jnp.stack(self.corners, axis=-1).reshape(-1)
+
+    @property
+    def center(self) -> Float[Array, "3"]:
+        """Center of the bounds."""
+        low, high = self.corners
+        return (low + high) / 2
+
+    @property
+    def nearest_to_axis(self) -> Float[Array, ""]:
+        """Distance from the motor axis at which the outermost beams begin: ρ of the sample nearest to the
+        axis; negative if it lies behind the axis, world length."""
+        depth = self.b + self.gamma_range[0]
+        return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
+
+    def locate(self, space: Space, volume: Volume) -> Space:
+        if volume.direction is not None:
+            raise ValueError(
+                "volume has a direction, and ToroidalMap places its voxels by the probe: pass one without."
+            )
+        return _Sector(self, volume.shape)
+
+    def _forward(self, point: Vec3) -> Vec3:
+        x, y, z = point
+        off = hypot(y, z) - self.a
+        half = math.pi / 2
+        return half + _atan2(y, z), half + _atan2(x, off), hypot(x, off) - self.b
+
+
+class _Sector(Space):
+    """The space of a volume under a `ToroidalMap`."""
+
+    probe: ToroidalMap
+    shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @property
+    def searches(self) -> bool:
+        return True
+
+    @property
+    def diagonal(self) -> Scalar:
+        low, high = self.probe.corners
+        return jnp.linalg.norm(high - low)
+
+    @property
+    def middle(self) -> Vec3:
+        return apart(self.probe.center)
+
+    def coordinate(self, point: Vec3) -> Vec3:
+        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        beta, sigma, gamma = (
+            (value - ends[0]) / (ends[1] - ends[0]) * (n - 1)
+            for value, ends, n in zip(self.probe._forward(point), ranges, self.shape, strict=True)
+        )
+        return beta, sigma, gamma
+
+    def point(self, coordinate: Vec3) -> Vec3:
+        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        toroidal = [
+            ends[0] + c / (n - 1) * (ends[1] - ends[0])
+            for c, ends, n in zip(coordinate, ranges, self.shape, strict=True)
+        ]
+        return apart(self.probe.to_world(jnp.stack(toroidal)))
+
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        # about the motor's axis ρ = a + (b + γ) sin σ, and about the apex b + γ: the sine is concave where it
+        # is positive, and linear in γ it is least at an end, so that a corner has the least ρ
+        probe = self.probe
+        beta, sigma, gamma = (
+            (ends[1] - ends[0]) / (n - 1)
+            for ends, n in zip(
+                (probe.beta_range, probe.sigma_range, probe.gamma_range), self.shape, strict=True
+            )
+        )
+        depth = [jnp.maximum(probe.b + probe.gamma_range[0] + end[2] * gamma, 0) for end in (low, high)]
+        angle = [jnp.clip(probe.sigma_range[0] + end[1] * sigma, 0, math.pi) for end in (low, high)]
+        rho = [probe.a + d * jnp.sin(s) for d in depth for s in angle]
+        return jnp.maximum(reduce(jnp.minimum, rho), 0) * beta, depth[0] * sigma, gamma
+
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
+        """World cells around the sector. A cell is occupied if the sphere around it reaches a visible block:
+        along a path, an angle changes by no more than the path's length over the distance to its axis."""
+        low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
+        x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
+        middle = jnp.arange(CUBES, dtype=x.dtype) + 0.5
+        point = jnp.meshgrid(*(a + middle * step for a, step in zip(low, size, strict=True)), indexing="ij")
+        radius = jnp.sqrt(x * x + y * y + z * z) / 2 + 16 * float(jnp.finfo(x.dtype).eps) * self._faces.size
+        rho = hypot(point[1], point[2])
+        off = hypot(point[0], rho - self.probe.a)
+
+        def angle(axis_distance: Scalar) -> Scalar:
+            """Upper bound on the change of an angle about an axis within the sphere."""
+            away = axis_distance > radius
+            return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
+
+        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        changes = angle(rho), angle(off), radius
+        begin, end, reached = [], [], jnp.ones(rho.shape, bool)
+        coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
+        if first is not None:
+            coordinate = tuple(c - corner for c, corner in zip(coordinate, first, strict=True))
+        for c, change, ends, n, blocks in zip(
+            coordinate, changes, ranges, self.shape, visible.shape, strict=True
+        ):
+            nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
+            reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, BLOCK * blocks))
+            begin.append(jnp.clip(jnp.floor((c - nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
+            end.append(jnp.clip(jnp.floor((c + nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
+        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (end[0], end[1], end[2]))
+        return Occupancy(reached & seen, low, (x, y, z))
+
+    def path(self, entry: Vec3, direction: Vec3) -> "_Curved":
+        return _Curved(self, entry, direction)
+
+    @property
+    def _faces(self) -> SectorFaces:
+        probe, (low, high) = self.probe, map(apart, self.probe.corners)
+        ranges = probe.beta_range, probe.sigma_range, probe.gamma_range
+        return SectorFaces(probe.a, probe.b, *ranges, low, high)
+
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        return self._faces.interval(origin, direction)
+
+    def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
+        return self._faces.gaps(entry, direction, length)
+
+
+class _Curved(Path):
+    """A straight world ray in the grid of a sector."""
+
+    sector: _Sector
+    entry: Vec3
+    direction: Vec3
+
+    def __call__(self, s: Scalar) -> Vec3:
+        return self.sector.coordinate(along(self.entry, self.direction, s))
+
+
+def _atan2(a: Scalar, b: Scalar) -> Scalar:
+    """atan2, with value and gradient 0 at the origin."""
+    # not merely nonzero: the derivative divides by a² + b², which must not underflow
+    away = jnp.maximum(jnp.abs(a), jnp.abs(b)) > float(jnp.finfo(a.dtype).tiny) ** 0.25
+    return jnp.where(away, jnp.arctan2(jnp.where(away, a, 0), jnp.where(away, b, 1)), 0)
+
+
+def _range(name: str, value: Arrayable) -> Float[Array, "2"]:
+    message = f"{name} must be (first, last) with first < last; got {{got}}."
+    return require(finite_array(name, value, (2,)), lambda ends: ends[0] < ends[1], message)
+
+
+def _angles(name: str, value: Arrayable) -> Float[Array, "2"]:
+    message = f"{name} must lie in [0, π] radians; got {{got}}."
+    return require(_range(name, value), lambda ends: (ends >= 0) & (ends <= math.pi + 1e-6), message)
+
+
+def _components(name: str, points: Arrayable) -> tuple[Any, Any, Any]:
+    points = jnp.asarray(points, dtype=float)
+    if points.ndim < 1 or points.shape[-1] != 3:
+        raise ValueError(f"{name} must have shape (*points, 3); got {points.shape}.")
+    return points[..., 0], points[..., 1], points[..., 2]

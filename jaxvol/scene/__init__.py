@@ -1,0 +1,1 @@
+"""What is looked at: volumes, transfer functions, cameras, and what a render returns."""

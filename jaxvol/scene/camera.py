@@ -1,0 +1,291 @@
+"""Which ray belongs to a pixel?
+
+Names and conventions follow VTK and PyVista: `view_angle` and `parallel_scale` measure the height
+of the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Num
+
+from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require
+from .._util.vec3 import Scalar, Vec3, along, apart
+from .volume import Volume, corners_of
+
+
+ALONG = 1e-3
+"""`looking_at` treats directions as parallel up to this sine of the angle between them."""
+
+
+class Camera(eqx.Module):
+    """A pinhole camera, or an orthographic one if `parallel_scale` is given.
+
+    **Arguments:**
+
+    - `position`: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
+    - `focal_point`: world point at the center of the image.
+    - `view_up`: direction that points up in the image; not parallel to the view direction.
+    - `view_angle`: angle between the lower and the upper edge of the image, degrees, in (0, 180).
+    - `parallel_scale`: half the height of the view, in world length. Makes the camera orthographic, with
+      ray origins in the plane through `position`.
+    - `size`: (width, height) of the image in pixels.
+    - `window`: the part of the image plane that is shown, (left, right, bottom, top) relative to its
+      center, in units of half the height of the whole view. The default is the whole view,
+      (-width/height, width/height, -1, 1). Set by `crop` and `zoom`.
+    - `corner`: column and row of the first pixel in the image that this one was cropped from, by default
+      (0, 0). Pixels of that image key everything random along a ray. Set by `crop`.
+
+    **Raises:** `ValueError` for a camera at its focal point, a `view_up` along the view direction, and an
+    angle, scale or size out of range.
+    """
+
+    position: Float[Array, "3"]
+    focal_point: Float[Array, "3"]
+    view_up: Float[Array, "3"]
+    view_angle: Float[Array, ""]
+    parallel_scale: Float[Array, ""] | None
+    window: Float[Array, "4"]
+    corner: Float[Array, "2"]
+    """Whole numbers, stored as floats so that `jax.grad` accepts a camera; their gradient is 0."""
+    size: tuple[int, int] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        position: Arrayable,
+        focal_point: Arrayable,
+        view_up: Arrayable = (0.0, 1.0, 0.0),
+        view_angle: Arrayable = 30.0,
+        *,
+        size: tuple[int, int] | Any = (512, 512),
+        parallel_scale: Arrayable | None = None,
+        window: Arrayable | None = None,
+        corner: Arrayable | None = None,
+    ):
+        self.size = width, height = _image_size(size)
+        self.focal_point = finite_array("focal_point", focal_point, (3,))
+        position = finite_array("position", position, (3,))
+        self.position = require(
+            position,
+            lambda here, there: (here != there).any(),
+            "position must differ from focal_point; got {got} for both.",
+            self.focal_point,
+        )
+        self.view_up = require(
+            finite_array("view_up", view_up, (3,)),
+            lambda up, here, there: _sine(up, there - here) > 1e-6,
+            "view_up must not be zero or point along the view; got {got}.",
+            self.position,
+            self.focal_point,
+        )
+        self.view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
+        self.parallel_scale = (
+            None if parallel_scale is None else number("parallel_scale", parallel_scale, above=0)
+        )
+        aspect = width / height
+        window = (-aspect, aspect, -1.0, 1.0) if window is None else window
+        self.window = finite_array("window", window, (4,))
+        if corner is None:
+            with jax.ensure_compile_time_eval():
+                self.corner = jnp.zeros(2)
+        else:
+            self.corner = finite_array("corner", corner, (2,))
+
+    @classmethod
+    def looking_at(
+        cls,
+        volume: Volume | Any,
+        direction: Arrayable = (0.5, -1.0, 0.4),
+        view_up: Arrayable = (0.0, 0.0, 1.0),
+        view_angle: Arrayable = 30.0,
+        *,
+        parallel: bool | Any = False,
+        size: tuple[int, int] | Any = (512, 512),
+    ) -> "Camera":
+        """A camera that sees the whole volume from the side that `direction` points to.
+
+        Like VTK's `ResetCamera`: the bounding sphere of the volume just fits into the view.
+
+        **Arguments:**
+
+        - `direction`: from the center of the volume to the camera, of any length.
+        - `view_up`: as in `Camera`. If it is within 0.06° of `direction`, y is used instead, or -z if y is
+          within 0.06°, too; seen from above, x then runs to the right.
+        - `view_angle`: degrees. For an orthographic camera, it only sets the distance.
+        - `parallel`: whether the camera is orthographic.
+
+        **Raises:** `ValueError` as `Camera` does, for a `direction` or `view_up` of 0, and if `volume` is not
+        a `Volume`.
+        """
+        if not isinstance(volume, Volume):
+            raise ValueError(
+                f"volume must be a jaxvol Volume; got {described(volume)}. "
+                "Pass jv.Volume(data, spacing=...) for an array."
+            )
+        direction = finite_array("direction", direction, (3,))
+        direction = require(direction, lambda d: (d != 0).any(), "direction must not be zero.")
+        view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
+        view_up = finite_array("view_up", view_up, (3,))
+        view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
+        width, height = _image_size(size)
+        cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
+        place = volume.origin, volume.spacing, volume.direction, cells
+        position, center, up, scale = _fitted_view(
+            place, direction, view_up, view_angle, min(1.0, width / height)
+        )
+        scale = scale if flag("parallel", parallel) else None
+        return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
+
+    def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
+        """A camera that renders only this rectangle of the image: the same pixels, jitter included.
+
+        `left` and `top` are the column and row of the rectangle's first pixel.
+
+        **Raises:** `ValueError` for a rectangle that is empty or extends beyond the image.
+        """
+        left, top = integer("left", left, 0), integer("top", top, 0)
+        width, height = integer("width", width, 1), integer("height", height, 1)
+        full_width, full_height = self.size
+        fits = 0 <= left < left + width <= full_width and 0 <= top < top + height <= full_height
+        if not fits:
+            raise ValueError(
+                f"crop must be a rectangle inside the {full_width} x {full_height} image; "
+                f"got left={left}, top={top}, width={width}, height={height}."
+            )
+        x = [self._column(edge) for edge in (left, left + width)]
+        y = [self._row(edge) for edge in (top + height, top)]
+        return self._showing(
+            jnp.stack([*x, *y]), (width, height), self.corner + np.array([left, top], self.corner.dtype)
+        )
+
+    def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
+        """A camera that shows 1/`factor` of the image at the same image size, around `center`.
+
+        `center` is given in fractions of width and height from the top left. Zooming magnifies the image
+        plane, so the perspective does not change.
+        """
+        factor = number("zoom factor", factor, above=0)
+        return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
+
+    def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
+        """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
+        dtype = self.position.dtype
+        column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
+        x, y = self._column(column + 0.5), self._row(row + 0.5)
+        right, up, forward = (apart(axis) for axis in axes_of(self))
+        position = apart(self.position)
+        if self.parallel_scale is not None:
+            scale = self.parallel_scale
+            return along(along(position, right, scale * x), up, scale * y), forward
+        scale = jnp.tan(jnp.deg2rad(self.view_angle) / 2)
+        dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
+        norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
+        return position, (dx / norm, dy / norm, dz / norm)
+
+    @eqx.filter_jit  # compiled like the renderer's rays, so that both round the same way
+    def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+        """Origins and unit directions of the rays of all pixels, indexed `[row, column]`."""
+        width, height = self.size
+        over_row = jax.vmap(self.ray, in_axes=(0, None))
+        origin, direction = jax.vmap(over_row, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
+        return jnp.stack(origin, axis=-1), jnp.stack(direction, axis=-1)
+
+    @property
+    def first_pixel(self) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """Column and row that key the first pixel: `corner` as integers."""
+        left, top = jnp.round(self.corner).astype(jnp.int32)
+        return left, top
+
+    def _showing(
+        self, window: Float[Array, "4"], size: tuple[int, int], corner: Float[Array, "2"] | None = None
+    ) -> "Camera":
+        camera = Camera(
+            self.position,
+            self.focal_point,
+            self.view_up,
+            self.view_angle,
+            size=size,
+            parallel_scale=self.parallel_scale,
+            window=window,
+        )
+        return camera if corner is None else eqx.tree_at(lambda camera: camera.corner, camera, corner)
+
+    def _column(self, column: Scalar | int) -> Scalar:
+        """Image-plane x of a column; whole numbers are pixel edges."""
+        left, right = self.window[0], self.window[1]
+        return left + (right - left) * (column / self.size[0])
+
+    def _row(self, row: Scalar | int) -> Scalar:
+        bottom, top = self.window[2], self.window[3]
+        return top - (top - bottom) * (row / self.size[1])
+
+
+def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Unit vectors to the right of the image, up in it, and forward."""
+    forward = camera.focal_point - camera.position
+    forward = forward / jnp.linalg.norm(forward)
+    right = jnp.cross(forward, camera.view_up)
+    right = right / jnp.linalg.norm(right)
+    return right, jnp.cross(right, forward), forward
+
+
+def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
+    """`Camera.crop` to `count` whole rows from a traced row `first` on; they may reach past the image."""
+    left, right = camera.window[0], camera.window[1]
+    below, above = (camera._row(row.astype(camera.window.dtype)) for row in (first + count, first))
+    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
+    return camera._showing(jnp.stack([left, right, below, above]), (camera.size[0], count), corner)
+
+
+# Jitted: the first image would have to wait for a program per operation.
+
+
+@jax.jit
+def _fitted_view(
+    place: tuple[Any, Any, Any, Any],
+    direction: Float[Array, "3"],
+    view_up: Float[Array, "3"],
+    view_angle: Float[Array, ""],
+    aspect: Any,
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
+    """Position, focal point, up direction and parallel scale of the view that holds a volume's bounding
+    sphere. `place`: what `corners_of` takes. `aspect` is width over height, at most 1."""
+    low, high = corners_of(*place)
+    center, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
+    half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
+    position = center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
+    y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
+    other = jnp.where(_sine(y, direction) > ALONG, y, minus_z)
+    up = jnp.where(_sine(view_up, direction) > ALONG, view_up, other)
+    return position, center, up, radius / aspect
+
+
+@jax.jit
+def _zoomed(
+    window: Float[Array, "4"], factor: Float[Array, ""], center: Float[Array, "2"]
+) -> Float[Array, "4"]:
+    """1/`factor` of a window, around `center`, given in fractions from its top left."""
+    left, right, bottom, top = window
+    x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
+    half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
+    return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
+
+
+def _sine(a: Any, b: Any) -> Any:
+    """Sine of the angle between two vectors; 0 if one is zero."""
+    across = sum((a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2]) ** 2 for i in range(3))
+    lengths = (a * a).sum() * (b * b).sum()
+    return (across / (lengths + (lengths == 0).astype(lengths.dtype))) ** 0.5
+
+
+def _image_size(size: tuple[int, int] | Any) -> tuple[int, int]:
+    try:
+        width, height = (int(n) for n in size)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"size must be (width, height) in pixels; got {size!r}.") from fault
+    if (width, height) != tuple(size) or width < 1 or height < 1:
+        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size}.")
+    return width, height

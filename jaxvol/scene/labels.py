@@ -1,0 +1,212 @@
+"""Transfer functions of segmented volumes: one for each label."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._util.checks import described, finite_array, integer, require
+from .._util.piecewise_linear import (
+    clip_below,
+    interpolate_row,
+    points_below,
+    positive_between,
+    table_row,
+    upper_bound_between,
+)
+from .._util.piecewise_means import mean_by_rows
+from .._util.vec3 import Scalar, Vec3
+from ..xla.xla import gather
+from .occupancy import Blocks
+from .transfer import Classify, Measured, Transfer, TransferFunction
+from .volume import Volume
+
+
+class LabelTransferFunction(Transfer):
+    """A transfer function for each label of a segmented volume.
+
+    **Arguments:**
+
+    - `functions`: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
+      label that is not seen. A label that is not named, or lies beyond the last, is not seen either. Labels
+      are 0 to 255 here; number others anew, as by `np.unique(labels, return_inverse=True)`.
+
+    A function with fewer control points than another is padded with copies of its last point beyond it.
+
+    The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
+    `AlphaCorrection(labels=True)` cuts cells there.
+
+    `with_visibility` and `with_opacity` hide labels, and make them fainter or denser. What is hidden is leapt
+    over, as all that is transparent. Other factors, or labels hidden and shown, compile nothing again.
+
+    **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
+    rendering a volume without labels.
+    """
+
+    stacked: TransferFunction
+    """All functions, stacked along a leading axis for the label; the last is that of invisible labels."""
+    opacity: Float[Array, " labels"]
+    """Of each label, a factor of its extinction: see `with_opacity`. Differentiable."""
+    shown: Bool[Array, " labels"]
+    """Of each label, whether it is seen: see `with_visibility`."""
+
+    def __init__(
+        self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
+    ):
+        given = _by_label(functions)
+        seen = [function for function in given if function is not None]
+        if not seen:
+            raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
+        points = max(function.values.shape[0] for function in seen)
+        first = _continued(seen[0], points)
+        hidden = TransferFunction(first.values, 0 * first.colors, 0 * first.extinction)
+        each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
+        self.stacked = _stacked(each)
+        self.opacity = jnp.asarray(np.ones(len(each)), self.stacked.extinction.dtype)
+        self.shown = jnp.asarray(np.ones(len(each)), bool)
+
+    def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
+        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
+        the opacity that it had. Other labels stay as they are.
+
+        **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
+        found = self.shown
+        for label, shown in self._changes("visible", visible):
+            if jnp.shape(shown) != () or not jnp.issubdtype(jnp.result_type(shown), bool):
+                raise ValueError(f"visible[{label}] must be True or False; got {described(shown)}.")
+            found = found.at[label].set(shown)
+        return eqx.tree_at(lambda transfer: transfer.shown, self, found)
+
+    def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
+        """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
+        keep theirs, which are 1 at first.
+
+        f is a factor of the extinction, at all values alike: what has the opacity α at f = 1 has
+        1 - (1 - α)^f, so that f = 0.5 makes 0.68 of 0.9, and 0.05 of 0.1. The image does not depend on the
+        step, and f may exceed 1. f is differentiable. Where it is 0, as where an extinction is, its
+        derivative misses what is leapt over (`SpaceLeaping`).
+
+        **Raises:** `ValueError` for labels beyond the last one, and for factors that are negative or not
+        finite."""
+        found = self.opacity
+        for label, factor in self._changes("opacity", opacity):
+            name = f"opacity[{label}]"
+            message = f"{name} must be at least 0; got {{got}}."
+            checked = require(finite_array(name, factor, ()), lambda factor: factor >= 0, message)
+            found = found.at[label].set(checked.astype(found.dtype))
+        return eqx.tree_at(lambda transfer: transfer.opacity, self, found)
+
+    def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
+        """Checked labels, each with what was given for it."""
+        if not isinstance(changes, Mapping):
+            raise ValueError(f"{name} must be by label, such as {{1: ...}}; got {described(changes)}.")
+        last = self.opacity.shape[0] - 2  # the one behind it stands for all without a function
+        return [(integer(f"{name}'s label", label, 0, last), each) for label, each in changes.items()]
+
+    @property
+    def _seen(self) -> TransferFunction:
+        """All functions, with the extinctions that are seen."""
+        factor = jnp.where(self.shown, self.opacity, 0)
+        extinction = self.stacked.extinction * factor[:, None]
+        return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
+
+    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+        """The label at a grid coordinate."""
+        return (volume.label(coordinate),)
+
+    def classifier(self) -> Classify:
+        """Look-up of colour and extinction, by label and value."""
+        tables = jax.vmap(TransferFunction.rows)(self._seen)
+        unseen, points = tables.shape[0] - 1, tables.shape[1]
+        rows = tables.reshape(-1, tables.shape[2])
+
+        def classify(measured: Measured) -> tuple[Vec3, Scalar]:
+            value, label = measured
+            label = jnp.where((label < 0) | (label > unseen), unseen, label)
+            values = gather(self.stacked.values, label)
+            row = table_row(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
+            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
+
+        return classify
+
+    def integrator(self) -> Classify:
+        """The means for the label in the middle of a cell: where it changes along one, `AlphaCorrection(
+        labels=True)` cuts it."""
+        stacked = jax.lax.stop_gradient(self.stacked.values)
+        tables = jax.vmap(TransferFunction.span_rows)(self._seen)
+        unseen, spans = tables.shape[0] - 1, tables.shape[1]
+        rows = tables.reshape(-1, tables.shape[2])
+
+        def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
+            _, label, (front,), (back,) = measured
+            label = jnp.where((label < 0) | (label > unseen), unseen, label)
+            values = gather(stacked, label)
+            i, j = (points_below(values, end) for end in (front, back))
+            a, b = (table_row(rows, label * spans + span) for span in (i, j))
+            return mean_by_rows(a, b, front, back, i == j)
+
+        return integrate
+
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        bound = jnp.zeros_like(blocks.low)
+        for label, values, extinction in self._functions():
+            own = upper_bound_between(values, extinction, blocks.low, blocks.high)
+            bound = jnp.where(blocks.may_hold(label), jnp.maximum(bound, own), bound)
+        return jnp.where(self.visible(blocks), bound, 0)
+
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        seen = jnp.zeros(blocks.low.shape, bool)
+        for label, values, extinction in self._functions():
+            seen |= positive_between(values, extinction, blocks.low, blocks.high) & blocks.may_hold(label)
+        return seen
+
+    def _functions(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
+        """Each label, with the control points and extinctions of its function, without their gradients."""
+        functions = jax.lax.stop_gradient(self._seen)
+        for label in range(functions.values.shape[0] - 1):
+            yield label, functions.values[label], functions.extinction[label]
+
+
+def _by_label(functions: Any) -> list[TransferFunction | None]:
+    """Those of label 0, 1, 2, …"""
+    if isinstance(functions, Mapping):
+        labels = [integer("functions' label", label, 0, 255) for label in functions]
+        named = dict(zip(labels, functions.values(), strict=True))
+        functions = [named.get(label) for label in range(max(labels, default=-1) + 1)]
+    if not isinstance(functions, list | tuple):
+        raise ValueError(
+            "functions must be {label: TransferFunction}, or a sequence of them from label 0 on; "
+            f"got {described(functions)}."
+        )
+    for label, function in enumerate(functions):
+        if not isinstance(function, TransferFunction | None):
+            raise ValueError(
+                f"functions[{label}] must be a TransferFunction, or None; got {described(function)}."
+            )
+    if len(functions) > 256:
+        raise ValueError(f"functions must be those of labels 0 to 255; got {len(functions)} of them.")
+    return list(functions)
+
+
+def _continued(function: TransferFunction, points: int) -> TransferFunction:
+    """The same function by so many points."""
+    values, missing = function.values, points - function.values.shape[0]
+    if missing == 0:
+        return function
+    # far enough apart to differ in the float type
+    gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
+    beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
+    return TransferFunction(
+        jnp.concatenate([values, beyond]),
+        jnp.concatenate([function.colors, jnp.repeat(function.colors[-1:], missing, axis=0)]),
+        jnp.concatenate([function.extinction, jnp.repeat(function.extinction[-1:], missing)]),
+    )
+
+
+@jax.jit
+def _stacked(functions: list[TransferFunction]) -> TransferFunction:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *functions)

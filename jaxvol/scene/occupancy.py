@@ -1,0 +1,330 @@
+"""Where may anything be visible? Ranges of values of a volume's blocks, and grids of occupied cells.
+
+Ranges depend on the voxels alone. They are computed once for an array of voxels, and kept as long as that
+array: arrays do not change, so that another array in a volume gets ranges of its own. Which blocks are
+visible depends on the transfer function as well, and is computed in each frame, in the compiled program. Both
+are conservative: what is called empty is proven to be. They carry no gradient.
+"""
+
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
+
+from .._util.axes import XYZ, inverse
+from .._util.vec3 import Vec3
+from ..xla.memo import memoized
+from ..xla.platform import on_gpu, while_loop
+from ..xla.sharding import varying
+from ..xla.xla import gather
+from .frame import Frame
+from .volume import Volume
+
+
+BLOCK = 4
+"""Cells of the voxel grid along the side of a block."""
+
+LAYERS = 8
+"""Layers of blocks whose extremes are found at a time."""
+
+FARTHEST = 255
+"""Stands for a grid without any occupied cell. Distances in others, in cells, are at most one less."""
+
+ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
+"""By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
+
+Nodes = TypeVar("Nodes", Array, np.ndarray)
+
+Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
+
+
+class Blocks(eqx.Module):
+    """Ranges of the values in each block of BLOCK³ cells, including the nodes on its faces."""
+
+    low: Float[Array, "bx by bz"]
+    high: Float[Array, "bx by bz"]
+    labels: UInt32[Array, "bx by bz"] | None
+    """Bit `label % 32` is set for each label of the block's nodes."""
+    slopes: "SlopeRanges | None" = None
+    """None: nothing is known about them."""
+
+    @classmethod
+    def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
+        """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: with the
+        ranges of slopes, for those who read the gradient."""
+        labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
+        low, high = map(volume.in_grid_order, memoized(volume.data, _ranges))
+        if volume.field is not None:  # its values need not lie between those of the voxels
+            low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
+        known = slopes and volume.field is None
+        return cls(low, high, labels, SlopeRanges.of(volume) if known else None)
+
+    @property
+    def unordered(self) -> Bool[Array, "bx by bz"]:
+        """Blocks that hold NaN, also as a slope: nothing is known about them."""
+        unordered = ~(self.low <= self.high)
+        if self.slopes is not None:
+            for low, high in zip(self.slopes.low, self.slopes.high, strict=True):
+                unordered |= ~(low <= high)
+        return unordered
+
+    @property
+    def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+        """Least and greatest magnitude of the gradient (`Volume.gradient`)."""
+        if self.slopes is None:
+            return jnp.zeros_like(self.low), jnp.full_like(self.high, jnp.inf)
+        return self.slopes.magnitudes
+
+    def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
+        """Which blocks may hold this label."""
+        if self.labels is None:
+            return jnp.ones(self.low.shape, bool)
+        return (self.labels >> (label % 32)) & 1 == 1
+
+
+class SlopeRanges(eqx.Module):
+    """Ranges of slopes along x, y, z in each block, including the nodes on its faces. Slopes between nodes
+    are interpolated, and so within these ranges.
+
+    - `low`, `high`: least and greatest slope along each axis, in value units per node.
+    - `steepest`: greatest length of a node's three slopes, per node. Interpolation never exceeds it.
+    - `spacing`: of the volume. Ranges do not depend on it, so that they are kept where it changes.
+    """
+
+    low: Float[Array, "3 bx by bz"]
+    high: Float[Array, "3 bx by bz"]
+    steepest: Float[Array, "bx by bz"]
+    spacing: Float[Array, "3"]
+
+    @classmethod
+    def of(cls, volume: Volume) -> "SlopeRanges":
+        """Those of a volume's voxels, computed once for each array of them."""
+        low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
+        if (axes := volume.fetch.axes) != XYZ:  # or ranges would be copied in each image
+            low, high = (jnp.stack([part[axis] for axis in inverse(axes)]) for part in (low, high))
+        return cls(low, high, steepest, jax.lax.stop_gradient(volume.spacing))
+
+    @property
+    def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+        """Least and greatest magnitude of the gradient, in value units per world length."""
+        spacing = self.spacing.astype(self.low.dtype)
+        least = most = jnp.zeros_like(self.steepest)
+        for axis in range(3):  # one by one: XLA's sum over a leading axis is slow on CPU
+            low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]
+            least += jnp.maximum(jnp.maximum(low, -high), 0) ** 2  # 0 where slopes change sign
+            most += jnp.maximum(-low, high) ** 2
+        most = jnp.minimum(jnp.sqrt(most), self.steepest / jnp.min(spacing))
+        return jnp.sqrt(least) * (1 - ROUNDING), most * (1 + ROUNDING)
+
+
+class Sums(eqx.Module):
+    """Counts the occupied cells of a grid in a box of any size, by eight look-ups (a summed-volume table)."""
+
+    table: Int[Array, " entries"]
+    shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
+        table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
+        for axis in range(3):
+            if on_gpu():  # a loop launches a kernel for each layer
+                table = jnp.cumsum(table, axis=axis, dtype=jnp.int32)
+                continue
+            # sums along the first axis, and moves it to the end; XLA's own cumulative sums are slow on CPU
+            _, sums = jax.lax.scan(_add, varying(jnp.zeros_like(table[0]), table), table)
+            table = jnp.moveaxis(sums, 0, 2)
+        nx, ny, nz = occupied.shape
+        return cls(table.reshape(-1), (nx, ny, nz))
+
+    def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:
+        """Whether any cell from `first` to `last` is occupied, both inclusive and inside the grid."""
+        _, ny, nz = (n + 1 for n in self.shape)
+        x, y, z = (((low, -1), (high + 1, 1)) for low, high in zip(first, last, strict=True))
+        count = jnp.zeros((), jnp.int32)
+        for i, sign_i in x:
+            for j, sign_j in y:
+                for k, sign_k in z:
+                    entry = gather(self.table, (i * ny + j) * nz + k)
+                    count = count + sign_i * sign_j * sign_k * entry
+        return count > 0
+
+
+class Occupancy(eqx.Module):
+    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it.
+
+    - `origin`, `size`: position of the grid's corner, and side lengths of a cell, along the axes of `frame`,
+      or, without one, the world's.
+    """
+
+    occupied: Bool[Array, "cx cy cz"]
+    origin: Vec3
+    size: Vec3
+    frame: Frame | None = None
+
+    def sums(self) -> Sums:
+        """For queries about boxes."""
+        return Sums.of(self.occupied)
+
+    def distance(self) -> UInt8[Array, " cells"]:
+        """Chessboard distance of each cell to the nearest occupied one, in cells: 0 in an occupied cell.
+        In row-major order."""
+
+        def spread(grid: Bool[Array, "cx cy cz"]) -> Bool[Array, "cx cy cz"]:
+            for axis in range(3):
+                padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
+                n = grid.shape[axis]
+                grid = grid | jax.lax.slice_in_dim(padded, 0, n, axis=axis)
+                grid = grid | jax.lax.slice_in_dim(padded, 2, n + 2, axis=axis)
+            return grid
+
+        def go_on(state: tuple[Array, Array, Array]) -> Array:
+            reached, _, rounds = state
+            return ~jnp.all(reached) & (rounds < FARTHEST - 1)
+
+        def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            reached, distance, rounds = state
+            return spread(reached), distance + (~reached).astype(distance.dtype), rounds + 1
+
+        anything = jnp.any(self.occupied)
+        start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
+        _, distance, _ = while_loop(go_on, grow, varying(start))
+        return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
+
+    def cell(self, point: Vec3) -> Vec3:
+        """Coordinate of a world point in the grid, in cells."""
+        point = self.own_point(point)
+        x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
+        return x, y, z
+
+    def own_point(self, point: Vec3) -> Vec3:
+        """A world point along the grid's axes."""
+        return point if self.frame is None else self.frame.coordinates(point)
+
+    def own_direction(self, direction: Vec3) -> Vec3:
+        """A world direction along the grid's axes."""
+        return direction if self.frame is None else self.frame.components(direction)
+
+
+def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:
+    return total + layer, total + layer
+
+
+@jax.jit
+def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+    return widened(*extremes(data))
+
+
+@jax.jit
+def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"], Shaped[Array, "bx by bz"]]:
+    """Least and greatest node of each block; NaN where a node is."""
+
+    def of(nodes: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
+        return over_blocks(nodes, jnp.minimum), over_blocks(nodes, jnp.maximum)
+
+    whole = (data.shape[0] - 1) // BLOCK
+    if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
+        return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
+    # some layers of blocks at a time, which stay in the cache of a CPU: of bytes, this is three times as fast
+    low, high = jax.lax.map(
+        lambda first: of(jax.lax.dynamic_slice_in_dim(data, first, BLOCK + 1)),
+        BLOCK * jnp.arange(whole),
+        batch_size=LAYERS,
+    )
+    low, high = low[:, 0], high[:, 0]
+    if whole * BLOCK < data.shape[0] - 1:
+        last_low, last_high = of(data[whole * BLOCK :])
+        low, high = jnp.concatenate([low, last_low]), jnp.concatenate([high, last_high])
+    return low, high
+
+
+@jax.jit
+def widened(
+    low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]
+) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+    """Ranges of the values interpolated between nodes, from those of the nodes."""
+    low, high = low.astype(jnp.float32), high.astype(jnp.float32)
+    slack = ROUNDING * jnp.maximum(abs(low), abs(high))
+    return low - slack, high + slack
+
+
+@jax.jit
+def _slope_ranges(
+    data: Shaped[Array, "nx ny nz"],
+) -> tuple[Float[Array, "3 bx by bz"], Float[Array, "3 bx by bz"], Float[Array, "bx by bz"]]:
+    """What `SlopeRanges` holds of the voxels, one layer of blocks after the other: the slopes of a volume
+    would take several times its memory."""
+    last = data.shape[0] - 1
+
+    def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
+        node = jnp.clip(BLOCK * block + jnp.arange(BLOCK + 1), 0, last)
+        # subtracted in their own type: doubles that differ little are the same in single precision
+        dtype = data.dtype if data.dtype == jnp.float64 else jnp.float32
+        before, here, after = (data[jnp.clip(node + side, 0, last)].astype(dtype) for side in (-1, 0, 1))
+        border = ((node == 0) | (node == last))[:, None, None]
+        along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)
+        slopes = jnp.stack([along_x, _central(here, 1), _central(here, 2)]).astype(jnp.float32)
+        square = jnp.max(jnp.sum(slopes**2, axis=0), axis=0)
+        low, high, square = (
+            jax.vmap(lambda part, of=of: over_blocks(part, of))(part)
+            for part, of in (
+                (jnp.min(slopes, axis=1), jnp.minimum),
+                (jnp.max(slopes, axis=1), jnp.maximum),
+                (square[None], jnp.maximum),
+            )
+        )
+        # inside loops on CPU, XLA's minima and maxima lose NaN
+        lost = over_blocks(jnp.any(jnp.isnan(slopes), axis=(0, 1)), jnp.logical_or)
+        slack = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
+        steepest = jnp.sqrt(square[0]) * (1 + ROUNDING)
+        return jnp.where(lost, jnp.nan, low - slack), jnp.where(lost, jnp.nan, high + slack), steepest
+
+    low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
+    return jnp.moveaxis(low, 0, 1), jnp.moveaxis(high, 0, 1), steepest
+
+
+def _central(values: Float[Array, "nx ny nz"], axis: int) -> Float[Array, "nx ny nz"]:
+    """Slopes of nodes along an axis, as `voxel_fetch.Fetch.slopes` has them."""
+    rise = jnp.diff(values, axis=axis)
+    n = values.shape[axis] - 1
+    first, last = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 1, n)))
+    before, after = (jax.lax.slice_in_dim(values, *part, axis=axis) for part in ((0, n - 1), (2, n + 1)))
+    return jnp.concatenate([first, (after - before) / 2, last], axis)
+
+
+@jax.jit
+def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]:
+    bits = jnp.uint32(1) << (labels.astype(jnp.int32) % 32).astype(jnp.uint32)
+    return over_blocks(bits, jnp.bitwise_or)
+
+
+def over_blocks(data: Nodes, combine: Callable[[Nodes, Nodes], Nodes], margin: int = 0) -> Nodes:
+    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis; of an array
+    of JAX or NumPy."""
+    xp: Any = jnp if isinstance(data, jax.Array) else np
+    values: Any = data
+
+    def along(axis: int, begin: int, end: int, step: int = 1) -> Any:
+        return values[(slice(None),) * axis + (slice(begin, end, step),)]
+
+    for axis in range(values.ndim):
+        cells = values.shape[axis] - 1
+        if margin:
+            missing = -cells % BLOCK
+            around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
+            values, cells = xp.pad(values, around, mode="edge"), cells + missing
+        # The last block may be shorter. To pad the nodes takes seven times as long, and a copy of them.
+        whole, rest = divmod(cells, BLOCK)
+        found = []
+        if whole:
+            last, parts = (whole - 1) * BLOCK, range(BLOCK + 1 + 2 * margin)
+            found.append(reduce(combine, [along(axis, i, i + last + 1, BLOCK) for i in parts]))
+        if rest:
+            nodes = range(whole * BLOCK, cells + 1)
+            found.append(reduce(combine, [along(axis, i, i + 1) for i in nodes]))
+        values = xp.concatenate(found, axis) if len(found) > 1 else found[0]
+    return values

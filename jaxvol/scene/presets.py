@@ -1,0 +1,235 @@
+"""Transfer functions by name: presets for kinds of data, and any matplotlib colormap."""
+
+from difflib import get_close_matches
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._util.checks import Arrayable, described, finite_array, integer, unit_interval
+from .._util.srgb import from_srgb
+from .transfer import TransferFunction, extinction_of
+
+
+# Unlit surfaces show their shape if the foot of their opacity ramp is dark and thin, and the rest bright and
+# dense: a grazing ray stays in the foot and draws a dark contour.
+#
+# name: (what it is for, its range of values, control points (value, linear rgb, opacity per mm))
+PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float, float, float], float]]]] = {
+    "ct_bone": (
+        "CT in Hounsfield units: bone only",
+        (-1000, 3000),
+        [
+            (130, (0.10, 0.06, 0.03), 0.0),
+            (220, (0.45, 0.33, 0.20), 0.15),
+            (350, (0.85, 0.75, 0.55), 0.5),
+            (800, (1.0, 0.97, 0.88), 0.9),
+            (3000, (1.0, 1.0, 1.0), 0.95),
+        ],
+    ),
+    "ct_skin_bone": (
+        "CT in Hounsfield units: bone under translucent skin and muscle",
+        (-1000, 3000),
+        [
+            (-550, (0.08, 0.03, 0.02), 0.0),
+            (-350, (0.18, 0.07, 0.04), 0.02),
+            (-100, (0.75, 0.42, 0.28), 0.07),
+            (100, (0.75, 0.30, 0.20), 0.03),
+            (180, (0.50, 0.30, 0.15), 0.03),
+            (320, (0.85, 0.72, 0.50), 0.45),
+            (800, (1.0, 0.97, 0.88), 0.9),
+            (3000, (1.0, 1.0, 1.0), 0.95),
+        ],
+    ),
+    "ct_airway": (
+        "CT in Hounsfield units: the walls of air-filled cavities, for a camera inside them",
+        (-1000, 3000),
+        [
+            (-920, (0.0, 0.0, 0.0), 0.0),
+            (-600, (0.12, 0.01, 0.01), 0.25),
+            (-200, (0.80, 0.28, 0.20), 0.6),
+            (100, (1.0, 0.75, 0.60), 0.95),
+            (400, (1.0, 0.95, 0.85), 0.98),
+        ],
+    ),
+    "ct_chest": (
+        "CT in Hounsfield units: lung, muscle and bones of the chest",
+        (-1000, 3000),
+        [
+            (-900, (0.02, 0.04, 0.08), 0.0),
+            (-800, (0.10, 0.22, 0.40), 0.002),
+            (-500, (0.25, 0.10, 0.08), 0.01),
+            (-150, (0.50, 0.15, 0.08), 0.03),
+            (60, (0.75, 0.25, 0.15), 0.10),
+            (180, (0.80, 0.55, 0.35), 0.3),
+            (350, (0.95, 0.90, 0.75), 0.8),
+            (1500, (1.0, 1.0, 1.0), 0.95),
+        ],
+    ),
+    "engine": (
+        "industrial CT, 8 bit: a translucent casting around denser parts",
+        (0, 255),
+        [
+            (55, (0.01, 0.012, 0.02), 0.0),
+            (75, (0.015, 0.02, 0.03), 0.05),
+            (110, (0.12, 0.20, 0.30), 0.10),
+            (145, (0.35, 0.45, 0.55), 0.12),
+            (160, (0.45, 0.22, 0.05), 0.10),
+            (190, (0.85, 0.38, 0.06), 0.5),
+            (235, (1.0, 0.85, 0.45), 0.9),
+        ],
+    ),
+    "mr_head": (
+        "MR of a head, T1, 8 bit: skin, with the brain showing through",
+        (0, 255),
+        [
+            (25, (0.05, 0.03, 0.03), 0.0),
+            (45, (0.20, 0.10, 0.08), 0.02),
+            (80, (0.60, 0.35, 0.28), 0.05),
+            (120, (0.75, 0.50, 0.42), 0.12),
+            (170, (0.95, 0.80, 0.68), 0.3),
+            (255, (1.0, 0.97, 0.92), 0.6),
+        ],
+    ),
+    "head": (
+        "the head phantom, 8 bit: skull under translucent skin and muscle",
+        (0, 255),
+        [
+            (40, (0.05, 0.02, 0.015), 0.0),
+            (58, (0.18, 0.07, 0.04), 0.03),
+            (80, (0.80, 0.46, 0.30), 0.045),
+            (100, (0.78, 0.30, 0.20), 0.018),
+            (140, (0.45, 0.25, 0.12), 0.03),
+            (165, (0.75, 0.60, 0.38), 0.25),
+            (200, (0.95, 0.88, 0.72), 0.6),
+            (235, (1.0, 0.98, 0.92), 0.7),
+            (255, (1.0, 1.0, 1.0), 0.8),
+        ],
+    ),
+    "bonsai": (
+        "CT of a potted tree, 8 bit: leaves, wood and pot",
+        (0, 255),
+        [
+            (28, (0.01, 0.03, 0.005), 0.0),
+            (36, (0.02, 0.07, 0.01), 0.12),
+            (48, (0.08, 0.30, 0.03), 0.35),
+            (62, (0.25, 0.55, 0.10), 0.35),
+            (85, (0.12, 0.06, 0.02), 0.2),
+            (120, (0.38, 0.20, 0.08), 0.6),
+            (160, (0.55, 0.33, 0.17), 0.8),
+            (200, (0.35, 0.40, 0.55), 0.8),
+            (255, (0.80, 0.85, 0.95), 0.95),
+        ],
+    ),
+}
+
+
+SHADED = frozenset({"ct_bone", "ct_skin_bone", "ct_airway", "ct_chest", "engine", "bonsai", "head"})
+"""Presets that show surfaces, which the command line shades. Gradients of magnetic resonance images are
+mostly noise."""
+
+
+def preset(
+    name: str | Any, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0
+) -> TransferFunction:
+    """A transfer function by name.
+
+    **Arguments:**
+
+    - `name`: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values:
+      Hounsfield units for `ct_…`, 0 to 255 for the others.
+    - `clim`: (low, high) in the volume's values; the preset's own range is stretched linearly to it.
+      For example, CT stored as Hounsfield units + 1000 needs `clim=(0, 4000)`.
+    - `unit_distance`: world length to which the preset's opacities refer; they are designed for 1 mm.
+
+    **Returns:** the `TransferFunction`, its colours linear.
+
+    **Raises:** `ValueError` for an unknown name, and a `clim` that does not increase.
+    """
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
+    _, (own_low, own_high), points = PRESETS[name]
+    low, high = _range((own_low, own_high) if clim is None else clim)
+    values, colors, opacities = zip(*points, strict=True)
+    fraction = (np.array(values) - own_low) / (own_high - own_low)
+    return TransferFunction(low + fraction * (high - low), colors, extinction_of(opacities, unit_distance))
+
+
+def colormap(
+    cmap: str | Any,
+    clim: Arrayable,
+    opacity: str | Arrayable = "linear",
+    unit_distance: Arrayable = 1.0,
+    n_colors: int | Any = 256,
+) -> TransferFunction:
+    """A transfer function from a matplotlib colormap and an opacity ramp, as in PyVista's `add_volume`.
+
+    **Arguments:**
+
+    - `cmap`: a matplotlib colormap or its name; or one colour for the whole range, such as `"tomato"`,
+      `"#ff6347"` or (1, 0.39, 0.28); or several colours, a list or an (m, 3) array, evenly spaced over the
+      range and interpolated linearly in sRGB, as in matplotlib. All colours are sRGB and are converted to
+      linear. Their alpha is ignored; `opacity` applies.
+    - `clim`: (low, high), the volume's values at which the colormap begins and ends.
+    - `opacity`: `"linear"`: from 0 to 1 over the range. `"sigmoid"`: `1/(1 + exp(-x))` for x from -10
+      to 10 over the range. An array in [0, 1]: opacities evenly spaced over the range.
+    - `unit_distance`: thickness, in world length, of a layer that has these opacities.
+    - `n_colors`: number of control points, at least 2.
+
+    **Returns:** the `TransferFunction`, its colours linear.
+
+    **Raises:** `ValueError` for an unknown colormap, colour or opacity, opacities outside [0, 1], and a
+    `clim` that does not increase.
+    """
+    n_colors = integer("n_colors", n_colors, 2)
+    colors = _display_colors(cmap, np.linspace(0, 1, n_colors))
+    low, high = _range(clim)
+    linear = from_srgb(jnp.asarray(colors, dtype=float))
+    extinction = extinction_of(_ramp(opacity, n_colors), unit_distance)
+    return TransferFunction(np.linspace(low, high, n_colors), linear, extinction)
+
+
+def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """sRGB colours at fractions of the range."""
+    from matplotlib import colormaps, colors
+
+    if isinstance(cmap, str) and cmap in colormaps:
+        cmap = colormaps[cmap]
+    if isinstance(cmap, colors.Colormap):
+        return cmap(at)[:, :3]
+    cmap = jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, cmap)
+    try:
+        rgb = colors.to_rgba_array(cmap)[:, :3]
+        if len(rgb) == 0 or rgb.min() < 0 or rgb.max() > 1:
+            raise ValueError
+    except (ValueError, TypeError) as fault:
+        near = get_close_matches(cmap.lower(), list(colormaps), 3) if isinstance(cmap, str) else []
+        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        got = repr(cmap) if isinstance(cmap, list | tuple) else described(cmap)
+        raise ValueError(
+            "cmap must be a matplotlib colormap or its name, or one or several colours, by name or sRGB in "
+            f"[0, 1]; got {got}.{hint}"
+        ) from fault
+    positions = np.linspace(0, 1, len(rgb))
+    return np.stack([np.interp(at, positions, channel) for channel in rgb.T], axis=-1)
+
+
+def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:
+    if isinstance(opacity, str):
+        ramps = {"linear": np.linspace(0, 1, n), "sigmoid": 1 / (1 + np.exp(-np.linspace(-10, 10, n)))}
+        if opacity not in ramps:
+            raise ValueError(f'opacity must be "linear", "sigmoid" or an array; got {opacity!r}.')
+        return jnp.asarray(ramps[opacity], dtype=float)
+    opacities = unit_interval("opacity", opacity, (None,))
+    if opacities.shape[0] < 2:
+        raise ValueError(f"opacity must hold at least 2 values; got {opacities.shape[0]}.")
+    return jnp.interp(jnp.linspace(0, 1, n), jnp.linspace(0, 1, opacities.shape[0]), opacities)
+
+
+def _range(clim: Any) -> tuple[float, float]:
+    low, high = np.asarray(finite_array("clim", clim, (2,))).tolist()
+    if not low < high:
+        raise ValueError(f"clim must be (low, high) with low < high; got {clim}.")
+    return low, high

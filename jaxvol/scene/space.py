@@ -1,0 +1,296 @@
+"""Where does a world point lie in the grid, and where does a ray enter and leave the grid?
+
+A `Space` answers both for one volume; this is the seam `locate`. The default, `Affine`, applies
+spacing, origin and direction, so rays stay straight in the grid. A space with curved rays returns a
+different `Path`; the rest of the march is unaffected.
+"""
+
+from abc import abstractmethod
+from functools import partial
+from typing import Literal, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._util.vec3 import Scalar, Vec3, along, apart
+from .frame import Frame
+from .occupancy import BLOCK, Occupancy
+from .volume import Volume
+
+
+class Path(eqx.Module):
+    """A ray in grid coordinates."""
+
+    @abstractmethod
+    def __call__(self, s: Scalar) -> Vec3:
+        """Grid coordinate at depth `s`, in world length past the entry."""
+
+
+Gap: TypeAlias = tuple[Scalar, Scalar]
+"""Depths between which a ray is outside the grid."""
+
+
+class Space(eqx.Module):
+    """The mapping between the world and a volume's grid."""
+
+    @property
+    def searches(self) -> bool:
+        """Whether `interval` and `gaps` search, in a loop."""
+        return False
+
+    @property
+    @abstractmethod
+    def diagonal(self) -> Scalar:
+        """Upper bound on the length of a ray through the grid."""
+
+    @property
+    @abstractmethod
+    def middle(self) -> Vec3:
+        """World point within half of `diagonal` of every point of the grid."""
+
+    @abstractmethod
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        """Distances at which a line enters and leaves the grid; on a miss, the first exceeds the second."""
+
+    def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
+        """Where a line is outside the grid between its entry and its exit, which lies `length` from there:
+        equally many gaps for every line, in any order; they may overlap, and those that it does not have
+        begin at infinity."""
+        return ()
+
+    @abstractmethod
+    def coordinate(self, point: Vec3) -> Vec3:
+        """Grid coordinate of a world point."""
+
+    @abstractmethod
+    def point(self, coordinate: Vec3) -> Vec3:
+        """World point of a grid coordinate."""
+
+    @abstractmethod
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        """Least world distance between neighbouring nodes along each axis, between two grid coordinates,
+        which may lie beyond the grid; 0 where nodes meet."""
+
+    @abstractmethod
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
+        """World-space cells that may hold anything visible, from the visible blocks of the grid; or of a box
+        of it that begins at the node `first`, where the volume is only a part of the grid."""
+
+    def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
+        """For each face at which rays may enter or leave, whether anything visible may lie there, from the
+        visible blocks of the grid."""
+        faces = [jax.lax.index_in_dim(visible, end, axis) for axis in range(3) for end in (0, -1)]
+        return tuple(jnp.any(face) for face in faces)
+
+    @abstractmethod
+    def path(self, entry: Vec3, direction: Vec3) -> Path:
+        """The straight world ray from `entry`, in grid coordinates."""
+
+
+class Line(NamedTuple):
+    """A ray before it is cut to the volume: world origin, unit direction, and (column, row) of its pixel."""
+
+    origin: Vec3
+    direction: Vec3
+    pixel: tuple[Int[Array, ""], Int[Array, ""]]
+
+
+class Ray(eqx.Module):
+    """One ray, clipped to the volume.
+
+    - `entry`, `direction`: world point where the ray enters the volume, and its unit direction.
+    - `t_in`: distance from the ray's origin to the entry. `length`: from entry to exit; 0 on a miss.
+      Both carry gradients. Depths `s` along a march are measured from the entry, where float32 resolves
+      them as finely as the volume needs, however far away the camera is.
+    - `path`: the ray in grid coordinates.
+    - `pixel`: (column, row); keys everything random along the ray.
+    - `gaps`: depths between entry and exit where the ray is outside the volume; with gradients.
+    """
+
+    entry: Vec3
+    direction: Vec3
+    t_in: Scalar
+    length: Scalar
+    path: Path
+    pixel: tuple[Int[Array, ""], Int[Array, ""]]
+    gaps: tuple[Gap, ...] = ()
+
+    def contains(self, depth: Scalar) -> Bool[Array, "..."]:
+        """Whether this depth is inside the volume: neither past the exit nor in a gap."""
+        return (depth < self.length) & ~self.in_gap(depth)
+
+    def in_gap(self, depth: Scalar) -> Bool[Array, "..."]:
+        within = jnp.zeros(jnp.shape(depth), bool)
+        for left, back in self.gaps:
+            within |= (depth >= left) & (depth < back)
+        return within
+
+
+def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
+    """Clip a ray to the volume and to what lies ahead of its origin, which may be inside.
+
+    If a number of the ray or the space is NaN or infinite, the ray is `invalid`.
+    """
+    # Rounding the distance of a far camera to float32 errs by too much. So move the origin close to the
+    # volume, where distances are short.
+    toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
+    base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
+    close = along(origin, direction, base)
+    near, far = space.interval(close, direction)
+    start = jnp.maximum(near, -base)
+    hit = far > start
+    start = jnp.where(hit, start, 0)  # a miss has infinite distances, whose products are NaN
+    entry = along(close, direction, start)
+    length = jnp.where(hit, far - start, 0)
+    path, gaps = space.path(entry, direction), space.gaps(entry, direction, length)
+    ray = Ray(entry, direction, base + start, length, path, pixel, gaps)
+    return invalid(ray, ~jnp.isfinite(toward))
+
+
+def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
+    """Where `fault` is true, replace the ray by one that is never marched and renders as NaN.
+
+    Comparisons with NaN are false, so a march would treat such a ray as a miss or never end.
+    """
+    t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
+    return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
+
+
+class Straight(Path):
+    """A path that is straight in the grid: `start + s rate`."""
+
+    start: Vec3
+    rate: Vec3
+
+    def __call__(self, s: Scalar) -> Vec3:
+        return along(self.start, self.rate, s)
+
+
+class Affine(Space):
+    """A grid given by spacing, origin and direction.
+
+    - `low`, `high`: its first and its last node, and `spacing`: all along the grid's own axes, which are
+      those of `frame`, or, without one, the world's.
+    """
+
+    low: Vec3
+    high: Vec3
+    spacing: Vec3
+    frame: Frame | None
+
+    def __init__(self, volume: Volume):
+        self.spacing = apart(volume.spacing)
+        if volume.direction is None:
+            self.low, self.high = (apart(end) for end in volume.corners)
+            self.frame = None
+        else:
+            # from the first node, where the numbers are small: many origins are far away
+            self.frame = Frame.of(volume.origin, volume.direction)
+            high = (jnp.asarray(volume.shape, volume.spacing.dtype) - 1) * volume.spacing
+            self.low, self.high = apart(jnp.zeros_like(high)), apart(high)
+
+    @property
+    def diagonal(self) -> Scalar:
+        return jnp.sqrt(sum((high - low) ** 2 for low, high in zip(self.low, self.high, strict=True)))
+
+    @property
+    def middle(self) -> Vec3:
+        x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
+        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
+
+    def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
+        if self.frame is not None:
+            origin = self.frame.coordinates(origin)
+        return slab_interval(origin, self.own(direction), self.low, self.high)
+
+    def coordinate(self, point: Vec3) -> Vec3:
+        if self.frame is not None:
+            point = self.frame.coordinates(point)
+        # times the reciprocal, since XLA stores quotients of which there is more than one use
+        x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
+        return x, y, z
+
+    def point(self, coordinate: Vec3) -> Vec3:
+        x, y, z = self._own_point(coordinate)
+        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
+
+    def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
+        return self.spacing
+
+    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
+        x, y, z = (BLOCK * step for step in self.spacing)
+        low = self.low if first is None else self._own_point(first)
+        return Occupancy(visible, low, (x, y, z), self.frame)
+
+    def path(self, entry: Vec3, direction: Vec3) -> Straight:
+        dx, dy, dz = (d / step for d, step in zip(self.own(direction), self.spacing, strict=True))
+        return Straight(self.coordinate(entry), (dx, dy, dz))
+
+    def own(self, direction: Vec3) -> Vec3:
+        """Components of a world direction along the grid's axes, in world length."""
+        return direction if self.frame is None else self.frame.components(direction)
+
+    def _own_point(self, coordinate: Vec3) -> Vec3:
+        x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
+        return x, y, z
+
+
+def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:
+    """Distances at which a line enters and leaves a box; on a miss, the first exceeds the second."""
+    (near_x, far_x), (near_y, far_y), (near_z, far_z) = (
+        _slab(*ends) for ends in zip(origin, direction, low, high, strict=True)
+    )
+    near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
+    far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
+    return near, far
+
+
+def node_distance(
+    space: Space, shape: tuple[int, ...], first: Int[Array, "3"] | None = None
+) -> Float[Array, "bx by bz"]:
+    """By block, the least world distance between neighbouring nodes, in its middle. `first`: of the blocks,
+    the index of the first one."""
+    first = jnp.zeros(3, jnp.int32) if first is None else first
+    dtype = space.middle[0].dtype
+    middle = [
+        BLOCK * ((jnp.arange(n) + begin).astype(dtype) + 0.5) for n, begin in zip(shape, first, strict=True)
+    ]
+
+    def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+        along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
+        return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))
+
+    return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))
+
+
+@partial(jax.jit, static_argnums=1)  # operation by operation, it takes seconds to compile
+def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
+    """The median of `node_distance` over all blocks: what steps are counted in, as voxels."""
+    return jnp.median(node_distance(space, shape))
+
+
+def world_gradient(
+    volume: Volume, space: Space, point: Vec3, method: Literal["trilinear", "central"] = "central"
+) -> Vec3:
+    """Gradient of the value with respect to a world point, in value units per world length.
+
+    `Volume.gradient`, transformed by the transposed Jacobian of `space.coordinate`.
+    """
+    coordinate, transpose = jax.vjp(space.coordinate, point)
+    slopes = volume.gradient(coordinate, method)
+    per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))
+    return transpose(per_node)[0]
+
+
+def _slab(origin: Scalar, direction: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
+    """Distances to the nearer and the farther of two parallel planes."""
+    # Smaller components count as parallel to the planes. Not 0: the derivative of 1/d, 1/d², must be finite.
+    parallel = jnp.abs(direction) < float(jnp.finfo(direction.dtype).tiny) ** 0.25
+    slope = jnp.where(parallel, 1, direction)
+    a, b = (low - origin) / slope, (high - origin) / slope
+    between = (low <= origin) & (origin <= high)
+    near = jnp.where(parallel, jnp.where(between, -jnp.inf, jnp.inf), jnp.minimum(a, b))
+    far = jnp.where(parallel, jnp.where(between, jnp.inf, -jnp.inf), jnp.maximum(a, b))
+    return near, far

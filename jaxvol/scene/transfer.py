@@ -1,0 +1,415 @@
+"""Which colour and extinction has this value?
+
+A transfer function answers three questions: `measured`, what it reads from the volume at a place;
+`classifier`, how that becomes colour and extinction; and `majorant`, a bound of its extinction over a block
+of the volume.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._util.checks import Arrayable, finite_array, increasing, number, require, unit_interval
+from .._util.piecewise_linear import (
+    FEW,
+    clip_below,
+    interpolate_row,
+    points_below,
+    positive_between,
+    table_row,
+    upper_bound_between,
+    variation_between,
+)
+from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
+from .._util.vec3 import Scalar, Vec3
+from ..xla.row_sums import row_sums
+from ..xla.xla import gather
+from .occupancy import Blocks
+from .variation import Variation, Windows
+from .volume import Volume
+
+
+Measured: TypeAlias = tuple[Any, ...]
+"""What a transfer function reads at a place: the value first, then whatever else it depends on. Of a cell
+that is integrated (`Classification.spanned`): the mean of the values at its ends, then what else is read in
+its middle, and what is read at its two ends."""
+
+Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
+"""From `Measured` to colour (r, g, b) and extinction (1/length)."""
+
+
+class Classification(NamedTuple):
+    """A transfer function applied to one volume, in two stages: `measure` at a grid coordinate, then
+    `classify`.
+
+    The stages are separate because measuring fetches from memory, and an engine keeps what was fetched.
+    """
+
+    measure: Callable[[Vec3], Measured]
+    classify: Classify
+    search: Callable[[Measured], Measured] | None = None
+    """Looks up what `classify` needs beside the measured values, once; it is appended to them."""
+    light: Callable[[Any], Vec3] | None = None
+    """From a `lighting.shading.Sample`, or many along one axis, to the shaded colours. None: colours are as
+    classified."""
+    beside: Callable[[Vec3], Measured] = lambda _: ()
+    """What is measured beside the value."""
+    integrate: Classify | None = None
+    """From what is measured of a cell (`spanned`) to its mean colour and extinction, if the value is linear
+    along it. None: a cell is as its sample."""
+
+    def at(self, coordinate: Vec3) -> Measured:
+        """What `classify` needs at a grid coordinate."""
+        return self.searched(self.measure(coordinate))
+
+    @staticmethod
+    def spanned(beside: Measured, front: Measured, back: Measured) -> Measured:
+        """What `integrate` needs of a cell: from what is measured at its ends, and beside the value in its
+        middle."""
+        return ((front[0] + back[0]) / 2, *beside, front, back)
+
+    @property
+    def of_cells(self) -> Classify:
+        """Classifies cells: `integrate`, or as their samples."""
+        return self.classify if self.integrate is None else self.integrate
+
+    def searched(self, measured: Measured) -> Measured:
+        """The measured values, followed by what `search` finds for them."""
+        return measured if self.search is None else (*measured, *self.search(measured))
+
+
+class Transfer(eqx.Module):
+    """The interface of all transfer functions."""
+
+    def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
+        """What is read from the volume at a grid coordinate: the value, then what is read `beside`."""
+        return (volume.value(coordinate), *self.beside(volume, coordinate))
+
+    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+        """What is read beside the value; by default nothing."""
+        return ()
+
+    @property
+    def reads_gradient(self) -> bool:
+        """Whether `beside` reads the volume's gradient, so that it is worth storing slopes, and the ranges of
+        them in blocks (`Blocks.slopes`). By default not."""
+        return False
+
+    @abstractmethod
+    def classifier(self) -> Classify:
+        """The function from `Measured` to colour and extinction. Tables that it needs are computed here,
+        once, outside the march's loop."""
+
+    def integrator(self) -> Classify | None:
+        """The function from what is measured over a cell (`Measured`) to its colour and extinction: the means
+        over all values between its ends, that of the colour weighted by the extinction. None, the default:
+        unknown, so that `quadrature="preintegrated"` is refused."""
+        return None
+
+    def search(self) -> Callable[[Measured], Measured] | None:
+        """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
+        classifier gets after it. By default there is none. With an `integrator` it depends on the value
+        alone."""
+        return None
+
+    def classification(self, volume: Volume) -> Classification:
+        """The two stages for this volume."""
+        return Classification(
+            partial(self.measured, volume),
+            self.classifier(),
+            self.search(),
+            beside=partial(self.beside, volume),
+        )
+
+    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
+        """Vector–Jacobian product of classifying many samples, in arrays of one shape: the cotangents of the
+        transfer function and of the measured values, from those of colour and extinction. None where there
+        is no derivative. `measured` includes what `search` found."""
+
+        return _classification_vjp(self, lambda transfer: transfer.classifier(), measured, color, extinction)
+
+    def pull_integrated(
+        self, measured: Measured, color: Vec3, extinction: Scalar
+    ) -> tuple["Transfer", Measured]:
+        """The same of classifying cells by `integrator`; `measured` is what was measured over them."""
+        return _classification_vjp(self, lambda transfer: transfer.integrator(), measured, color, extinction)
+
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
+        block's range. 0 only where the extinction is proven to be 0, and in blocks that hold NaN
+        (`Blocks.unordered`). It carries no gradient. By default infinite: nothing is proven."""
+        return jnp.full(blocks.low.shape, jnp.inf)
+
+    def variation(self, windows: Windows) -> Variation:
+        """How much extinction and emission change within the range of each window. It carries no gradient. By
+        default nothing is known."""
+        return Variation.unknown(windows)
+
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        """Where `majorant` is positive; to be overridden where that takes less time to find out."""
+        return self.majorant(blocks) > 0
+
+
+def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool) -> Classification:
+    """A transfer function applied to a volume: to its points, and where cells are `integrated`
+    (`quadrature="preintegrated"`), also to these.
+
+    **Raises:** `ValueError` for that, where the transfer function has no `integrator`."""
+    classification = transfer.classification(volume)
+    if not integrated:
+        return classification
+    integrate = transfer.integrator()
+    if integrate is None:
+        raise ValueError(
+            'quadrature="preintegrated" needs a transfer function with an integral over the value; '
+            f'{type(transfer).__name__} has no integrator. Use "midpoint".'
+        )
+    return classification._replace(integrate=integrate)
+
+
+def _classification_vjp(
+    transfer: Transfer,
+    classify_of: Callable[[Any], Any],
+    measured: Measured,
+    color: Vec3,
+    extinction: Scalar,
+) -> tuple[Any, Measured]:
+    """JAX's vector–Jacobian product of classifying many samples."""
+
+    def classified(given: tuple[Transfer, Measured]) -> tuple[Vec3, Scalar]:
+        transfer, measured = given
+        classify = classify_of(transfer)
+        for _ in range(extinction.ndim):
+            classify = jax.vmap(classify)
+        return classify(measured)
+
+    _, pull = eqx.filter_vjp(classified, (transfer, measured))
+    return pull((color, extinction))[0]
+
+
+class TransferFunction(Transfer):
+    """Colour and extinction, piecewise linear in the volume's value and constant beyond the ends.
+
+    **Arguments:**
+
+    - `values`: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
+      step: what lies below takes the first one's colour and extinction, what lies there or above the
+      second's. They carry no gradient.
+    - `colors`: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
+    - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
+      `1 - exp(-extinction w)`.
+
+    Extinction is interpolated. VTK interpolates opacity; the two agree at the points, and
+    differ between points where the opacity of a unit distance is high.
+
+    Put a step between values of the data rather than at one: interpolation may round a value to either side.
+
+    Where it fails, and where not: `experiments/stability.py`, "extinction without bound".
+
+    **Raises:** `ValueError` for fewer than two points, points that do not increase or of which three are
+    equal, negative extinction, NaN or infinity, or lengths that differ.
+    """
+
+    values: Float[Array, " n"]
+    colors: Float[Array, "n 3"]
+    extinction: Float[Array, " n"]
+
+    def __init__(self, values: Arrayable, colors: Arrayable, extinction: Arrayable):
+        self.values = increasing("values", values)
+        n = self.values.shape[0]
+        self.colors = finite_array("colors", colors, (n, 3))
+        extinction = finite_array("extinction", extinction, (n,))
+        self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Sequence[tuple[float, Sequence[float], float]] | Any,
+        unit_distance: Arrayable = 1.0,
+    ) -> "TransferFunction":
+        """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
+
+        **Arguments:**
+
+        - `points`: in increasing order of value; two of one value make a step. `opacity` in [0, 1] is that
+          of a layer of thickness `unit_distance`, and becomes the extinction
+          `-ln(1 - opacity) / unit_distance` exactly.
+          An opacity of 1, whose extinction would be infinite, is taken as 1 - 2⁻²⁴.
+        - `unit_distance`: world length. VTK's `ScalarOpacityUnitDistance`.
+
+        **Raises:** `ValueError` as the class does, and for an opacity outside [0, 1].
+        """
+        try:
+            values, colors, opacities = zip(*points, strict=True)
+        except (TypeError, ValueError) as fault:
+            raise ValueError(
+                f"points must be triples (value, (r, g, b), opacity); got {points!r}."
+            ) from fault
+        return cls(values, colors, extinction_of(opacities, unit_distance))
+
+    def __call__(self, value: Scalar) -> tuple[Vec3, Scalar]:
+        """Colour (r, g, b) and extinction of a value."""
+        search, measured = self.search(), (value,)
+        return self.classifier()(measured if search is None else (*measured, *search(measured)))
+
+    def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
+        """Opacity at the control points of a layer of thickness `unit_distance`."""
+        return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
+
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        if not self._looks_up_rows:
+            return super().majorant(blocks)
+        values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
+        bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
+        return jnp.where(self.visible(blocks), bound, 0)
+
+    def variation(self, windows: Windows) -> Variation:
+        if not self._looks_up_rows:
+            return super().variation(windows)
+        points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
+        return Variation(*variation_between(*points, windows.low, windows.high))
+
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+        if not self._looks_up_rows:
+            return super().visible(blocks)
+        values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
+        return positive_between(values, extinction, blocks.low, blocks.high)
+
+    def search(self) -> Callable[[Measured], Measured] | None:
+        values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
+        if last < FEW:
+            return None
+
+        def search(measured: Measured) -> Measured:
+            interval = jnp.clip(points_below(values, measured[0]) - 1, 0, last)
+            return interval, clip_below(measured[0] - gather(values, interval), jnp.zeros_like(values[0]))
+
+        return search
+
+    def classifier(self) -> Classify:
+        """Look-up of colour and extinction."""
+        rows, values = self.rows(), jax.lax.stop_gradient(self.values)
+
+        def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
+            _, interval, past = measured
+            return interpolate_row(table_row(rows, interval), past)
+
+        def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
+            (value,) = measured
+            row = tuple(rows[0])
+            for start, following in zip(values[1:], rows[1:], strict=True):
+                row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
+            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
+
+        return chosen if values.shape[0] <= FEW else looked_up
+
+    @property
+    def _looks_up_rows(self) -> bool:
+        """Whether no subclass classifies in another way."""
+        own = (TransferFunction.classifier, TransferFunction.rows)
+        return all(getattr(type(self), method.__name__) is method for method in own)
+
+    def integrator(self) -> Classify | None:
+        """The exact means, but for rounding."""
+        if not self._looks_up_rows:
+            return None
+        rows, few = self.span_rows(), self.values.shape[0] <= FEW
+
+        def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
+            _, front, back = measured
+            if few:
+                return mean_by_spans(rows, front[0], back[0])
+            (a, i), (b, j) = (_span_of(rows, end) for end in (front, back))
+            return mean_by_rows(a, b, front[0], back[0], i == j)
+
+        return integrate
+
+    def pull_integrated(
+        self, measured: Measured, color: Vec3, extinction: Scalar
+    ) -> tuple["Transfer", Measured]:
+        # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
+        _, front, back = measured
+        rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
+        (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
+        means = partial(mean_by_rows, same=i == j)
+        _, pull = jax.vjp(means, a, b, front[0], back[0])
+        of_a, of_b, of_front, of_back = pull((color, extinction))
+        fronts, backs = (
+            row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
+        )
+        (transfer,) = pull_rows(fronts + backs)
+        return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
+
+    def span_rows(self) -> Float[Array, "spans 26"]:
+        """The table of `piecewise_means.span_rows`."""
+        at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        return span_rows(jax.lax.stop_gradient(self.values), at_points)
+
+    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
+        if not self._looks_up_rows:
+            transfer, (of_value, *found) = super().pull(measured, color, extinction)
+            if found:  # the distance past the point depends on the value
+                of_value = of_value + jnp.where(measured[0] < self.values[0], 0, found[1])
+            return transfer, (of_value,)
+        # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
+        rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
+        if self.values.shape[0] <= FEW:
+            interval = jnp.maximum(points_below(self.values, value) - 1, 0)
+            past = clip_below(value - table_row(rows, interval)[0], jnp.zeros_like(value))
+        else:
+            _, interval, past = measured
+        *_, r, g, b, slope, inverse = table_row(rows, interval)
+        part = past * inverse
+        parts = jnp.stack([*color, extinction], axis=-1)
+        shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
+        sums = row_sums(len(rows), interval, shared)
+        at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))
+        leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
+        none = jax.tree.map(jnp.zeros_like, eqx.filter(self, eqx.is_inexact_array))
+        transfer = eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), none, leaves)
+        of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
+        return transfer, (jnp.where(value < self.values[0], 0, of_value),)
+
+    def rows(self) -> Float[Array, "points 10"]:
+        """A table with one row for each point, so that a value between this point and the next finds all it
+        needs side by side: value, colour and extinction of the point, the slopes of colour and extinction,
+        and 1 over the gap to the next point. Slopes are 0 beyond the last point, and between two equal
+        ones."""
+        values = jax.lax.stop_gradient(self.values)
+        gap = (values[1:] - values[:-1])[:, None]
+        inverse = jnp.where(gap > 0, 1 / jnp.where(gap > 0, gap, 1), 0)
+        at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        slopes = jnp.concatenate([(at_points[1:] - at_points[:-1]) * inverse, inverse], axis=1)
+        return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
+
+
+def _span_of(
+    rows: Float[Array, "spans 26"], measured: Measured
+) -> tuple[tuple[Scalar, ...], Int[Array, "..."]]:
+    """The row of the span in which a value lies, and its index. `measured`: the value, and what
+    `TransferFunction.search` finds for it."""
+    value, *found = measured
+    index = jnp.where(value < rows[0, 0], 0, found[0] + 1) if found else span_index(rows, value)
+    return table_row(rows, index), index
+
+
+def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:
+    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity.
+
+    Inverse of `1 - exp(-extinction unit_distance)`; an opacity above 1 - 2⁻²⁴ counts as that, the
+    largest float32 below 1. **Raises** `ValueError` for an opacity outside [0, 1].
+    """
+    unit_distance = number("unit_distance", unit_distance, above=0)
+    opacity = unit_interval("opacity", opacity, (None,))
+    return _extinction(opacity, unit_distance)
+
+
+@jax.jit  # one program, rather than one for each operation
+def _extinction(opacity: Float[Array, " n"], unit_distance: Float[Array, ""]) -> Float[Array, " n"]:
+    return -jnp.log1p(-jnp.minimum(opacity, 1 - 2.0**-24)) / unit_distance

@@ -1,0 +1,300 @@
+"""What is a volume's value at a grid coordinate?
+
+Grid coordinates count voxels: node `data[i, j, k]` lies at coordinate (i, j, k), so a grid of
+n nodes spans n - 1 cells along an axis. Values are interpolated trilinearly between nodes;
+a coordinate outside the grid takes the value of the nearest point of the grid.
+"""
+
+from abc import abstractmethod
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Integer, Shaped
+
+from .._util.axes import XYZ, Axes
+from .._util.checks import Arrayable, described, finite_array, require
+from .._util.named_axes import along_xyz, is_named
+from .._util.vec3 import Scalar, Vec3
+from .._util.voxels import label_array, voxel_array
+from ..xla.platform import is_traced
+from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by
+
+
+class Field(eqx.Module):
+    """A user-defined scalar field that replaces the interpolation of voxels, for example a formula.
+
+    Every engine and adjoint evaluates it for `Volume(data, field=...)`. Its arrays are differentiable, like
+    all arrays of a volume. `SpaceLeaping` leaps over no part of it, since its range is unknown. The voxel
+    gradient of `"replay"` covers the voxels that the field reads through `volume.interpolated`.
+    """
+
+    @abstractmethod
+    def value(self, volume: "Volume", coordinate: Vec3) -> Scalar:
+        """Value at a grid coordinate, whose world position is
+        `volume.origin + volume.direction @ (coordinate * volume.spacing)`."""
+
+
+class Volume(eqx.Module):
+    """A scalar field sampled on a regular grid, `data[x, y, z]`.
+
+    **Arguments:**
+
+    - `data`: (nx, ny, nz) voxels, at least 2 along each axis: an array of any library and memory layout, or
+      nested sequences. uint8, int8, uint16, int16, float16, bfloat16 and float32 keep their type on the
+      device; a voxel is converted after it is fetched. float64 is kept if JAX's 64-bit types are enabled,
+      and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
+      int8, uint16, int16 and float32 that holds every value exactly.
+      Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
+      evenly spaced, give spacing and origin. For an image stack of scikit-image, [plane, row, column], pass
+      `stack.T`: x then runs along the rows, y from row to row, z from plane to plane.
+    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT). By default
+      that of the data's coordinates, or 1.
+    - `origin`: world position of node (0, 0, 0). By default that of the data's coordinates, or 0.
+    - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
+      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
+      and for the identity, the data's axes are the world's, and the field is None.
+    - `labels`: optional integer label of every node (a segmentation), of the same shape. 64-bit labels
+      become 32-bit.
+    - `field`: optional `Field` that supplies the values instead of the voxels; the voxel grid then only sets
+      the volume's extent.
+
+    bfloat16 keeps 8 significant bits, float16 11: values around 1000 are rounded to multiples of 4 and of 0.5
+    (`experiments/stability.py`, "voxels of 16-bit floats").
+
+    `direction` is differentiable like `spacing`, as far as it turns: gradients are exact along changes that
+    keep it orthonormal, such as those of the angles that it is computed from.
+
+    **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
+    unsupported type, or hold NaN or infinity, even if only after conversion to float32; for integers that no
+    type holds exactly; for spacing that is not positive; for a direction whose columns are not of length 1
+    and orthogonal to 1e-4; and for labels of another shape or type, or beyond
+    int32.
+    """
+
+    data: Shaped[Array, "nx ny nz"]
+    spacing: Float[Array, "3"]
+    origin: Float[Array, "3"]
+    direction: Float[Array, "3 3"] | None
+    labels: Integer[Array, "nx ny nz"] | None
+    field: Field | None
+    fetch: Fetch
+
+    def __init__(
+        self,
+        data: Arrayable,
+        spacing: Arrayable | None = None,
+        origin: Arrayable | None = None,
+        labels: Arrayable | None = None,
+        *,
+        direction: Arrayable | None = None,
+        field: Field | Any | None = None,
+    ):
+        data, place = along_xyz(data) if is_named(data) else (data, {})
+        self.data = voxel_array(data)
+        spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
+        origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin
+        spacing = finite_array("spacing", spacing, (3,))
+        self.spacing = require(
+            spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}."
+        )
+        self.origin = finite_array("origin", origin, (3,))
+        self.direction = None if direction is None else _turn(direction)
+        self.labels = None if labels is None else label_array(labels, self.data.shape)
+        if not isinstance(field, Field | None):
+            raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
+        self.field, self.fetch = field, OneByOne()
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of nodes along x, y, z."""
+        return self.fetch.shape(self.data)
+
+    @property
+    def first(self) -> Vec3 | None:
+        """Where `data` is only a part of the grid, the node at which it begins, in the type of `spacing`."""
+        if self.fetch.window is None:
+            return None
+        x, y, z = self.fetch.window.first.astype(self.spacing.dtype)
+        return x, y, z
+
+    def in_grid_order(self, of_data: Array) -> Array:
+        """What was computed of parts of `data`, with its last three axes along x, y, z: `data` may be a part
+        of a grid that is kept in the order of storage (`part_of`). The same array, if they are."""
+        if self.fetch.axes == XYZ:
+            return of_data
+        return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
+
+    @property
+    def bounds(self) -> Float[Array, "6"]:
+        """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes: a box along the world's
+        axes, in which a volume with a `direction` lies askew."""
+        low, high = self.corners
+        if self.direction is not None:
+            # of each axis of the data, what it adds to the world's, up or down
+            reach = self.direction * (self._steps * self.spacing)[None, :]
+            low = self.origin + jnp.sum(jnp.minimum(reach, 0), axis=1)
+            high = self.origin + jnp.sum(jnp.maximum(reach, 0), axis=1)
+        return jnp.stack([low, high], axis=-1).reshape(-1)
+
+    @property
+    def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """World positions of the first and the last node."""
+        return corners_of(self.origin, self.spacing, self.direction, self._steps)
+
+    @property
+    def _steps(self) -> Float[np.ndarray, "3"]:
+        """Number of cells along x, y, z."""
+        return np.asarray(self.shape, self.spacing.dtype) - 1
+
+    @property
+    def center(self) -> Float[Array, "3"]:
+        """World position of the center of the grid."""
+        low, high = self.corners
+        return (low + high) / 2
+
+    def value(self, coordinate: Vec3) -> Scalar:
+        """Value at a grid coordinate, in the coordinate's float type; from `field` if there is one."""
+        return self.interpolated(coordinate) if self.field is None else self.field.value(self, coordinate)
+
+    def interpolated(self, coordinate: Vec3) -> Scalar:
+        """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type."""
+        cube, (fx, fy, fz) = self.fetch.cube(self.data, coordinate)
+        ((c000, c001), (c010, c011)), ((c100, c101), (c110, c111)) = cube
+        return _mix(
+            fx,
+            _mix(fy, _mix(fz, c000, c001), _mix(fz, c010, c011)),
+            _mix(fy, _mix(fz, c100, c101), _mix(fz, c110, c111)),
+        )
+
+    def gradient(self, coordinate: Vec3, method: Literal["trilinear", "central"] = "central") -> Vec3:
+        """Gradient of the value along the grid axes, in value units per world length.
+
+        - `"trilinear"`: derivative of the trilinear interpolant within a cell: exact for the rendered
+          field, discontinuous between cells.
+        - `"central"`: trilinear interpolation of central differences at the nodes, which at the border of
+          the grid are one-sided: continuous, with an error of O(spacing²) relative to the gradient of the
+          sampled field. From the second node to the last but one, it equals the difference of the values one
+          node to either side; for a `field`, it is that difference everywhere, over the part inside.
+
+        **Raises:** `ValueError` for another method.
+        """
+        if method == "trilinear":
+            slopes = self._trilinear_slopes(coordinate)
+        elif method == "central":
+            central = self.field is None
+            slopes = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
+        else:
+            raise ValueError(f'method must be "trilinear" or "central"; got {method!r}.')
+        sx, sy, sz = slopes
+        return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
+
+    def label(self, coordinate: Vec3) -> Int[Array, ""]:
+        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one.
+
+        **Raises:** `ValueError` for a volume without labels."""
+        if self.labels is None:
+            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
+        i, j, k = (
+            jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)
+            for c, n in zip(coordinate, self.shape, strict=True)
+        )
+        _, ny, nz = self.shape
+        return fetched(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
+
+    def label_share(self, coordinate: Vec3, label: int) -> Scalar:
+        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others.
+
+        **Raises:** `ValueError` for a volume without labels."""
+        if self.labels is None:
+            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
+        share = jnp.zeros_like(coordinate[0])
+        for index, weight in corners(coordinate, self.shape):
+            share = share + weight * (fetched(self.labels, index) == label).astype(share.dtype)
+        return share
+
+    def _trilinear_slopes(self, coordinate: Vec3) -> Vec3:
+        cube, (fx, fy, fz) = self.fetch.cube(self.data, coordinate)
+        ((c000, c001), (c010, c011)), ((c100, c101), (c110, c111)) = cube
+        return (
+            _mix(fy, _mix(fz, c100 - c000, c101 - c001), _mix(fz, c110 - c010, c111 - c011)),
+            _mix(fx, _mix(fz, c010 - c000, c011 - c001), _mix(fz, c110 - c100, c111 - c101)),
+            _mix(fx, _mix(fy, c001 - c000, c011 - c010), _mix(fy, c101 - c100, c111 - c110)),
+        )
+
+    def _field_slopes(self, coordinate: Vec3) -> Vec3:
+        def slope(axis: int) -> Scalar:
+            last = self.shape[axis] - 1
+            before, after = (jnp.clip(coordinate[axis] + side, 0, last) for side in (-1, 1))
+            rise = self.value(_with(coordinate, axis, after)) - self.value(_with(coordinate, axis, before))
+            # at least half a node apart unless the coordinate is more than half a node outside the grid
+            return rise / jnp.maximum(after - before, 0.5)
+
+        return slope(0), slope(1), slope(2)
+
+
+def corners_of(
+    origin: Float[Array, "3"], spacing: Float[Array, "3"], direction: Float[Array, "3 3"] | None, cells: Any
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """World positions of the first and the last node of a grid of so many cells along x, y, z."""
+    along = cells.astype(spacing.dtype) * spacing
+    if direction is not None:
+        # not by a matrix product, which some GPUs round to 10 bits
+        along = jnp.sum(direction * along[None, :], axis=1)
+    return origin, origin + along
+
+
+def _turn(direction: Arrayable) -> Float[Array, "3 3"] | None:
+    """A direction, checked; None for one that is known to be the identity."""
+    turn = require(
+        finite_array("direction", direction, (3, 3)),
+        lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
+        "direction must be a 3 x 3 matrix whose columns have length 1 and are orthogonal to each other; got "
+        "{got}.",
+    )
+    known = not is_traced(turn) and np.array_equal(np.asarray(turn), np.eye(3))
+    return None if known else turn
+
+
+def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
+    x, y, z = (component if i == axis else c for i, c in enumerate(coordinate))
+    return x, y, z
+
+
+def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
+    # exactly a and b at the ends; a + f (b - a) would round at f = 1
+    return a * (1 - fraction) + b * fraction
+
+
+def without_voxels(volume: Volume) -> Volume:
+    """The volume without `data`, which is too large to pass around."""
+    return eqx.tree_at(lambda v: v.data, volume, None)
+
+
+def with_voxels(volume: Volume, data: Array) -> Volume:
+    """The volume with `data` as its voxels."""
+    return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
+
+
+def part_of(
+    volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
+) -> Volume:
+    """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing,
+    origin and direction are those of the whole. Beyond the part nothing is known: its faces are read.
+
+    `axes`: of the array, which is data[z, y, x] for (2, 1, 0); by default as before. All else is along x, y,
+    z."""
+    window = Window(first, whole, volume.fetch.axes if axes is None else axes)
+    fetch = eqx.tree_at(lambda f: f.window, volume.fetch, window, is_leaf=lambda leaf: leaf is None)
+    return with_fetch(volume, fetch)
+
+
+def read_as(volume: Volume, fetch: Fetch) -> Volume:
+    """The volume with another way to read its voxels, which are the same."""
+    return with_fetch(volume, read_by(volume.fetch, fetch))
+
+
+def with_fetch(volume: Volume, fetch: Fetch) -> Volume:
+    """The volume with `fetch` as the way to read its voxels."""
+    return eqx.tree_at(lambda v: v.fetch, volume, fetch, is_leaf=lambda leaf: isinstance(leaf, Fetch))

@@ -1,0 +1,335 @@
+"""Reads the voxels around a coordinate: one by one, from packed words, or recording each fetch."""
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
+
+from .._util.axes import XYZ, Axes, inverse, permuted
+from .._util.vec3 import Scalar, Vec3
+from ..xla.platform import on_gpu
+from ..xla.row_sums import without_zeros
+from ..xla.xla import gather
+
+
+Cube: TypeAlias = list[list[list[Scalar]]]
+"""Eight voxels, [x][y][z]."""
+
+Node: TypeAlias = tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+"""Indices along x, y, z."""
+
+SLOPE_BITS = 10
+"""Bits of a doubled slope of 8-bit voxels, an integer between -510 and 510."""
+
+
+class Window(eqx.Module):
+    """The box of a grid that is in memory. Beyond it nothing is known: there its faces are read.
+
+    - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both along x, y, z.
+    - `axes`: of the array in memory, which is data[z, y, x] for (2, 1, 0). All else is along x, y, z, so that
+      what is computed, and how it rounds, does not depend on them.
+    """
+
+    first: Int[Array, "3"]
+    whole: tuple[int, int, int] = eqx.field(static=True)
+    axes: Axes = eqx.field(static=True)
+
+
+class Fetch(eqx.Module):
+    """How voxels are read from memory, where all or only a `window` of the grid is."""
+
+    window: Window | None = eqx.field(default=None, kw_only=True)
+
+    @abstractmethod
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+        """The eight voxels that begin with this one of those in memory, along the array's axes."""
+
+    @property
+    def axes(self) -> Axes:
+        """Of the array in memory (`Window.axes`)."""
+        return XYZ if self.window is None else self.window.axes
+
+    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+        """The eight voxels around a grid coordinate, and its fractional position between them."""
+        node, fraction = self.split(data, coordinate)
+        return transposed(self.cube_at(data, node, coordinate[0].dtype), self.axes), fraction
+
+    def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
+        """Number of nodes of the grid."""
+        if self.window is not None:
+            return self.window.whole
+        nx, ny, nz = data.shape
+        return nx, ny, nz
+
+    def split(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Node, Vec3]:
+        """The node below a grid coordinate, among those in memory and along the array's axes; and the
+        fractions past it, along x, y, z."""
+        node, fraction = split(coordinate, self.shape(data))
+        if self.window is None:
+            return node, fraction
+        # of integers, so that the fractions are those of the whole grid
+        i, j, k = (
+            jnp.clip(node[axis] - self.window.first[axis], 0, n - 2)
+            for axis, n in zip(self.axes, data.shape, strict=True)
+        )
+        return (i, j, k), fraction
+
+    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+        """The node below a grid coordinate, as an index into the flattened array."""
+        return flat_index(self.split(data, coordinate)[0], data.shape)
+
+    def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
+        """The same, where slopes are asked for at one coordinate only and its node, as an index into the
+        flattened array, is known. XLA computes an index that several fetches share on one thread, as a kernel
+        of its own, unless it lies in memory."""
+        return self
+
+    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+        """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
+        the nodes. That of a node is half the difference of the two voxels beside it, or at the border the
+        difference between itself and the one beside it. From six cubes, unless they are stored."""
+        node, fraction = self.split(data, coordinate)
+        slopes = [self._slopes_of_nodes(data, node, axis, coordinate[0].dtype) for axis in range(3)]
+        return self._interpolated_slopes(slopes, fraction)
+
+    def _interpolated_slopes(self, slopes: list[Cube], fraction: Vec3) -> Vec3:
+        """Slopes along x, y and z, from those of eight nodes along the array's axes."""
+        found = [interpolated(transposed(cube, self.axes), fraction) for cube in slopes]
+        return permuted(found, inverse(self.axes))
+
+    def _slopes_of_nodes(self, data: Shaped[Array, "nx ny nz"], node: Node, axis: int, dtype: Any) -> Cube:
+        """Slopes along an axis of the array of the eight nodes that begin with this one."""
+
+        def beside(offset: int) -> Cube:
+            i, j, k = (
+                jnp.clip(n + offset, 0, data.shape[a] - 2) if a == axis else n for a, n in enumerate(node)
+            )
+            return _with_first(axis, self.cube_at(data, (i, j, k), dtype))
+
+        def slope(whole: Bool[Array, ""], before: Scalar, after: Scalar) -> Scalar:
+            return (after - before) * jnp.where(whole, 1, 0.5).astype(dtype)
+
+        # A cube does not reach past the border. There it begins with the first node, or ends with the last.
+        first, last = node[axis] == 0, node[axis] == data.shape[axis] - 2
+        (a, b), (c, d) = beside(-1), beside(1)
+        b, c = (
+            jax.tree.map(partial(jnp.where, border), outer, inner)
+            for border, outer, inner in ((first, a, b), (last, d, c))
+        )
+        lower, upper = jax.tree.map(partial(slope, first), a, c), jax.tree.map(partial(slope, last), b, d)
+        return _with_first(axis, [lower, upper])
+
+
+def read_by(fetch: Fetch, how: Fetch) -> Fetch:
+    """The same voxels as of `fetch`, read as by `how`."""
+    return eqx.tree_at(lambda fetch: fetch.window, how, fetch.window, is_leaf=lambda leaf: leaf is None)
+
+
+def transposed(cube: Cube, axes: Axes) -> Cube:
+    """A cube along x, y, z, from one whose own axes run along these."""
+
+    def corner(*index: int) -> Scalar:
+        i, j, k = permuted(index, axes)
+        return cube[i][j][k]
+
+    return [[[corner(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+
+
+def _with_first(axis: int, cube: Cube) -> Cube:
+    """A cube with this axis and the first one exchanged."""
+    return transposed(cube, ((0, 1, 2), (1, 0, 2), (2, 1, 0))[axis])
+
+
+def interpolated(cube: Cube, fraction: Vec3) -> Scalar:
+    """Trilinear interpolation."""
+
+    def mix(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
+        return a + f * (b - a)
+
+    fx, fy, fz = fraction
+    (y0, y1), (y2, y3) = ((mix(fz, *row) for row in plane) for plane in cube)
+    return mix(fx, mix(fy, y0, y1), mix(fy, y2, y3))
+
+
+class OneByOne(Fetch):
+    """Fetches each of the eight voxels separately."""
+
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+        return cube_of(lambda flat: fetched(data, flat), data.shape, node, dtype)
+
+
+class Packed(Fetch):
+    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
+
+    - `nodes`: of 8-bit voxels, where they are stored, the slopes of each node. Doubled they are integers of
+      10 bits: that along x in the highest bits of a word, that along y from bit 12 on, that along z in the
+      lowest.
+    - `begin`: see `of_slopes_at`.
+    """
+
+    words: UInt32[Array, " voxels"]
+    nodes: UInt32[Array, " voxels"] | None = None
+    begin: Int[Array, ""] | None = None
+
+    def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
+        return Packed(self.words, self.nodes, begin, window=self.window)
+
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+        _, ny, nz = data.shape
+        base = flat_index(node, data.shape)
+        bits = 8 * data.dtype.itemsize
+        signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
+
+        def voxel(word: Int[Array, ""], number: int) -> Scalar:
+            if signed:  # shifting down from the top bits extends the sign
+                return (word << (32 - bits * (number + 1)) >> (32 - bits)).astype(dtype)
+            return (word >> (bits * number) & (2**bits - 1)).astype(dtype)
+
+        def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
+            if bits == 8:
+                word = self._word(flat)
+                return [[voxel(word, 0), voxel(word, 1)], [voxel(word, 2), voxel(word, 3)]]
+            words = self._word(flat), self._word(flat + nz)
+            return [[voxel(word, 0), voxel(word, 1)] for word in words]
+
+        return [row(base), row(base + ny * nz)]
+
+    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+        nodes = self.nodes
+        if nodes is None:
+            return super().slopes(data, coordinate)
+        node, fraction = self.split(data, coordinate)
+        base = flat_index(node, data.shape) if self.begin is None else self.begin
+        dtype = coordinate[0].dtype
+        _, ny, nz = data.shape
+        shift = 32 - SLOPE_BITS
+
+        # Parts of the array, so that all eight fetches share one index: XLA adds an offset that is part of
+        # the index 16 times for 16 samples. A slice that is fetched from is not stored.
+        last = (ny + 1) * nz + 1
+        length = data.size - last
+
+        def word(offset: int) -> Int[Array, ""]:
+            return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
+
+        words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+
+        def slopes(bits: int) -> Cube:
+            """The slopes that begin so many bits below the highest one, times a power of two."""
+
+            def top(word: Int[Array, ""]) -> Scalar:
+                return ((word << bits) & -(1 << shift)).astype(dtype)
+
+            return jax.tree.map(top, words)
+
+        x, y, z = self._interpolated_slopes([slopes(bits) for bits in (0, 10, shift)], fraction)
+        factor = 2.0 ** -(shift + 1)
+        return x * factor, y * factor, z * factor
+
+    def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
+        word = gather(self.words, flat)
+        # XLA repeats a fetch for each use of its value, but not for uses of the converted value
+        return word.astype(jnp.int32)
+
+
+class Recording(Fetch):
+    """Records which voxels are fetched, and adds a value to each, so that the VJP with respect to these
+    values returns their cotangents.
+
+    - `perturbations`: the values, in the order of the fetches; if empty, nothing is added (to count the
+      fetches).
+    - `bases`: of each cube its first voxel, as an index into the flattened array, filled while a program is
+      traced.
+    """
+
+    perturbations: list[Cube]
+    bases: list[Int[Array, "..."]] = eqx.field(static=True)
+
+    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+        number = len(self.bases)
+        cube = cube_of(lambda flat: jax.lax.stop_gradient(fetched(data, flat)), data.shape, node, dtype)
+        self.bases.append(flat_index(node, data.shape))
+        if self.perturbations:
+            cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
+        return cube
+
+
+def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
+    """Values to add to the cubes that begin at these voxels, which may be given by their shapes alone."""
+    zeros = (jnp.zeros(base.shape, dtype) for base in bases)
+    return [[[[zero, zero], [zero, zero]], [[zero, zero], [zero, zero]]] for zero in zeros]
+
+
+_PAIRS = jax.lax.ScatterDimensionNumbers(
+    update_window_dims=(1,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
+)
+
+
+def scatter_add(
+    voxels: Float[Array, " voxels"],
+    shape: tuple[int, ...],
+    bases: list[Int[Array, "..."]],
+    cubes: list[Cube],
+) -> Float[Array, " voxels"]:
+    """Add the cotangents of cubes, which begin at these voxels, to the flattened voxels of an array of this
+    shape."""
+    _, ny, nz = shape
+    for base, cube in zip(bases, cubes, strict=True):
+        for x, y in itertools.product((0, 1), repeat=2):
+            # both voxels of a pair along z at once: XLA adds one update after the other
+            pair = jnp.stack(cube[x][y], axis=-1).reshape(-1, 2).astype(voxels.dtype)
+            index, mode = (base + (x * ny + y) * nz).reshape(-1), "promise_in_bounds"
+            if on_gpu():
+                index, mode = without_zeros(index, pair, voxels.size), "drop"
+            voxels = jax.lax.scatter_add(voxels, index[:, None], pair, _PAIRS, mode=mode)
+    return voxels
+
+
+def cube_of(
+    voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], node: Node, dtype: Any
+) -> Cube:
+    """The eight voxels that begin with this one, each by its index into the flattened array."""
+    _, ny, nz = shape
+    base = flat_index(node, shape)
+    return [
+        [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
+    ]
+
+
+def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
+    """The index of a node into the flattened array."""
+    i, j, k = node
+    _, ny, nz = shape
+    return (i * ny + j) * nz + k
+
+
+def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
+    """The eight nodes around a coordinate: the index of each into the flattened array, and its trilinear
+    weight."""
+    (i, j, k), fraction = split(coordinate, shape)
+    _, ny, nz = shape
+    found = []
+    for x, y, z in itertools.product((0, 1), repeat=3):
+        sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
+        found.append((((i + x) * ny + j + y) * nz + k + z, math.prod(sides)))
+    return found
+
+
+def split(coordinate: Vec3, shape: tuple[int, ...]) -> tuple[Node, Vec3]:
+    """The node below a coordinate, and the fractions past it; the last node belongs to the cell below."""
+    x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
+    # the second clip also keeps the index of a NaN inside the array
+    i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
+    return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
+
+
+def fetched(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
+    """The entry at index `flat` of the flattened array."""
+    return gather(array.reshape(-1), flat)

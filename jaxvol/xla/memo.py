@@ -1,0 +1,50 @@
+"""Memoizes results computed from an array, for as long as the array lives.
+
+Arrays are immutable: an update of a volume replaces its array, and results for the old one are never
+requested again. So nothing stored here goes stale, and nothing outlives its array.
+"""
+
+import weakref
+from collections.abc import Callable
+from functools import cache
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from .platform import is_traced
+from .xla import computed_now
+
+
+T = TypeVar("T")
+
+
+def memoized(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
+    """`compute(array)`, computed once in the lifetime of a concrete array; it carries no gradient. Under
+    `jax.vmap`, it is computed once in the lifetime of the batch."""
+    if not isinstance(array, jax.Array):  # NumPy arrays are mutable
+        return compute(array)
+    if is_traced(array):
+        return _of_batch(compute)(jax.lax.stop_gradient(array))
+    key = id(array), compute
+    if key not in _MEMORY:
+        _MEMORY[key] = computed_now(compute, array)
+        weakref.finalize(array, _MEMORY.pop, key, None)
+    return _MEMORY[key]
+
+
+@cache
+def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`compute` of one array, with a batching rule that memoizes the results of a batch."""
+    one, several = jax.custom_batching.custom_vmap(compute), jax.vmap(compute)
+
+    @one.def_vmap
+    def _(size: int, batched: list[bool], arrays: Array) -> Any:
+        results = memoized(arrays, several)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return one
+
+
+_MEMORY: dict[tuple[int, Callable[..., Any]], Any] = {}

@@ -1,0 +1,53 @@
+"""For which platform is a program traced, and how does it loop there?
+
+On a GPU, the host launches one kernel after the other. It waits for the device at each branch, and at each
+turn of a loop whose number of turns is not known when it is compiled; a number that is known costs nothing.
+(XLA's `ConditionalThunk` and `WhileThunk` copy the predicate to the host.)
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.core
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+
+State = TypeVar("State")
+
+TURNS = 16
+"""Turns of a loop between two looks at its condition, on a GPU."""
+
+
+def platform() -> str:
+    """The platform of a program that is traced now: that of `jax.default_device`, or else of JAX's default
+    backend. Arrays that were put on another device make it as right, but not as fast."""
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.default_backend() if device is None else getattr(device, "platform", str(device))
+
+
+def on_gpu() -> bool:
+    """Whether a program that is traced now is for a GPU."""
+    return platform() in ("gpu", "cuda", "rocm")
+
+
+def while_loop(
+    cond: Callable[[State], Bool[Array, ""]], body: Callable[[State], State], start: State
+) -> State:
+    """`jax.lax.while_loop`. On a GPU, it looks at the condition once in `TURNS`; surplus turns change
+    nothing."""
+
+    def turn(_: object, state: State) -> State:
+        return jax.tree.map(partial(jnp.where, cond(state)), body(state), state)
+
+    def turns(state: State) -> State:
+        return jax.lax.fori_loop(0, TURNS, turn, state)
+
+    return jax.lax.while_loop(cond, turns if on_gpu() else body, start)
+
+
+def is_traced(*values: Any) -> bool:
+    """Whether any of the values is a tracer."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))

@@ -1,0 +1,60 @@
+"""Where are compiled programs kept, so that the next process need not compile them again?"""
+
+import os
+from pathlib import Path
+
+import jax
+
+
+SHORTEST = 0.1
+"""Seconds of compilation from which on a program is kept: what is faster to compile than to read is not."""
+
+
+def default_programs() -> Path:
+    """The folder of kept programs: JAX's own if `JAX_COMPILATION_CACHE_DIR` is set, else one in the user's
+    cache."""
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(chosen) if chosen else caches / "jaxvol" / "programs"
+
+
+def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
+    """Keeps compiled programs in a folder, so that the first image of the next process takes less time.
+
+    XLA compiles a program for each kind of scene (sizes, transforms, light), which takes some 4 s. Call this
+    before the first image, in a script or a notebook: it turns on JAX's persistent compilation cache for this
+    process. The command `jaxvol` does so by itself, and so do `view` and the page of `jaxvol view`, unless
+    JAX has a folder already. The programs are those of this machine, this version of jaxvol and of JAX;
+    others are compiled beside them. To be rid of them, delete the folder.
+
+    **Arguments:** `folder`: made if it does not exist. By default the folder that
+    `JAX_COMPILATION_CACHE_DIR` names, or else `jaxvol/xla/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
+
+    **Returns:** the folder.
+
+    **Raises:** `OSError` for a folder that cannot be made.
+    """
+    path = default_programs() if folder is None else Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    if _folder() != str(path):
+        jax.config.update("jax_compilation_cache_dir", str(path))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
+        _forget_that_none_was_set()
+    return path
+
+
+def keep_programs_by_default() -> None:
+    """`keep_programs()`, unless JAX keeps them somewhere already."""
+    if not _folder():
+        keep_programs()
+
+
+def _folder() -> str | None:
+    return getattr(jax.config, "jax_compilation_cache_dir", None)
+
+
+def _forget_that_none_was_set() -> None:
+    # JAX decides once, at the first program, whether there is a cache; in a notebook that may be long ago
+    from jax.experimental.compilation_cache import compilation_cache
+
+    compilation_cache.reset_cache()

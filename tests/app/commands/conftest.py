@@ -1,0 +1,34 @@
+"""Commands without rendering: what they ask for is noted; they get a picture that only the camera changes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.scene.rendering import Details
+
+
+class Drawn:
+    """Stands in for `jaxvol.render`. `scenes`, `how`: what it was called with. `level`: of all opacities."""
+
+    def __init__(self):
+        self.scenes, self.how, self.level = [], [], 1.0
+
+    def __call__(self, volume, transfer, camera, march, **how):
+        self.scenes.append((volume, transfer, camera, march))
+        self.how.append(how)
+        width, height = camera.size
+        level = self.level * (0.5 + 0.3 * np.sin(np.sum(np.asarray(camera.position))))
+        alpha = np.linspace(0, level, width * height, dtype=np.float32).reshape(height, width, 1)
+        rgba = alpha * np.array([0.9, 0.5, 0.1, 1], np.float32)
+        depth = np.full((height, width), 7.5, np.float32)
+        depth[0, 0] = np.inf
+        details = Details(depth=jnp.asarray(depth), samples=jnp.ones((height, width), jnp.int32))
+        return jv.Rendering(jnp.asarray(rgba), jnp.zeros((height, width), bool), details)
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    drawn = Drawn()
+    monkeypatch.setattr("jaxvol.app.commands.frames.render", drawn)
+    return drawn

@@ -1,0 +1,213 @@
+"""Does a picture hold what made it, and is it made again from that?"""
+
+import contextlib
+import json
+import shutil
+import zlib
+
+import equinox as eqx
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+from skimage.io import imread
+
+import jaxvol as jv
+from jaxvol.app.cli import _parser, main
+from jaxvol.app.commands.checksum import checksum
+from jaxvol.app.commands.recorded import KEYWORD, MOST
+from jaxvol.app.commands.settings import parsed
+
+
+SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
+
+
+def text_in(path):
+    return json.loads(Image.open(path).info[KEYWORD])
+
+
+@pytest.fixture
+def picture(volume_file, tmp_path, monkeypatch, drawn):
+    monkeypatch.chdir(tmp_path)
+    look = ["--direction", "1", "-0.3", "0.7", "--background", "0", "0.1", "1"]
+    assert main(["render", volume_file.name, *SEEN, *look, "-o", "a.png"]) == 0
+    return tmp_path / "a.png"
+
+
+def like(name, *words):
+    return main(["render", "--like", "a.png", *words, "-o", name])
+
+
+def test_a_picture_is_made_again_bit_by_bit(picture, volume_file, tmp_path, drawn):
+    said = text_in(picture)
+    assert said["command"] == "render"
+    assert said["file"] == {"name": volume_file.name, "sha256": checksum(volume_file)}
+    assert str(tmp_path) not in json.dumps(said)  # nobody gave an absolute path
+    assert "programs" not in said["settings"]
+    assert like("b.png") == 0
+    assert eqx.tree_equal(*drawn.scenes)
+    assert drawn.how[0] == drawn.how[1]
+    np.testing.assert_array_equal(imread("b.png"), imread(picture))
+    assert text_in("b.png") == said
+    assert like("c.png", "--background", "1", "1", "1") == 0
+    assert (imread("c.png") != imread(picture)).any()
+    np.save("other.npy", np.asarray(jv.phantom("engine", 24).data)[::-1])  # another volume, alike
+    assert main(["render", "other.npy", "--like", "a.png", "-o", "d.png"]) == 0
+    assert text_in("d.png")["file"]["name"] == "other.npy"
+    assert not eqx.tree_equal(drawn.scenes[0][0], drawn.scenes[-1][0])
+    # other commands take its settings, too
+    assert parsed(_parser, ["plan", "--like", "a.png"]).direction == [1, -0.3, 0.7]
+    found = parsed(_parser, ["animate", "--like", "a.png", "--frames", "3"])
+    assert (found.preset, found.frames) == ("engine", 3)
+
+
+def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path, monkeypatch, drawn):
+    monkeypatch.chdir(tmp_path)
+    jv.write_transfer("t.json", jv.preset("engine"))
+    words = ["--size", "16", "16", "--step", "0.4", "--no-shade", "--transfer", "t.json"]
+    assert main(["render", volume_file.name, *words, "-o", "a.png"]) == 0
+    (tmp_path / "t.json").unlink()
+    assert like("b.png") == 0
+    assert eqx.tree_equal(*drawn.scenes)
+    assert text_in("b.png") == text_in("a.png")
+    assert like("c.png", "--preset", "engine") == 0
+    assert "transfer" not in text_in("c.png")
+
+
+def test_the_volume_may_lie_beside_the_picture_and_must_be_the_same(picture, volume_file, tmp_path, capsys):
+    (tmp_path / "there").mkdir()
+    for file in (picture, volume_file):
+        shutil.copy(file, tmp_path / "there" / file.name)
+    volume_file.write_bytes(volume_file.read_bytes()[::-1])
+    assert like("b.png") == 2
+    changed = f"{volume_file.name} is not the volume that a.png shows: its SHA-256 differs"
+    assert changed in capsys.readouterr().err
+    volume_file.unlink()
+    assert like("b.png") == 2
+    assert "which is not there" in capsys.readouterr().err
+    assert parsed(_parser, ["render", "--like", "there/a.png"]).file.parent.name == "there"
+
+
+def different(path, file, *contents):
+    """Whether a volume's checksum is another for each of these contents of one of its files."""
+    found = set()
+    for content in contents:
+        file.write_bytes(content)
+        found.add(checksum(path))
+    return len(found) == len(contents)
+
+
+def test_a_checksum_tells_all_files_of_a_volume_and_nothing_else(tmp_path):
+    slices, first = tmp_path / "slices", tmp_path / "slices" / "a.dcm"
+    slices.mkdir()
+    (slices / "b.dcm").write_bytes(bytes(128) + b"DICM" + b"0")
+    assert different(slices, first, bytes(128) + b"DICM1", bytes(128) + b"DICM2")
+    one = checksum(slices)
+    (slices / "picture.png").write_bytes(b"drawn meanwhile")
+    assert checksum(slices) == one
+    first.rename(slices / "c.dcm")
+    assert checksum(slices) != one
+    # the voxels that a header names, and the header
+    voxels = tmp_path / "my scan.raw"
+    (tmp_path / "a.mhd").write_text("NDims = 3\nElementDataFile = my scan.raw\n")
+    (tmp_path / "a.nrrd").write_text("NRRD0004\ndata file: my scan.raw\n\n")
+    (tmp_path / "a.raw").write_bytes(b"1")
+    bare = checksum(tmp_path / "a.raw")
+    for name in ("a.mhd", "a.nrrd"):
+        assert different(tmp_path / name, voxels, b"1", b"2")
+    assert different(tmp_path / "a.raw", tmp_path / "a.raw.json", b"{}", b'{"spacing": [1, 1, 2]}')
+    assert checksum(tmp_path / "a.raw") != bare
+    zarr = tmp_path / "zarr"
+    (zarr / "1").mkdir(parents=True)
+    (zarr / "zarr.json").write_text("{}")
+    assert different(zarr, zarr / "1" / "c", b"2", b"3")
+
+
+def test_the_checksum_of_one_slice_is_that_of_its_series(tmp_path):
+    pytest.importorskip("SimpleITK", reason="SimpleITK is not installed: pip install jaxvol[io]")
+    from ...io.formats.test_dicom import write_series
+
+    paths = write_series(tmp_path / "a")
+    one = checksum(paths[0])
+    assert checksum(paths[1]) == one
+    content = paths[1].read_bytes()
+    paths[1].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert checksum(paths[0]) != one
+
+
+def png(path, text, keyword=KEYWORD):
+    chunks = PngInfo()
+    chunks.add_text(keyword, text, zip=True)
+    Image.new("RGB", (8, 8)).save(path, pnginfo=chunks)
+
+
+def unpacks_to_much(path):
+    """A text of 64 MB of zeros in 64 kB."""
+    Image.new("RGB", (8, 8)).save(path)
+    whole = path.read_bytes()
+    body = b"zTXt" + KEYWORD.encode() + b"\0\0" + zlib.compress(bytes(2**26))
+    chunk = (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+    path.write_bytes(whole[:33] + chunk + whole[33:])
+
+
+def said(settings=None, **changed):
+    return json.dumps({"jaxvol": "1", "command": "render", "settings": settings or {}} | changed)
+
+
+def volume(name):
+    return said(file={"name": name, "sha256": "0" * 64})
+
+
+BAD = {
+    "no object": ("[]", "jaxvol, command, settings are needed"),
+    "checksum": (said(file={"name": "a", "sha256": "b"}), "file must have a name"),
+    "foreign": (lambda p: Image.new("RGB", (8, 8)).save(p), "holds no settings of jaxvol"),
+    "a JPEG": (lambda p: Image.new("RGB", (8, 8)).save(p, "JPEG"), "cannot be read as a PNG"),
+    "unpacks to much": (unpacks_to_much, "a.png"),
+    "of another program": (lambda p: png(p, "x", "Software"), "holds no settings of jaxvol"),
+    "no JSON": ("import os; os.remove('x')", "damaged: they are not JSON"),
+    "long number": ("9" * 5000, "damaged"),
+    "long": ('"' + "x" * MOST + '"', "PNG"),
+    "command": (
+        said({"size": [9, 9]}, command="demo"),
+        "was not made by jaxvol render, but, as it says, by jaxvol 'demo --size 9 9'",
+    ),
+    "option": (said({"evil": 1}), "the settings in it: jaxvol render has no option"),
+    "a file": (said({"transfer": "/dev/zero"}), "has no option 'transfer'"),
+    "rivals": (said({"preset": "head", "cmap": "hot"}), "one of preset and cmap excludes the other"),
+    "programs": (said({"programs": "/"}), "has no option 'programs'"),
+    "kind": (said({"step": "1"}), "step must be a number; got '1'"),
+    "file": (said(file="/etc/passwd"), "file must have a name and a SHA-256"),
+    "no file": (said(), "does not say which volume it shows"),
+    "a device": (volume("/dev/zero"), "/dev/zero is no volume"),
+    "a folder": (volume("folder"), "folder is no volume"),
+    "transfer": (said(transfer={"values": []}), "the transfer function in it must be an object"),
+    "transfer's numbers": (
+        said(transfer={"values": ["a"], "colors": 1, "extinction": None}),
+        "the transfer function in it: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_settings_that_others_may_have_made_are_checked(case, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    made, message = BAD[case]
+    png(tmp_path / "a.png", made) if isinstance(made, str) else made(tmp_path / "a.png")
+    assert like("b.png") == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("jaxvol render: error: --like: ")
+    assert printed.count("\n") == 1
+    assert len(printed) < 700
+    assert message in printed
+    assert not (tmp_path / "b.png").exists()
+
+
+def test_a_damaged_picture_raises_nothing_but_value_errors(picture, tmp_path):
+    whole = picture.read_bytes()
+    for number in range(8, len(whole), 97):
+        for content in (whole[:number], whole[:number] + bytes([whole[number] ^ 255]) + whole[number + 1 :]):
+            (tmp_path / "d.png").write_bytes(content)
+            with contextlib.suppress(ValueError):
+                parsed(_parser, ["render", "--like", "d.png"])  # pixels may be damaged: they are not read

@@ -1,0 +1,339 @@
+"""Do the options of `jaxvol render` mean what they say? Which scene is rendered, and what is written?"""
+
+import re
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from skimage.io import imread
+
+import jaxvol as jv
+from jaxvol.app.automatic import front_of, upright
+from jaxvol.app.cli import main
+from jaxvol.compositing.modes import compositing_of
+from jaxvol.lighting import Phong
+from jaxvol.planning import Part, Plan
+from jaxvol.scene.rendering import BrickReport
+
+
+ENGINE = np.asarray(jv.phantom("engine", 24).data)
+RANGE = float(ENGINE.min()), float(ENGINE.max())
+FAST = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()
+
+
+def render(file, *words, step: str | None = "0.4"):
+    """The command with a given step, which need not be planned."""
+    given = [] if step is None else ["--step", step]
+    return main(["render", str(file), "--size", "16", "16", *given, *map(str, words)])
+
+
+def same(found, expected):
+    return jax.tree.all(
+        jax.tree.map(lambda a, b: bool(np.allclose(a, b, rtol=1e-5, atol=1e-6)), found, expected)
+    )
+
+
+def test_render_writes_what_the_library_renders(volume_file, tmp_path, capsys):
+    """The picture, its opacity, and distances, of one image."""
+    files = {name: tmp_path / name for name in ("a/x.png", "b/depth.tif", "x.npy")}
+    view = ["--camera", 40, -30, 20, *[11.5] * 3, "--view-up", 0, 0, 1, "--zoom", 1.5]
+    look = ["--preset", "engine", "--no-shade", *view]
+    png, depth, npy = files.values()
+    assert render(volume_file, *look, "--transparent", "-o", png, "--depth", depth) == 0
+    printed = capsys.readouterr().out
+    assert str(depth) in printed
+    told = re.search(r"in (\S+) s \(reading (\S+) s, compiling and rendering (\S+) s\)", printed)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(float(told[2]) + float(told[3]), abs=0.02)
+    assert "cpu" in printed.lower() or "gpu" in printed.lower()
+
+    camera = jv.Camera((40, -30, 20), (11.5,) * 3, (0, 0, 1), size=(16, 16)).zoom(1.5)
+    rendering = jv.render(jv.load(volume_file), jv.preset("engine"), camera, jv.March(0.4, FAST, "midpoint"))
+    opacity = np.asarray(rendering.rgba[..., 3])
+    assert opacity.std() > 0.1
+    np.testing.assert_array_equal(imread(png)[..., 3], (opacity * 255).round())
+    np.testing.assert_array_equal(imread(depth), rendering.depth)
+    assert np.isinf(imread(depth)).any()
+    assert render(volume_file, *look, "--background", 0, 0, 0, "-o", npy) == 0
+    assert np.load(npy).dtype == np.float32
+    np.testing.assert_array_equal(np.load(npy), rendering.image((0, 0, 0)))
+    assert render(volume_file, *look, "-o", png) == 0
+    linear = rendering.image((1, 1, 1))
+    assert np.abs(imread(png) - np.asarray(jv.to_srgb(linear)) * 255).max() <= 1
+
+
+GRAY = ["--cmap", "gray", "--clim", "-100", "255"]
+SURFACE = ["--compositing", "isosurface", "--isovalue", "30"]
+SCENES = {
+    "a preset that shows surfaces": (["--preset", "engine"], jv.preset("engine"), "over", Phong(), 1),
+    "a preset, unlit": (["--preset", "engine", "--no-shade"], jv.preset("engine"), "over", None, 1),
+    "a range": (
+        ["--preset", "ct_bone", "--clim", "20", "90", "--unit-distance", "3"],
+        jv.preset("ct_bone", (20, 90), 3.0),
+        *("over", Phong(), 1),
+    ),
+    # values of a ray are light on dark
+    "a projection": (
+        [*GRAY, "--compositing", "maximum", "--unit-distance", "20"],
+        jv.colormap("gray", (-100, 255), unit_distance=20),
+        *("maximum", None, 0),
+    ),
+    "of all values": (["--compositing", "average"], jv.colormap("gray", RANGE), "average", None, 0),
+    "an isosurface": (SURFACE, jv.colormap("white", RANGE), jv.Isosurface(30.0), Phong(), 1),
+    "a red one": ([*SURFACE, "--cmap", "red"], jv.colormap("red", RANGE), jv.Isosurface(30.0), Phong(), 1),
+    "a file": (["--transfer", "t.json"], jv.preset("head"), "over", None, 1),
+}
+"""Options, and the transfer function, the mode, the light and the background that they mean."""
+
+
+@pytest.mark.parametrize("case", SCENES)
+def test_options_of_the_look_make_the_scene(case, volume_file, tmp_path, monkeypatch, drawn):
+    monkeypatch.chdir(tmp_path)
+    jv.write_transfer("t.json", jv.preset("head"))
+    words, transfer, mode, lighting, behind = SCENES[case]
+    assert render(volume_file, *words, "-o", "x.npy") == 0
+    ((volume, found, camera, march),), (how,) = drawn.scenes, drawn.how
+    assert eqx.tree_equal(volume, jv.load(volume_file))
+    assert same(found, transfer)
+    assert same(how["compositing"], compositing_of(mode))
+    assert type(how["lighting"]) is type(lighting)
+    assert same(how["lighting"], lighting)
+    assert same(camera, jv.Camera.looking_at(volume, size=(16, 16)))
+    assert same(march, jv.March(0.4, FAST, "midpoint"))
+    rgba = drawn(volume, found, camera, march).rgba
+    np.testing.assert_allclose(np.load("x.npy"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind, atol=1e-6)
+
+
+def test_a_scene_of_which_nothing_is_told_is_shown_by_its_values(volume_file, tmp_path, drawn):
+    volume = jv.load(volume_file)
+    assert render(volume_file, "-o", tmp_path / "x.png") == 0
+    assert same(drawn.scenes[0][1], jv.automatic_transfer(volume))
+    assert isinstance(drawn.how[0]["lighting"], Phong)
+    labels = np.zeros((24, 24, 24), np.uint8)
+    labels[4:12, 4:-4, 4:-4], labels[12:-4, 4:-4, 4:-4] = 2, 5
+    np.save(tmp_path / "labels.npy", labels)
+    assert render(tmp_path / "labels.npy", "-o", tmp_path / "x.png") == 0
+    assert isinstance(drawn.scenes[1][1], jv.LabelTransferFunction)
+
+
+def test_options_of_the_view_make_the_camera(volume_file, tmp_path, drawn):
+    output = tmp_path / "x.npy"
+    assert render(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
+    camera = drawn.scenes[-1][2]
+    assert camera.parallel_scale is not None
+    away = np.asarray(camera.focal_point - camera.position)
+    np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
+    # what one face cuts stands on it, also in colours of one's own
+    data = np.zeros((12, 12, 12), np.uint8)
+    data[5:, 4:9, 3:8] = 200
+    np.save(tmp_path / "block.npy", data)
+    up = upright(jv.load(tmp_path / "block.npy"))
+    assert up is not None
+    np.testing.assert_array_equal(up, (-1, 0, 0))
+    for view in ([], ["--view-up", *up, "--direction", *front_of(up)], ["--view-up", 0, 0, 1]):
+        assert render(tmp_path / "block.npy", "--cmap", "gray", "-o", output, *view) == 0
+    found, told, other = (scene[2] for scene in drawn.scenes[1:])
+    assert same(found, told)
+    assert not same(found, other)
+
+
+CLIP = [5, 30, -1, 20, -1, 30]
+PLANES = [((12, 0, 0), (1, 0.5, 0)), ((0, 0, 4), (0, 0, 1))]
+CUT = ["--clip-box", *CLIP, "--clip-inside-out"]
+for origin, normal in PLANES:
+    CUT += ["--clip-plane", *origin, *normal]
+
+
+def test_a_clip_is_that_of_the_library(volume_file, tmp_path, drawn):
+    clip = jv.Clip(CLIP, PLANES, inside_out=True)
+    assert render(volume_file, "--preset", "engine", *CUT, "-o", tmp_path / "x.npy") == 0
+    transforms = drawn.scenes[0][3].transforms
+    assert same(transforms, (clip, *FAST))
+
+
+@pytest.fixture
+def plans(monkeypatch):
+    """What was planned: plans of a step of 0.7, with an error of 0.02 less what is asked for."""
+    made = []
+
+    def plan(volume, transfer, camera, tolerance, **how):
+        march, parts = jv.March(0.7, how["transforms"]), (Part("leaps", False, "nothing is empty"),)
+        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 0.1, 9.0, parts, 1.0)
+        made.append((volume, transfer, camera, tolerance, how))
+        return found
+
+    monkeypatch.setattr("jaxvol.app.commands.frames.plan", plan)
+    return made
+
+
+def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, plans):
+    words = ["--preset", "engine", *CUT]
+    assert render(volume_file, *words, "-o", tmp_path / "x.png", step=None) == 0
+    assert float(drawn.scenes[0][3].step) == np.float32(0.7)
+    printed = capsys.readouterr().out
+    assert "(reading and planning " in printed
+    assert "not proven to be within an RMSE of 0.0039; jaxvol plan tells more" in printed
+    assert render(volume_file, *words, "--tolerance", "0.01", "-o", tmp_path / "x.png", step=None) == 0
+    assert "not proven" not in capsys.readouterr().out
+    assert main(["plan", str(volume_file), *map(str, words), "--tolerance", "0.01"]) == 0
+    assert "step 0.7, left, Clip" in capsys.readouterr().out
+    assert [tolerance for *_, tolerance, _ in plans] == [1 / 255, 0.01, 0.01]
+    for *_, how in plans:
+        assert same(how["transforms"], (jv.Clip(CLIP, PLANES, inside_out=True),))
+        assert isinstance(how["lighting"], Phong)
+        assert how["once"]
+    for bad in (["--tolerance", "0.1", "--step", "1"], ["--step", "1"]):
+        assert main(["plan", str(volume_file), *bad]) == 2
+        assert "--step" in capsys.readouterr().err
+    # of an orbit, for four views, by the shortest step
+    assert (
+        main(
+            ["animate", str(volume_file), "--frames", "2", "--size", "8", "8", "-o", str(tmp_path / "a.gif")]
+        )
+        == 0
+    )
+    assert len(plans) == 3 + 4
+    assert not plans[-1][-1]["once"]
+
+
+@pytest.mark.slow
+def test_render_needs_nothing_but_a_file_and_plan_says_how(volume_file, tmp_path, capsys):
+    output = tmp_path / "out.png"
+    assert main(["render", str(volume_file), "-o", str(output), "--size", "16", "16"]) == 0
+    assert imread(output).std() > 5
+    assert "(reading and planning " in capsys.readouterr().out
+    assert main(["plan", str(volume_file), "--size", "16", "16", "--tolerance", str(1 / 255)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"step [\d.e-]+, (midpoint|preintegrated)", printed)
+    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping", "voxels as uint8"):
+        assert word in printed
+    for bad in ("0", "nan", "2"):
+        assert main(["plan", str(volume_file), "--tolerance", bad]) == 2
+        assert "tolerance must be" in capsys.readouterr().err
+
+
+def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
+    np.save(tmp_path / "v.npy", np.linspace(20, 90, 1000).reshape(10, 10, 10).astype(np.float32))
+    bone = ["--preset", "ct_bone", "-o", str(tmp_path / "x.png")]
+    assert render(tmp_path / "v.npy", *bone) == 0
+    assert "nothing" not in capsys.readouterr().out
+    drawn.level = 0.0
+    assert render(tmp_path / "v.npy", *bone) == 0
+    why = r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values from 130 on\. A clim from"
+    assert re.search(why, capsys.readouterr().out)
+    away = ["--camera", *["90"] * 3, *["200"] * 3]
+    for words, why in (
+        (["--clip-plane", *["20"] * 3, *"100"], "what the clip leaves of the volume"),
+        (away, "nothing is seen: no ray of the camera meets the volume"),
+        (["--compositing", "isosurface", "--isovalue", "999"], "and none crosses .* 999"),
+    ):
+        assert render(tmp_path / "v.npy", *bone, *words) == 0
+        assert re.search(why, capsys.readouterr().out), why
+    drawn.level = 1e-4
+    assert render(tmp_path / "v.npy", *bone) == 0
+    assert re.search(
+        r"nothing is seen: the opacity is at most .*\. Use a shorter unit", capsys.readouterr().out
+    )
+
+
+def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monkeypatch, capsys, drawn):
+    asked = {}
+
+    def render_bricks(source, transfer, camera, march, **how):
+        asked.update(how, source=source, transfer=transfer)
+        how["progress"](1, 2)
+        report = BrickReport((2, 2, 1), 4, 3, 0, 99, (9, 9, 9), 99)
+        return eqx.tree_at(
+            lambda r: r.details.bricks,
+            drawn(source, transfer, camera, march),
+            report,
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    monkeypatch.setattr("jaxvol.app.commands.frames.render_bricks", render_bricks)
+    words = ["--preset", "engine", "-o", tmp_path / "x.npy", "--memory"]
+    assert render(volume_file, *words, "200K") == 0
+    assert asked["memory"] == 200 * 2**10
+    assert isinstance(asked["lighting"], Phong)
+    assert asked["source"].shape == (24, 24, 24)
+    assert "3 of 2 x 2 x 1 bricks read, 99 bytes" in capsys.readouterr().out
+    jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
+    assert render(tmp_path / "v.npz", "--memory", "1M") == 2
+    assert "is not of a kind that is read in parts" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_plan_with_memory_is_by_bricks_where_the_volume_does_not_fit(tmp_path, capsys):
+    np.save(tmp_path / "engine.npy", np.asarray(jv.phantom("engine", 64).data))
+    words = [str(tmp_path / "engine.npy"), "--size", "16", "16", "--preset", "engine", "--memory"]
+    assert main(["plan", *words, "1M"]) == 0
+    assert "bricks:" in capsys.readouterr().out
+    assert main(["plan", *words, "1G"]) == 0
+    assert "in memory:" in capsys.readouterr().out
+    assert main(["render", *words, "1M", "-o", str(tmp_path / "x.png")]) == 0
+    assert "bricks read" in capsys.readouterr().out
+    assert main(["render", "--like", str(tmp_path / "x.png"), "-o", str(tmp_path / "y.png")]) == 0
+    np.testing.assert_array_equal(imread(tmp_path / "x.png"), imread(tmp_path / "y.png"))
+    assert main(["render", *words, "10", "-o", str(tmp_path / "z.png")]) == 2
+    assert "memory must" in capsys.readouterr().err
+
+
+BAD = {
+    "EXR": (["FILE", "-o", "x.exr"], "--output: a file of colours must end in one of .png, .jpg"),
+    "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of one channel must end in one of .tif"),
+    "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
+    "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
+    "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--parallel goes with --direction"),
+    "no file": (["nowhere.raw"], "error: there is no file"),
+    "cmap": (["nowhere.raw", "--cmap", "moon"], "cmap must be"),
+    "background": (
+        ["nowhere.raw", "--background", "200", "0", "nan"],
+        "--background must be three numbers from 0 to 1 (linear RGB); got 200 0 nan.",
+    ),
+    "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
+    "size": (["FILE", "--size", "0", "5"], "size must be"),
+    "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
+    "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
+    "nothing to turn": (["FILE", "--clip-inside-out"], "--clip-inside-out goes with --clip-box or"),
+    "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
+    "shaded average": (
+        ["FILE", "--shade", "--compositing", "average"],
+        "--shade needs a place that is shaded",
+    ),
+    "no isovalue": (["FILE", "--compositing", "isosurface"], "--compositing isosurface needs the value"),
+    "isovalue": (["FILE", "--isovalue", "9"], "--isovalue goes with --compositing isosurface; got --comp"),
+    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "--tolerance finds a step; leave out --step"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
+    arguments, message = BAD[case]
+    arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
+    monkeypatch.setattr("jaxvol.app.commands.frames.render", None)  # fails if it is called
+    assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1
+    assert printed.err.startswith("jaxvol render: error: ")
+    assert message in printed.err
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = volume_file.read_bytes()
+    (tmp_path / "link.npy").symlink_to(volume_file)
+    (tmp_path / "stack").mkdir()
+    (tmp_path / "stack" / "1.tif").write_bytes(b"a slice")
+    there, name = sorted(tmp_path.iterdir()), volume_file.name
+    for words, message in (
+        ([name, "-o", "link.npy"], "--output: link.npy is the volume"),
+        ([name, "-o", "a.png", "--depth", name], f"--depth: {name} is the volume"),
+        ([name, "-o", "a.npy", "--depth", "./a.npy"], "--depth: a.npy is what --output writes"),
+        (["stack", "-o", "stack/1.tif"], "--output: stack/1.tif is a slice of the volume"),
+    ):
+        assert main(["render", *words]) == 2
+        assert message in capsys.readouterr().err
+    assert volume_file.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == there

@@ -1,0 +1,266 @@
+"""Does a transfer function that is guessed from a histogram show what is there?"""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.app.automatic import (
+    FRONT,
+    framed,
+    front_of,
+    labels_shown,
+    transfer_by_copy,
+    upright,
+    visible_points,
+)
+from jaxvol.app.automatic.body import is_body
+from jaxvol.app.automatic.framing import MARGIN
+from jaxvol.app.automatic.labels import INSIDE
+from jaxvol.app.automatic.sampling import SAMPLED
+from jaxvol.app.automatic.thresholds import thresholds
+from jaxvol.app.commands.data import copy_of, middle_of
+from jaxvol.app.commands.orbit import turned
+from jaxvol.bricks import source_of
+from jaxvol.lighting import Phong
+
+
+MARCH = (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination())
+
+
+def ball(radius, inner, n=32, *, noise=2.0, spacing=1.0, at=0.0):
+    """A ball of value 100 around a dense one of value 200, in noise around 10."""
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij")
+    r = np.sqrt((x - at) ** 2 + y**2 + z**2)
+    data = (
+        10 + 90 * np.clip((radius - r) * n / 4 + 0.5, 0, 1) + 100 * np.clip((inner - r) * n / 4 + 0.5, 0, 1)
+    )
+    rng = np.random.default_rng(0)
+    return jv.Volume(
+        (data + noise * rng.standard_normal(data.shape)).clip(0, 255).astype(np.uint8), [spacing] * 3
+    )
+
+
+def opacity_at(transfer, value, length):
+    return float(-np.expm1(-length * np.interp(value, transfer.values, transfer.extinction)))
+
+
+def test_thresholds_part_three_classes():
+    values = np.concatenate([np.full(900, 10.0), np.full(80, 100.0), np.full(20, 200.0)]).astype(np.float32)
+    values += np.random.default_rng(0).normal(0, 3, values.shape).astype(np.float32)
+    first, second = thresholds(values)
+    assert first == pytest.approx(55, abs=2)  # in the middle, wherever between them
+    assert second == pytest.approx(150, abs=2)
+
+
+def test_what_is_around_is_transparent_and_what_is_dense_opaque():
+    volume = ball(0.8, 0.35)
+    transfer = jv.automatic_transfer(volume)
+    across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
+    assert opacity_at(transfer, 10, across) == 0
+    assert 0.2 < opacity_at(transfer, 100, 0.2 * across) < 0.95  # what is inside shines through
+    assert opacity_at(transfer, 200, 0.1 * across) > 0.9
+
+
+@pytest.mark.slow
+def test_a_picture_shows_what_is_dense_through_what_is_around_it():
+    volume = ball(0.8, 0.35)
+    transfer, camera = jv.automatic_transfer(volume), jv.Camera.looking_at(volume, size=(32, 32))
+    rgba = np.asarray(
+        jv.render(volume, transfer, camera, jv.March(0.4, MARCH, "midpoint"), lighting=Phong()).rgba
+    )
+    assert rgba[0, 0, 3] == 0
+    assert rgba[16, 16, 3] > 0.95
+    assert 0.1 < (rgba[..., 3] > 0.1).mean() < 0.5
+    # the dense ball is brighter than what is around it
+    assert rgba[16, 16, :3].mean() > 1.3 * np.median(rgba[..., :3].mean(-1)[rgba[..., 3] > 0.1])
+
+
+def test_units_of_length_and_of_values_do_not_matter():
+    volume, scaled = ball(0.8, 0.35), ball(0.8, 0.35, spacing=20.0)
+    scaled = jv.Volume(np.asarray(scaled.data, np.float32) * 1000 - 7, scaled.spacing)
+    one, other = jv.automatic_transfer(volume), jv.automatic_transfer(scaled)
+    np.testing.assert_allclose(np.asarray(one.values) * 1000 - 7, other.values, rtol=0.02)
+    np.testing.assert_allclose(one.extinction, 20 * np.asarray(other.extinction), rtol=1e-4)
+
+
+def test_an_object_that_the_faces_cut_is_no_block_and_few_values_are_shown_too():
+    volume = ball(3.0, 0.35)
+    transfer = jv.automatic_transfer(volume)
+    across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
+    assert opacity_at(transfer, 100, across) < 0.5
+    assert opacity_at(transfer, 200, 0.1 * across) > 0.9
+    for kinds in (1, 2, 3):
+        data = (np.arange(27) % kinds).astype(np.uint8).reshape(3, 3, 3)
+        extinction = np.asarray(jv.automatic_transfer(jv.Volume(data)).extinction)
+        assert np.isfinite(extinction).all()
+        assert extinction.max() > 0
+
+
+def test_of_a_large_volume_a_copy_tells_the_same_if_grain_is_looked_at_as_it_is():
+    data = np.asarray(jv.phantom("head", 160).data, np.float32)[:, :140, :130]
+    waves = 20 * np.sin(np.pi / 3 * np.add.outer(np.arange(160), np.arange(140)))[..., None]
+    volume = jv.Volume(np.where(data > 60, data + waves, data), (1, 1, 2))
+    assert math.prod(volume.shape) > SAMPLED
+    source = source_of(volume)
+    copy = copy_of(source, 2**28)
+    assert max(copy.shape) <= 80
+    whole, found = jv.automatic_transfer(volume), transfer_by_copy(copy, middle_of(source))
+    for name in ("values", "colors", "extinction"):
+        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-5)
+    # waves of six voxels are grain to those who see every second voxel alone
+    assert jv.automatic_transfer(copy).values.shape != whole.values.shape
+
+
+def test_what_is_no_volume_or_a_traced_one_is_refused():
+    with pytest.raises(ValueError, match="volume must be a jaxvol Volume"):
+        jv.automatic_transfer(np.zeros((3, 3, 3)))
+    volume = jv.phantom("head", 16)
+    with pytest.raises(ValueError, match="volume is traced here, and its histogram is needed"):
+        jax.jit(jv.automatic_transfer)(volume)
+    found, inside = jv.automatic_transfer(volume), jax.jit(lambda _: jv.automatic_transfer(volume))(0.0)
+    np.testing.assert_array_equal(found.extinction, inside.extinction)
+    np.testing.assert_array_equal(found.colors, inside.colors)
+
+
+def extent(points):
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2, high - low
+
+
+def test_the_points_are_around_what_is_visible():
+    volume = ball(0.3, 0.15, at=0.5)
+    points = visible_points(volume, jv.automatic_transfer(volume))
+    middle, size = extent(points)
+    np.testing.assert_allclose(middle / 31 * 2 - 1, (0.5, 0, 0), atol=0.06)
+    assert (size / 31 * 2 > 0.55).all()
+    assert (size / 31 * 2 < 0.85).all()
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    turned = jv.Volume(volume.data, volume.spacing, (5, 6, 7), direction=turn)
+    there, _ = extent(visible_points(turned, jv.automatic_transfer(volume)))
+    np.testing.assert_allclose(there, turn @ middle + (5, 6, 7), atol=1e-4)
+
+
+def test_specks_far_away_do_not_count_and_parts_that_are_near_do():
+    data = np.array(ball(0.3, 0.15, at=0.5).data)
+    volume = jv.Volume(data)
+    transfer = jv.automatic_transfer(volume)
+    middle, size = extent(visible_points(volume, transfer))
+    data[1, 1, 1] = data[1, 30, 30] = 200
+    specks = extent(visible_points(jv.Volume(data), transfer))
+    np.testing.assert_array_equal(specks, (middle, size))
+    data[12:19:2, 16, 16] = 200  # with one voxel between them, like leaves
+    _, longer = extent(visible_points(jv.Volume(data), transfer))
+    assert longer[0] >= size[0] + 5
+    flat = np.full((9, 9, 9), 10, np.uint8)
+    flat[4] = 200  # in a plane, of which there is no hull of three dimensions
+    shown = jv.TransferFunction([10, 200], np.ones((2, 3)), [0, 99])
+    np.testing.assert_array_equal(extent(visible_points(jv.Volume(flat), shown))[1], (2, 8, 8))
+    hidden = jv.TransferFunction([0, 1], np.zeros((2, 3)), np.zeros(2))
+    np.testing.assert_array_equal(extent(visible_points(volume, hidden))[1], (31, 31, 31))
+
+
+def in_picture(camera, points):
+    """Image coordinates of points, in units of half the picture's height and width."""
+    away = np.asarray(camera.position - camera.focal_point)
+    back = away / np.linalg.norm(away)
+    right = np.cross(camera.view_up, back)
+    right /= np.linalg.norm(right)
+    offset = points - np.asarray(camera.position)
+    plane = np.stack([offset @ right, offset @ np.cross(back, right)], axis=1)
+    if camera.parallel_scale is None:
+        plane /= -(offset @ back)[:, None] * np.tan(np.deg2rad(float(camera.view_angle)) / 2)
+    else:
+        plane /= float(camera.parallel_scale)
+    return plane / (camera.size[0] / camera.size[1], 1)
+
+
+def test_a_framed_camera_just_sees_all_points():
+    points = np.random.default_rng(1).normal(size=(40, 3)) * (3, 1, 0.5) + (10, -20, 5)
+    volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
+    for parallel in (False, True):
+        for size in ((32, 32), (48, 32), (16, 32)):
+            camera = jv.Camera.looking_at(volume, (1, -1, 0.3), view_angle=40, parallel=parallel, size=size)
+            seen = in_picture(framed(camera, points), points)
+            low, high = seen.min(axis=0), seen.max(axis=0)
+            # both sides of the tighter axis are at the margin, and the other is as far inside on both sides
+            assert max(high) == pytest.approx(1 / MARGIN, abs=1e-4)
+            np.testing.assert_allclose(low[np.argmax(high)], -1 / MARGIN, atol=1e-4)
+            assert np.abs(seen).max() < 1 / MARGIN + 1e-4
+            np.testing.assert_allclose(low + high, 0, atol=1e-4)
+    # one that turns sees them all the time
+    points -= (10, -20, 5)
+    camera = jv.Camera.looking_at(volume, (1, -1, 0.3), size=(32, 32))
+    angles = range(0, 360, 15)
+    found = framed(camera, points, [turned(camera, angle, (0, 0, 1)) for angle in angles])
+    reach = [np.abs(in_picture(turned(found, angle, (0, 0, 1)), points)).max() for angle in angles]
+    assert max(reach) == pytest.approx(1 / MARGIN, abs=1e-4)
+
+
+def standing(axis, end):
+    """A ball that one face of the grid cuts, at an end (0 or -1) of an axis."""
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 24)] * 3, indexing="ij"))
+    x[axis] -= 0.7 if end else -0.7
+    return jv.Volume((200 * ((x**2).sum(axis=0) < 0.5)).astype(np.uint8))
+
+
+def test_what_one_face_cuts_stands_on_it():
+    for axis in range(3):
+        for end in (0, -1):
+            up = upright(standing(axis, end))
+            assert up is not None
+            np.testing.assert_array_equal(up, np.eye(3)[axis] * (-1 if end else 1))
+            side = front_of(up)
+            assert side @ up == FRONT[2]  # from as far above
+            np.testing.assert_allclose(np.linalg.norm(side), np.linalg.norm(FRONT))
+            if axis == 2 and end == 0:
+                np.testing.assert_array_equal(side, FRONT)
+    # nothing is up where no face or two cut
+    assert upright(ball(0.6, 0.3)) is None
+    both = np.maximum(np.asarray(standing(1, 0).data), np.asarray(standing(1, -1).data))
+    assert upright(jv.Volume(both)) is None
+
+
+def test_borders_and_grain_between_thresholds_are_no_body():
+    solid = np.asarray(ball(0.8, 0.35).data)
+    assert is_body(solid, 55, 150)
+    border = np.where(solid > 55, 200, solid).astype(np.uint8)
+    border[1:] = np.maximum(border[1:], border[:-1] // 2)  # of 100, on one side
+    assert not is_body(border, 55, 150)
+    grain = solid + 45 * np.random.default_rng(0).uniform(-1, 1, solid.shape) * (solid > 55) * (solid < 150)
+    assert not is_body(grain.astype(np.float32), 55, 150)
+    assert is_body(solid[:2], 55, 150)  # too thin to tell
+
+
+def labels(n=24):
+    data = np.zeros((n, n, n), np.uint8)
+    data[4:12, 4:-4, 4:-4], data[12:-4, 4:-4, 4:-4], data[10:14, 10:14, :4] = 2, 5, 7
+    return data
+
+
+def test_labels_are_shown_in_colours_of_their_own():
+    shown = labels_shown(jv.Volume(labels(), (1, 2, 3), (4, 5, 6)))
+    assert shown is not None
+    volume, transfer = shown
+    np.testing.assert_array_equal(volume.spacing, (1, 2, 3))
+    np.testing.assert_array_equal(volume.origin, (4, 5, 6))
+    # voxels are smooth, and opaque inside; labels, counted from 1 on, reach two voxels beyond
+    data, kinds = np.asarray(volume.data), np.asarray(volume.labels)
+    assert data[8, 12, 12] == data[16, 12, 12] == INSIDE
+    assert 0 < data[3, 12, 12] < data[4, 12, 12] < INSIDE
+    assert kinds[[1, 2, 8, 16, 12], 12, [12, 12, 12, 12, 1]].tolist() == [0, 1, 1, 2, 3]
+    colors = np.asarray(transfer.stacked.colors)[1:4, 0]
+    assert np.abs(colors[:, None] - colors[None])[np.triu_indices(3, 1)].max(axis=-1).min() > 0.3
+    across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
+    assert opacity_at(jax.tree.map(lambda leaf: leaf[1], transfer.stacked), INSIDE, 0.02 * across) > 0.9
+
+
+def test_other_volumes_are_not_taken_for_labels():
+    for name in ("head", "engine", "colon", "vessels"):
+        assert labels_shown(jv.phantom(name, 24)) is None
+    floats, two = labels().astype(np.float32), (labels() > 0).astype(np.uint8)
+    many = np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4)
+    for data in (floats, two, many):
+        assert labels_shown(jv.Volume(data)) is None

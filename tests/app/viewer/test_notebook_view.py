@@ -1,0 +1,184 @@
+"""Does the notebook's face hand on what the pointer and the controls do? Without a browser."""
+
+import asyncio
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.app.viewer.model import Frame
+
+from .test_model import BALL, LABELS, LOOK, MARCH
+
+
+pytest.importorskip("rendercanvas.anywidget", reason="needs rendercanvas: pip install jaxvol[notebooks]")
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch):
+    """Nothing is drawn: what is drawn is for `test_model.py`."""
+    monkeypatch.setattr("jaxvol.app.viewer.worker.Worker.ask", lambda self, request: None)
+
+
+@contextmanager
+def viewed(*scene, **more) -> Iterator[Any]:
+    view = jv.view(*scene, **{"march": MARCH, "lit": False, "size": (300, 210), **more})
+    try:
+        yield view
+    finally:
+        view.close()
+
+
+@pytest.fixture
+def shown():
+    with viewed(BALL, LOOK) as view:
+        yield view
+
+
+def pointer(kind, x, y, *, buttons=(), modifiers=(), **more):
+    return {"event_type": kind, "x": x, "y": y, "buttons": buttons, "modifiers": modifiers, **more}
+
+
+def test_a_drag_orbits_and_with_shift_or_the_right_button_it_moves(shown):
+    first = shown.model.state.orbit
+    shown._pointed(pointer("pointer_move", 5, 5))
+    assert shown.model.state.orbit is first  # no button is down
+    shown._pointed(pointer("pointer_down", 10, 10, buttons=(1,)))
+    # browsers' moves are sent late, so that one from before may come now
+    shown._pointed(pointer("pointer_move", 9, 9))
+    shown._pointed(pointer("pointer_move", 31, 10, buttons=(1,)))
+    turned = first.turned(21 / 210, 0)
+    np.testing.assert_allclose(shown.model.state.orbit.toward, turned.toward)
+    shown._pointed(pointer("pointer_move", 31, 52, buttons=(1,), modifiers=("Shift",)))
+    moved = turned.panned(0, 42 / 210)
+    np.testing.assert_allclose(shown.model.state.orbit.focal_point, moved.focal_point)
+    shown._pointed(pointer("pointer_up", 31, 52))
+    shown._pointed(pointer("pointer_move", 90, 90, buttons=(1,)))
+    np.testing.assert_allclose(shown.model.state.orbit.toward, moved.toward)
+    shown._pointed(pointer("wheel", 0, 0, dy=-100))
+    assert shown.model.state.orbit.distance == pytest.approx(first.distance / 1.2)
+    shown._reset()
+    assert shown.model.state.orbit is first
+
+
+def test_what_is_drawn_and_told_is_shown(shown, monkeypatch):
+    images = []
+    monkeypatch.setattr(shown.canvas, "show", lambda *image: images.append(image))
+    frame = Frame(np.zeros((210, 300, 3), np.uint8), "coarse", shown.model.state, 0.1, 0.1, 0.4)
+    shown.model._show(frame)
+    shown.model._tell("one\ntwo")
+    assert images == [(frame.pixels, 85)]
+    assert shown._status.value == "one<br>two"
+    shown.model.close()
+    shown.model._show(frame)
+    shown.model._tell("nothing more")
+    assert (len(images), shown._status.value) == (1, "one<br>two")
+
+
+def test_what_is_shown_can_be_rendered(shown):
+    assert shown.camera.size == (300, 210)
+    np.testing.assert_allclose(shown.transfer.extinction, LOOK.extinction, rtol=1e-6)
+    assert float(shown.march.step) == pytest.approx(float(MARCH.step))
+    assert [type(t) for t in shown.march.transforms] == [type(t) for t in MARCH.transforms]
+    assert shown.lighting is None
+    shown.model.change(lit=True)
+    assert isinstance(shown.lighting, jv.lighting.Phong)
+
+
+def test_the_controls_of_points_window_and_level_agree(shown):
+    shown._look.level.value = 150.0
+    assert shown.model.state.look.level == pytest.approx(150)
+    value, color, opacity, more, _ = shown._look.points.children[1].children
+    assert value.value == pytest.approx(shown.model.state.look.values[1])
+    opacity.value, color.value = 0.5, "#ff0000"
+    assert shown.model.state.look.opacity(1) == pytest.approx(0.5)
+    assert shown.model.state.look.colors[1] == pytest.approx((1, 0, 0))
+    last = shown._look.points.children[2].children[0]
+    last.value = last.value + 40
+    assert shown._look.window.value == pytest.approx(180)
+    more.click()
+    assert len(shown.model.state.look) == len(shown._look.points.children) == 4
+    shown._look.points.children[0].children[4].click()
+    assert len(shown.model.state.look) == len(shown._look.points.children) == 3
+
+
+def test_a_step_alone_is_moved_by_its_level_and_stretched_by_its_window():
+    with viewed(BALL, jv.TransferFunction([90, 90], [(1, 0, 0), (0, 0, 1)], [0, 2])) as view:
+        assert (view._look.window.value, view._look.level.value) == (0, 90)
+        view._look.level.value = 110.0
+        assert view.model.state.look.values == pytest.approx((110, 110))
+        view._look.window.value = 20.0
+        assert view.model.state.look.values == pytest.approx((100, 120))
+
+
+def test_light_is_offered_where_something_can_be_lit():
+    for compositing, offered in (("over", True), ("average", False)):
+        with viewed(BALL, LOOK, compositing=compositing) as view:
+            names = [getattr(widget, "description", "") for widget in view.children[1].children]
+            assert ("light" in names) is offered
+            assert "AlphaCorrection" in names
+
+
+def test_the_plot_follows_the_points(shown):
+    plot = shown._look.children[0]
+    before = plot.value
+    assert before.count("<circle") == 2  # the third lies beyond the volume's values
+    shown._look.points.children[1].children[2].value = 0.1
+    assert plot.value != before
+
+
+def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
+    with viewed(LABELS) as view:
+        rows = view._look.children
+        assert [row.children[1].description for row in rows] == ["1", "2"]
+        assert "#1f77b4" in rows[0].children[0].value
+        rows[0].children[1].value = False
+        rows[1].children[2].value = 0.25
+        transfer = view.transfer
+        assert isinstance(transfer, jv.LabelTransferFunction)
+        assert np.asarray(transfer.shown).tolist()[1:3] == [False, True]
+        assert np.asarray(transfer.opacity).tolist()[1:3] == [1.0, 0.25]
+        assert view.volume.labels is not None
+
+
+def test_the_canvas_waits_for_no_tick(monkeypatch):
+    """An event is handled when it comes, and an image sent in the next turn of the event loop, and once."""
+    from jaxvol.app.viewer.canvas import PromptCanvas
+
+    sent, handled, pixels = [], [], np.zeros((4, 6, 3), np.uint8)
+    monkeypatch.setattr(PromptCanvas, "send", lambda self, message, buffers: sent.append(message["mimetype"]))
+
+    async def run():
+        canvas = PromptCanvas(size=(6, 4))
+        resized = {"type": "resize", "width": 6, "height": 4, "pwidth": 6, "pheight": 4, "ratio": 1}
+        canvas._rfb_handle_msg(canvas, resized, [])
+        canvas._has_visible_views = True
+        canvas.add_event_handler(handled.append, "pointer_down")
+        canvas.submit_event(pointer("pointer_down", 1, 1))
+        assert len(handled) == 1
+        for quality in (80, 94):
+            canvas.show(pixels, quality)
+            await asyncio.sleep(0)
+        assert canvas._rfb_lossless_draw_info is None
+        assert "this.setThrottle(0)" in canvas._esm
+        canvas._is_closed = True
+
+    asyncio.run(run())
+    assert sent == ["image/jpeg"] * 2
+
+
+@pytest.mark.parametrize(
+    ("call", "module", "extra"), [(jv.view, "rendercanvas", "notebooks"), (jv.serve, "viser", "view")]
+)
+def test_without_the_extra_the_error_says_what_to_install(call, module, extra, monkeypatch):
+    for name in [module, *(n for n in sys.modules if n.startswith(f"{module}."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    for own in ("notebook", "canvas", "page"):
+        monkeypatch.delitem(sys.modules, f"jaxvol.app.viewer.{own}", raising=False)
+        monkeypatch.delattr(f"jaxvol.app.viewer.{own}", raising=False)
+    with pytest.raises(ImportError, match=rf"pip install jaxvol\[{extra}\]"):
+        call(BALL)

@@ -1,0 +1,94 @@
+"""Does the camera move as the pointer wants it to?"""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.app.viewer.orbit import NEAREST, STEEPEST, Orbit
+
+
+START = Orbit.at((5.0, -3.0, 2.0), (1.0, 2.0, 0.5), (0.0, 0.0, 2.0), 40.0)
+
+HEIGHT = 400
+"""Pixels of the view."""
+
+
+def pixel(orbit: Orbit, point) -> np.ndarray:
+    """Where a world point appears: (x, y) from the middle of the view, to the right and down, in heights."""
+    forward = -orbit.toward
+    right = np.cross(forward, orbit.view_up)
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    offset = np.asarray(point) - orbit.position
+    scale = 2 * math.tan(math.radians(orbit.view_angle) / 2) * (offset @ forward)
+    return np.array([offset @ right, -(offset @ up)]) / scale
+
+
+@pytest.mark.parametrize("drag", [(0.01, 0.0), (0.0, 0.01), (-0.004, 0.007)])
+def test_the_front_of_what_is_seen_follows_a_drag(drag):
+    front = START.focal_point + 0.5 * START.toward
+    moved = pixel(START.turned(*drag), front) - pixel(START, front)
+    assert np.dot(moved, drag) > 0.99 * np.linalg.norm(moved) * np.linalg.norm(drag)
+
+
+def test_half_a_turn_for_a_drag_over_the_height():
+    turned = START.turned(1.0, 0.0)
+    level, was = (v - (v @ START.view_up) * START.view_up for v in (turned.toward, START.toward))
+    np.testing.assert_allclose(level, -was, atol=1e-12)
+    assert turned.distance == START.distance
+    assert turned.toward @ START.view_up == pytest.approx(START.toward @ START.view_up)
+
+
+def test_a_camera_stops_short_of_the_pole_and_comes_back():
+    over = START.turned(0.0, 5.0)
+    assert math.asin(over.toward @ START.view_up) == pytest.approx(STEEPEST)
+    over.camera((8, 8))  # a legal camera
+    back = over.turned(0.0, -(STEEPEST - math.asin(START.toward @ START.view_up)) / math.pi)
+    np.testing.assert_allclose(back.toward, START.toward, atol=1e-6)
+
+
+def test_a_camera_that_looks_along_the_axis_is_turned_away_from_it():
+    above = Orbit.at((0, 0, 5), (0, 0, 0), (0, 0, 1), 30)
+    above.camera((8, 8))
+    assert np.isfinite(above.turned(0.1, 0.1).toward).all()
+
+
+@pytest.mark.parametrize("drag", [(0.1, 0.0), (0.0, 0.1), (-0.3, 0.2)])
+def test_what_is_panned_stays_under_the_pointer(drag):
+    moved = pixel(START.panned(*drag), START.focal_point) - pixel(START, START.focal_point)
+    np.testing.assert_allclose(moved, drag, atol=1e-12)
+
+
+def test_a_zoom_magnifies_what_is_at_the_focal_point_and_ends():
+    beside = START.focal_point + 1e-3 * np.cross(START.toward, START.view_up)
+    grown = pixel(START.zoomed(3.0), beside) / pixel(START, beside)
+    assert grown[0] == pytest.approx(3.0, rel=1e-5)
+    assert START.zoomed(1e9).distance == pytest.approx(NEAREST * START.distance)
+
+
+def test_the_camera_is_that_of_the_renderer():
+    camera = jv.Camera((5, -3, 2), (1, 2, 0.5), (0, 0, 1), 40, size=(HEIGHT, HEIGHT))
+    again = Orbit.of(camera).camera((HEIGHT, HEIGHT))
+    ray = jax.jit(lambda camera: camera.ray(30, 70))
+    origin, direction = (np.asarray(part) for part in ray(again))
+    np.testing.assert_allclose((origin, direction), ray(camera), atol=1e-6)
+    # and so are the pixels of `pixel`
+    x, y = pixel(Orbit.of(camera), origin + 3 * direction)
+    np.testing.assert_allclose([x * HEIGHT, y * HEIGHT], [30.5 - HEIGHT / 2, 70.5 - HEIGHT / 2], atol=1e-2)
+
+
+def test_bad_cameras_are_refused():
+    with pytest.raises(ValueError, match="perspective"):
+        Orbit.of(jv.Camera((1, 0, 0), (0, 0, 0), (0, 0, 1), parallel_scale=1))
+    for position, up, angle in (
+        ((0, 0, 0), (0, 0, 1), 30),
+        ((1, 0, 0), (0, 0, 0), 30),
+        ((1, 0, 0), (0, 0, 1), 0),
+    ):
+        with pytest.raises(ValueError, match="is none"):
+            Orbit.at(position, (0, 0, 0), up, angle)
+    with pytest.raises(ValueError, match="is none"):
+        Orbit.at((math.nan, 0, 0), (0, 0, 0), (0, 0, 1), 30)

@@ -1,0 +1,177 @@
+"""Who may connect to the page of `jaxvol view`, and what can a client make it do?"""
+
+import asyncio
+import socket
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import jaxvol as jv
+
+
+viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
+client = pytest.importorskip("websockets.sync.client")
+exceptions = pytest.importorskip("websockets.exceptions")
+frames = pytest.importorskip("websockets.frames")
+protocol = pytest.importorskip("websockets.client")
+uri = pytest.importorskip("websockets.uri")
+
+VOLUME = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
+GRAY = jv.colormap("gray", (0, 26), n_colors=4)
+VISER = [f"viser-v{viser.__version__}"]
+
+
+@pytest.fixture(scope="module")
+def page():
+    served = jv.serve(VOLUME, GRAY, port=18080)
+    yield served
+    served.close()
+
+
+def is_taken(page, origin: str) -> bool:
+    """Whether a client from a page of this origin receives anything before it is sent away."""
+    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=VISER) as connection:
+        try:
+            connection.recv(timeout=30)
+        except exceptions.ConnectionClosed:
+            return False
+        return True
+
+
+def test_only_its_own_pages_may_connect(page):
+    """Any page that the browser shows may open a connection to a port of this machine."""
+    assert is_taken(page, page.url)
+    assert is_taken(page, f"http://127.0.0.1:{page.port}")
+    for origin in ("https://example.org", f"http://example.org:{page.port}", "http://localhost:1", "null"):
+        assert not is_taken(page, origin)
+
+
+def handled(page, origin: str) -> int:
+    """Messages that viser handles of a client from a page of this origin, which sends one along with its
+    request for a connection."""
+    server, message = page._server._websock_server, viser._messages.ShareUrlDisconnect
+    messages, ended = [], threading.Event()
+
+    def note(_: int, message: object) -> None:
+        messages.append(message)
+
+    server.register_handler(message, note)
+    server.on_client_disconnect(lambda _: ended.set())
+    asked = protocol.ClientProtocol(
+        uri.parse_uri(page.url.replace("http", "ws")), origin=origin, subprotocols=VISER
+    )
+    asked.send_request(asked.connect())
+    packed = viser.infra._messages.msgspec.msgpack.encode({"type": message.__name__})
+    frame = frames.Frame(frames.Opcode.BINARY, packed).serialize(mask=True)
+    end = frames.Frame(frames.Opcode.CLOSE, frames.Close(1000, "").serialize()).serialize(mask=True)
+    with socket.create_connection(("127.0.0.1", page.port), timeout=20) as connection:
+        connection.sendall(b"".join(asked.data_to_send()) + frame)
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101")
+        connection.sendall(end)
+        while connection.recv(1 << 16):
+            pass
+    assert ended.wait(20)
+    server.unregister_handler(message, note)
+    return len(messages)
+
+
+def test_what_others_send_is_not_handled(page):
+    assert handled(page, page.url) == 1
+    assert handled(page, "https://example.org") == 0
+
+
+def test_nobody_else_reaches_it_and_it_serves_no_other_files(page):
+    with socket.create_connection(("127.0.0.1", page.port), timeout=5):
+        pass  # as browsers do in advance
+    # an address of this machine, too, but not the one that it is bound to
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.2", page.port), timeout=5)
+    assert (
+        page._server.request_share_url() is None
+    )  # a message of viser's asks for a tunnel to a public address
+    assert page._server._share_tunnel is None
+    for path in ("/../../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd"):
+        with socket.create_connection(("127.0.0.1", page.port), timeout=5) as connection:
+            connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            answer = connection.recv(1 << 16)
+        assert b"root:" not in answer
+        assert not answer.startswith(b"HTTP/1.1 200")
+
+
+def test_the_camera_of_a_page_is_that_of_the_volume(page):
+    """viser's scene has the size of 1, whatever the volume's."""
+    orbit = page._state.orbit
+    again = page._center + page._radius * page._shown(orbit.position)
+    np.testing.assert_allclose(again, orbit.position)
+    assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
+
+
+def controls(transfer, **how) -> dict[str, Any]:
+    """Those of a page that is opened, by their labels."""
+    from jaxvol.app.viewer.page import _Panel
+
+    page = jv.serve(VOLUME, transfer, port=18090, **how)
+    try:
+        gui = page._server.gui
+        client: Any = SimpleNamespace(gui=gui)
+        _Panel(client, page._content, page._state).model.close()
+        return {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
+    finally:
+        page.close()
+
+
+def test_the_controls_show_how_it_begins():
+    shown = controls(GRAY, march=jv.March(16.0), compositing="average")
+    assert shown["step (voxels)"].value == shown["step (voxels)"].max == 16
+    assert "SpaceLeaping" in {name.replace("\u200b", "") for name in shown}
+    assert "light" not in shown
+    shown = controls(jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2]))
+    assert (shown["window"].value, shown["level"].value) == (0, 9)
+    assert shown["level"].max - shown["level"].min > 20
+    assert "light" in shown
+
+
+def test_labels_are_shown_and_changed_by_their_controls(page, monkeypatch):
+    """What is changed in a browser; not what the program itself shows in its controls."""
+    from jaxvol.app.viewer.model import Model
+    from jaxvol.app.viewer.page_look import _LabelControls
+
+    from .test_model import LABELS, begun
+
+    changes: list[Any] = []
+    monkeypatch.setattr(Model, "change", lambda _, **changed: changes.append(changed["look"]))
+    model = Model(*begun(LABELS, None), lambda _: None, lambda _: None, rest=0)
+    try:
+        controls = _LabelControls(page._server.gui, model)
+    finally:
+        model.close()
+    look: Any = model.state.look
+    assert (controls.label.options, controls.label.value) == (("1", "2"), "1")
+
+    def choose(control, value, client):
+        control.value = value
+        for call in control._impl.update_cb:
+            asyncio.run(call(SimpleNamespace(client=client)))
+
+    choose(controls.shown, False, None)
+    assert not changes
+    choose(controls.shown, False, "a browser")
+    assert equal(changes.pop(), look.changed(1, shown=False))
+    choose(controls.label, "2", "a browser")
+    assert controls.shown.value  # as the look has it
+    assert controls.color.value == tuple(round(255 * part) for part in look.color(2))
+    choose(controls.opacity, 0.5, "a browser")
+    assert equal(changes.pop(), look.changed(2, opacity=0.5))
+
+
+def equal(one, other) -> bool:
+    return (one.shown, one.opacities) == (other.shown, other.opacities)
+
+
+def test_a_port_that_is_none_is_named():
+    for port in (99999, 0, -5, "x"):
+        with pytest.raises(ValueError, match="port must be an integer from 1 to 65535; got"):
+            jv.serve(VOLUME, port=port)

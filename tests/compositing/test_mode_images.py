@@ -1,0 +1,195 @@
+"""Are images of every compositing mode, in both engines, those of NumPy? And their gradients right?"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.engine.driver import render_scene
+from jaxvol.engine.scene import Scene
+from jaxvol.engine.tiling import Tiling
+from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
+
+from ..modes import (
+    MODES,
+    QUADRATURE,
+    VALUE,
+    Additive,
+    FoggedSurface,
+    ball_in_a_corner,
+    check_gradients,
+    same_image,
+    scaled_transfer,
+    shown,
+)
+from ..scenes import anisotropic_noise, around, in_float64, inside, orthographic, slow, soft_transfer
+
+
+STEP = 0.11
+JITTER = jv.EmptySpaceJitter(4)
+TYPES = {
+    "over": "int16",
+    "additive": "uint8",
+    "maximum": "uint8",
+    "minimum": "uint16",
+    "first visible": "uint8",
+}
+"""Of voxels; else float32."""
+SIMILAR = "minimum", "first visible"
+"""To the maximum, and to the isosurface."""
+TOPS = {"uint8": 255, "uint16": 60_000, "int16": 4000, "float32": 1}
+
+
+def scene_of(name, volume, dtype):
+    """A volume of values from 0 to 1 in another type, with a transfer function and the mode for it."""
+    top, transfer = TOPS[dtype], soft_transfer()
+    data = np.asarray(volume.data)
+    if name == "minimum":  # what is invisible are the greatest values
+        data = 1 - data
+        transfer = jv.TransferFunction(
+            1 - transfer.values[::-1], transfer.colors[::-1], transfer.extinction[::-1]
+        )
+    data = data * top if dtype == "float32" else np.round(data * top)
+    mode = jv.Isosurface(VALUE * top) if name == "isosurface" else MODES[name]
+    return jv.Volume(data.astype(dtype), volume.spacing, volume.origin), scaled_transfer(top, transfer), mode
+
+
+def march_of(name, *transforms, step=STEP):
+    ending = () if name == "over" else (jv.EarlyTermination(0.05),)  # under which other rays never end
+    return jv.March(step, (JITTER, jv.AlphaCorrection(), *ending, *transforms), QUADRATURE.get(name, "left"))
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "dtype"),
+    [
+        *((name, "hierarchy", TYPES.get(name, "float32")) for name in MODES if name not in SIMILAR),
+        *slow(*((name, "hierarchy", TYPES[name]) for name in SIMILAR)),
+        *slow(("maximum", "distance", "float32"), ("isosurface", "beam", "uint8")),
+    ],
+)
+def test_an_image_is_that_of_numpy(name, method, dtype):
+    """Where rays leap, samples shift and cells are cut: of noise and, in empty space, of a ball."""
+    for each, step, most in ((anisotropic_noise(), STEP, 1.001), (ball_in_a_corner(), 0.05, 0.7)):
+        march = march_of(name, jv.SpaceLeaping(method), step=step)
+        volume, transfer, mode = scene_of(name, each, dtype)
+        for camera, rest in ((around(volume).zoom(2.0), 0), (inside(volume), 0.2)):
+            found = jv.render(volume, transfer, camera, march, compositing=mode)
+            value = float(mode.value) if isinstance(mode, jv.Isosurface) else 0
+            rgba, depth, samples = shown(name, volume, transfer, camera, step, JITTER, value)
+            assert np.mean(rgba[..., 3] > 0) > 0.05
+            same_image(found, rgba, depth)
+            taken = np.sum(found.samples) / samples
+            assert taken == 1 if name == "average" else taken < most + rest
+
+
+def test_the_reference_shows_the_same():
+    """Modes of each kind in one program, of rays that shift."""
+    names = "additive", "average", "maximum", "isosurface"
+    volume, camera = anisotropic_noise(), around(anisotropic_noise())
+    width, height = camera.size
+    column, row = (
+        jnp.asarray(index, jnp.int32) for index in np.meshgrid(np.arange(width), np.arange(height))
+    )
+
+    @jax.jit
+    @jax.vmap
+    @jax.vmap
+    def reference(origin, direction, column, row):
+        return {
+            name: jv.render_ray_reference(
+                *(volume, soft_transfer(), origin, direction, march_of(name)),
+                pixel=(column, row),
+                compositing=MODES[name],
+            )
+            for name in names
+        }
+
+    found = reference(*camera.rays(), column, row)
+    for name in names:
+        same_image(found[name], *shown(name, volume, soft_transfer(), camera, STEP, JITTER)[:2])
+
+
+def test_nan_is_passed_on():
+    """From voxels into the pixels whose rays meet them, and from a parameter into all."""
+    volume = anisotropic_noise()
+    camera = around(volume)
+    hurt = eqx.tree_at(lambda v: v.data, volume, volume.data.at[10:14, 10:14, 10:14].set(jnp.nan))
+    high = eqx.tree_at(lambda v: v.data, hurt, hurt.data + 2)  # no surface is crossed in front
+    lost = eqx.tree_at(lambda t: t.extinction, soft_transfer(), jnp.full(8, jnp.nan))
+    nowhere = eqx.tree_at(lambda mode: mode.value, MODES["isosurface"], jnp.asarray(jnp.nan))
+    for name, data, transfer, mode in (
+        ("average", hurt, lost, MODES["average"]),
+        ("isosurface", high, soft_transfer(), nowhere),
+    ):
+        march = march_of(name, jv.SpaceLeaping())
+        found = jv.render(data, soft_transfer(), camera, march, compositing=MODES[name])
+        seen = np.isnan(found.rgba).any(axis=-1)
+        assert 0 < seen.mean() < 0.3
+        if name == "isosurface":
+            np.testing.assert_array_equal(np.isnan(found.depth), seen)
+            np.testing.assert_array_equal(found.rgba[~seen], 0)
+        assert np.isnan(jv.render(volume, transfer, camera, march, compositing=mode).rgba).all()
+
+
+# ---- gradients ----
+
+
+THICKNESS, LEVEL = {"thickness": lambda scene: scene[4].thickness}, {"value": lambda scene: scene[4].value}
+GRADIENTS = {
+    "surface": (FoggedSurface, LEVEL, {"normals": True}),
+    "average": (jv.Average, THICKNESS, {}),
+    "additive": (lambda part: Additive(part), {}, {}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "adjoint"),
+    [("surface", "replay"), ("surface", "forward"), ("average", "replay"), ("additive", "direct")],
+)
+def test_gradients_are_central_differences(name, adjoint):
+    """And 0 of an image of nothing."""
+    make, parameters, options = GRADIENTS[name]
+    with in_float64():
+        noise = anisotropic_noise()
+        volume = jv.Volume(np.asarray(noise.data, np.float64), noise.spacing, noise.origin)
+        transforms = jv.AlphaCorrection(), jv.SpaceLeaping()
+        march = jv.March(STEP, transforms, QUADRATURE.get(name, "left"), max_samples=64)
+        scene = volume, soft_transfer(), around(volume), march, make(VALUE)
+        check_gradients(scene, parameters, adjoint, **options)
+
+
+# ---- with light, labels, tiles ----
+
+
+@pytest.mark.slow
+def test_what_is_selected_is_lit():
+    """By the same light in both engines; through a parallel camera."""
+    lighting = ScattererTemplates(
+        Material(0.8, 0.1, 1.4), DirectionalLight((0.3, -1.0, 0.2)), templates=1, photons=2
+    )
+    volume = anisotropic_noise()
+    camera, march, mode = orthographic(volume), jv.March(STEP), MODES["isosurface"]
+    found = jv.render(volume, soft_transfer(), camera, march, compositing=mode, lighting=lighting)
+    unlit = jv.render(volume, soft_transfer(), camera, march, compositing=mode)
+    assert np.abs(found.rgba - unlit.rgba).max() > 0.1
+
+    @jax.jit
+    @jax.vmap
+    def reference(origin, direction):
+        options = {"compositing": mode, "lighting": lighting}
+        return jv.render_ray_reference(volume, soft_transfer(), origin, direction, march, **options).rgba
+
+    np.testing.assert_allclose(found.rgba[8], reference(*(part[8] for part in camera.rays())), atol=2e-4)
+
+
+@pytest.mark.slow
+def test_more_tiles_than_one_show_nothing():
+    volume, mode = anisotropic_noise(), MODES["isosurface"]
+    scene = volume, soft_transfer(), around(volume, (37, 50)), jv.March(STEP, (jv.SpaceLeaping(),))
+    whole = jv.render(*scene, compositing=mode)
+    small = render_scene(Scene(*scene, mode), "all", "replay", Tiling(tile=6, batch=5))
+    for part in ("rgba", "depth", "normal"):
+        np.testing.assert_array_equal(getattr(whole, part), getattr(small, part))

@@ -1,0 +1,201 @@
+"""Are medical images (MetaImage, NRRD, NIfTI) read as SimpleITK wrote them, along left, back and head?"""
+
+import zlib
+
+import numpy as np
+import pytest
+
+from jaxvol.io.formats import load, save
+from jaxvol.scene.volume import Volume
+
+from .test_formats import ramp, raw_bytes, same, write
+
+
+sitk = pytest.importorskip("SimpleITK", reason="SimpleITK is not installed: pip install jaxvol[io]")
+
+ENDINGS = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr")
+
+
+def write_itk(path, data, spacing=(1, 1, 1), origin=(0, 0, 0), direction=None, compress=False):
+    image = sitk.GetImageFromArray(np.ascontiguousarray(data.T))
+    image.SetSpacing([float(s) for s in spacing])
+    image.SetOrigin([float(o) for o in origin])
+    image.SetDirection(np.ravel(np.eye(3) if direction is None else direction).tolist())
+    sitk.WriteImage(image, str(path), compress)
+    return path
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_image_comes_out_as_it_was_written(tmp_path, ending):
+    path, data = tmp_path / f"a{ending}", ramp("int16")
+    for compress in (False, True):
+        write_itk(path, data, (1, 2, 3), (4, 5, 6), compress=compress)
+        assert same(load(path), data, (1, 2, 3), (4, 5, 6))
+    assert same(load(path, spacing=(2, 2, 2), origin=(0, 0, 0)), data, (2, 2, 2))
+    with pytest.raises(ValueError, match="shape and dtype are for raw files"):
+        load(path, dtype="int16")
+    # axes of the file: toward the head, the right and the front
+    direction = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    turned = load(write_itk(path, data, (1, 2, 3), (10, 20, 30), direction))
+    assert same(turned, data.transpose(1, 2, 0)[::-1, ::-1, :], (2, 3, 1), (10 - 3 * 2, 20 - 2 * 3, 30))
+    c, s = np.cos(0.1), np.sin(0.1)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    oblique = load(write_itk(path, data, (1, 2, 3), (4, 5, 6), turn))
+    assert same(oblique, data, (1, 2, 3), (4, 5, 6))
+    np.testing.assert_allclose(np.array(oblique.direction), turn, atol=1e-6)
+    # turned by nearly a right angle as well, about z: the first axis to the back, the second to the right
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    oblique = load(write_itk(path, data, (1, 2, 3), (4, 5, 6), turn @ quarter))
+    corner = np.array([4, 5, 6]) + turn @ quarter @ (0, 3 * 2, 0)
+    assert same(oblique, data.transpose(1, 0, 2)[::-1], (2, 1, 3), corner)
+    np.testing.assert_allclose(np.array(oblique.direction), turn, atol=1e-6)
+
+
+def test_nifti_values_are_scaled(tmp_path):
+    path = write_itk(tmp_path / "a.nii", ramp("int16"))
+    content = bytearray(path.read_bytes())
+    content[112:120] = np.array([0.5, -100], "float32").tobytes()  # scl_slope, scl_inter
+    assert same(load(write(path, bytes(content))), ramp("float32") / 2 - 100)
+
+
+WIDE = [
+    ("float64", 0, 1, "float32"),
+    ("int32", -(2**15), 2**15 - 1, "int16"),
+    ("uint32", 0, 2**16 - 1, "uint16"),
+    ("int64", -1, 2**16 - 1, "float32"),
+    ("int64", -(2**24), 2**24, "float32"),
+    ("int32", 0, 2**24 + 1, None),
+    ("uint64", 0, 2**64 - 1, None),
+    ("int32", 0, 255, "uint8"),
+]
+
+
+def test_wide_types_become_those_of_a_volume_where_no_value_is_lost(tmp_path):
+    for dtype, low, high, becomes in WIDE:
+        data = np.zeros((5, 4, 3), dtype)
+        data[0, 0, 0], data[-1, -1, -1] = low, high
+        path = write_itk(tmp_path / "a.nrrd", data)
+        if becomes:
+            assert same(load(path), data.astype(becomes))
+        else:
+            with pytest.raises(ValueError, match=rf"a\.nrrd: data must .*got {dtype} from {low} to {high}"):
+                load(path)
+
+
+def test_what_is_no_whole_image_of_a_volume_is_refused_without_text_of_itk(tmp_path, capfd):
+    for name, image in {
+        "flat.mha": sitk.Image([4, 4], sitk.sitkUInt8),
+        "film.nii": sitk.Image([4, 4, 4, 4], sitk.sitkUInt8),
+        "vectors.nrrd": sitk.Image([4, 4, 4], sitk.sitkVectorFloat32, 3),
+    }.items():
+        sitk.WriteImage(image, str(tmp_path / name))
+        with pytest.raises(ValueError, match="must be a 3-D image of one value per voxel"):
+            load(tmp_path / name)
+    noise = np.random.default_rng(0).integers(0, 250, (20, 20, 20)).astype("uint8")
+    for ending in ENDINGS:
+        for compress in (False, True):
+            folder = tmp_path / f"{ending}{compress}"
+            folder.mkdir()
+            path = write_itk(folder / f"a{ending}", noise, compress=compress)
+            held = max(folder.iterdir(), key=lambda file: file.stat().st_size)  # for .mhd, the data file
+            held.write_bytes(held.read_bytes()[:-1000])
+            with pytest.raises(ValueError, match=f"a{ending}"):
+                load(path)
+        with pytest.raises(ValueError, match=f"b{ending} cannot be read") as fault:
+            load(write(tmp_path / f"b{ending}", b"not an image\n" * 99))
+        assert "\n" not in str(fault.value)
+        assert not any(word in str(fault.value) for word in ("ITK", ".cxx", "(0x", "ERROR"))
+    assert capfd.readouterr().err == ""
+    path = save(Volume(ramp()), tmp_path / "a.nii")
+    whole = bytearray(path.read_bytes())
+    whole[70:72] = (9999).to_bytes(2, "little")  # the type of the voxels, whose fault only ITK sees
+    path.write_bytes(whole)
+    with pytest.raises(ValueError, match=r"incomplete \(\S*a\.nii is not recognized as a NIFTI file\)\.$"):
+        load(path)
+    path = write_itk(tmp_path / "c.mhd", ramp(), compress=True)
+    (tmp_path / "c.zraw").unlink()
+    with pytest.raises(ValueError, match=r"c\.mhd cannot be read"):
+        load(path)
+
+
+@pytest.mark.parametrize(("msb", "order"), [(False, "<"), (True, ">")])
+def test_a_metaimage_is_inflated_to_its_end_whatever_its_header_says_of_it(tmp_path, msb, order):
+    # ITK reads CompressedDataSize bytes and leaves the rest unset, as in a well-known file of frog tissue
+    packed = zlib.compress(raw_bytes(ramp("int16"), order))
+    (tmp_path / "a.mhd").write_text(
+        f"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = {msb}\n"
+        f"CompressedData = True\nCompressedDataSize = {len(packed) - 30}\n"
+        "ElementSpacing = 1 2 3\nDimSize = 5 4 3\nElementType = MET_SHORT\nElementDataFile = a.zraw\n"
+    )
+    (tmp_path / "a.zraw").write_bytes(packed)
+    assert same(load(tmp_path / "a.mhd"), ramp("int16"), (1, 2, 3))
+
+
+VALUES = np.arange(24, dtype=np.uint8)
+
+
+def write_mhd(path, content, *lines):
+    (path.parent / "voxels.bin").write_bytes(content)
+    header = [
+        "NDims = 3",
+        "DimSize = 4 3 2",
+        "ElementType = MET_UCHAR",
+        *lines,
+        "ElementDataFile = voxels.bin",
+    ]
+    path.write_text("\n".join(header) + "\n")
+    return path
+
+
+def test_a_metaimages_voxels_may_be_the_end_of_another_file_or_text(tmp_path):
+    expected, longer = VALUES.reshape(4, 3, 2, order="F"), b"\xff" * 10 + VALUES.tobytes()
+    path = tmp_path / "a.mhd"
+    for size in (-1, 10):
+        assert same(load(write_mhd(path, longer, f"HeaderSize = {size}")), expected)
+    write_mhd(path, longer, "HeaderSize = -1")
+    np.testing.assert_array_equal(sitk.GetArrayFromImage(sitk.ReadImage(str(path))).T, expected)
+    for told, message in (("-2", "HeaderSize must be"), ("ten", "HeaderSize must be"), ("11", "cut short")):
+        with pytest.raises(ValueError, match=message):
+            load(write_mhd(path, longer, f"HeaderSize = {told}"))
+    with pytest.raises(ValueError, match="cut short"):
+        load(write_mhd(path, longer[:10], "HeaderSize = -1"))
+    text = " ".join(map(str, VALUES))
+    assert same(load(write_mhd(path, text.encode(), "BinaryData = False")), expected)
+    for wrong in ("300", "-1", "7.5", "nan"):
+        write_mhd(path, text.replace("23", wrong).encode(), "BinaryData = False")
+        with pytest.raises(ValueError, match=rf"must hold integers from 0 to 255.*; got {wrong}"):
+            load(path)
+    doubles = write_mhd(path, VALUES.astype("<f8").tobytes())
+    doubles.write_text(doubles.read_text().replace("MET_UCHAR", "MET_DOUBLE"))
+    assert same(load(doubles), expected.astype(np.float32))
+    doubles.write_text(doubles.read_text().replace("MET_DOUBLE", "MET_STRING"))
+    with pytest.raises(ValueError, match=r"ElementType must be one of .*got 'MET_STRING'"):
+        load(doubles)
+    for spacing in ("1 1", "1 1 far"):
+        with pytest.raises(ValueError, match=f"ElementSpacing must be 3 numbers; got '{spacing}'"):
+            load(write_mhd(path, VALUES.tobytes(), f"ElementSpacing = {spacing}"))
+    for wrong, message in ((text.replace("23", "many"), "must hold numbers in text"),):
+        with pytest.raises(ValueError, match=message):
+            load(write_mhd(path, wrong.encode(), "BinaryData = False"))
+    for count in (23, 25, 10**6):
+        with pytest.raises(ValueError, match=r"cut short|oversized"):
+            load(write_mhd(path, b"1 " * count, "BinaryData = False"))
+
+
+@pytest.mark.parametrize("digits", [3, 4])
+def test_directions_that_a_file_has_rounded_are_taken_as_meant(tmp_path, digits):
+    half = 0.5**0.5
+    meant = np.array([[half, 0, half], [0, 1, 0], [-half, 0, half]])
+    text = " ".join(f"{number:g}" for number in np.round(meant, digits).T.ravel())
+    path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text}")
+    np.testing.assert_allclose(np.asarray(load(path).direction), meant, atol=1e-6)
+    path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text.replace('0.7', '0.8')}")
+    with pytest.raises(ValueError, match="TransformMatrix must be orthogonal directions of length 1"):
+        load(path)
+
+
+def test_a_real_medical_volume_comes_out_scaled_and_whole(real_volume):
+    data = np.asarray(load(real_volume("seg3d_mr_head.nii.gz")).data)
+    assert (data.shape, data.min()) == ((160, 232, 160), 0)
+    assert data.max() == pytest.approx(255 * 2.007843, rel=1e-5)
+    assert data.mean(dtype=np.float64) == pytest.approx(55.6883 * 2.007843, rel=1e-4)

@@ -1,0 +1,217 @@
+"""Does a scan-converted volume hold at each node what the probe acquired there, and nothing outside?"""
+
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+import jaxvol as jv
+from jaxvol.io import scan_conversion
+
+from ..scenes import in_float64
+
+
+HALF = np.pi / 2
+SHAPE = (9, 11, 13)
+GRID: dict[str, Any] = {"spacing": (4.0, 5.0, 3.0), "shape": (24, 20, 22), "origin": (-45.0, -50.0, 22.0)}
+PROBES = {
+    "across the middle": (20.0, 30.0, (0.9, 2.3), (0.8, 2.4), (0.0, 60.0)),
+    "apex behind the axis": (-15.0, 40.0, (HALF - 0.5, HALF + 0.6), (HALF - 0.6, HALF + 0.4), (5.0, 55.0)),
+}
+PROBE = PROBES["across the middle"]
+
+
+def acquired(dtype, seed=0):
+    rng = np.random.default_rng(seed)
+    if np.dtype(dtype).kind == "f":
+        return rng.normal(size=SHAPE).astype(dtype)
+    limits = np.iinfo(dtype)
+    return rng.integers(limits.min, limits.max, SHAPE, dtype, endpoint=True)
+
+
+def labelled(data):
+    """All volumes of 8 bits have labels, so that they share a program."""
+    return jv.Volume(data, labels=np.random.default_rng(1).integers(1, 5, SHAPE).astype(np.int16))
+
+
+def nodes(grid):
+    spacing = np.broadcast_to(grid["spacing"], 3)
+    axes = [o + s * np.arange(n) for o, s, n in zip(grid["origin"], spacing, grid["shape"], strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+
+
+def toroidal(points, probe):
+    """(β, σ, γ) by the paper's equation 1 in float64, which holds where z > 0 and R > 0; NaN elsewhere."""
+    a, b, *_ = probe
+    x, y, z = np.moveaxis(points, -1, 0)
+    away = np.sqrt(y**2 + z**2) - a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.stack([HALF + np.arctan(y / z), HALF + np.arctan(x / away), np.hypot(x, away) - b], -1)
+    return np.where(((z > 0) & (away > 0))[..., None], found, np.nan)
+
+
+def coordinates(probe, grid=GRID):
+    """Of the nodes in the acquired grid; and how far they are outside of it."""
+    ends, last = np.array(probe[2:]), np.array(SHAPE) - 1
+    at = (toroidal(nodes(grid), probe) - ends[:, 0]) / (ends[:, 1] - ends[:, 0]) * last
+    return at, np.max(np.maximum(-at, at - last), -1)
+
+
+@pytest.mark.parametrize("name", PROBES)
+@pytest.mark.parametrize("kinds", [("uint8", "uint8"), ("int16", "uint8"), ("float32", "float32")])
+def test_nodes_hold_what_scipy_interpolates_in_float64(name, kinds):
+    """Outside, the fill value. Values beyond an integer type become its ends; others are rounded, not cut."""
+    data, probe = acquired(kinds[0]), PROBES[name]
+    if kinds[0] == "int16":
+        data = data // 11
+    volume = labelled(data) if kinds[0] == "uint8" else jv.Volume(data)
+    found = jv.scan_convert(volume, jv.ToroidalMap(*probe), fill_value=7, dtype=kinds[1], **GRID)
+    assert found.data.dtype == kinds[1]
+    np.testing.assert_allclose(found.spacing, GRID["spacing"])
+    np.testing.assert_allclose(found.origin, GRID["origin"])
+    at, outside = coordinates(probe)
+    inside = outside <= 0
+    sure = np.abs(np.nan_to_num(outside, nan=1)) > 1e-3  # rounding decides on those nearer to a face
+    assert 0.1 < inside.mean() < 0.9
+    assert sure.mean() > 0.99
+    values = np.asarray(found.data, np.float64)
+    assert np.all(values[~inside & sure] == 7)
+    expected = map_coordinates(data.astype(np.float64), np.nan_to_num(np.moveaxis(at, -1, 0)), order=1)
+    # half a unit for rounding to integers; 2e-5 of the range for the coordinates' rounding
+    tolerance = 2e-5 * float(np.ptp(data.astype(np.float64))) + (0.5 if kinds[1] == "uint8" else 0)
+    if kinds[1] == "uint8":
+        expected = np.clip(expected, 0, 255)
+    assert np.abs(values - expected)[inside & sure].max() < tolerance
+
+
+def test_labels_are_those_of_the_nearest_sample():
+    volume = labelled(acquired("uint8"))
+    assert volume.labels is not None
+    found = np.asarray(jv.scan_convert(volume, jv.ToroidalMap(*PROBE), fill_value=7, **GRID).labels)
+    at, _ = coordinates(PROBE)
+    inside = np.all((at > 1e-3) & (at < np.array(SHAPE) - 1 - 1e-3), -1)
+    sure = inside & np.all(np.abs(at % 1 - 0.5) > 1e-3, -1)
+    i, j, k = np.moveaxis(np.rint(at[sure]).astype(int), -1, 0)
+    assert found.dtype == np.int16
+    np.testing.assert_array_equal(found[sure], np.asarray(volume.labels)[i, j, k])
+    assert np.all(found[np.isnan(at[..., 0])] == 0)
+
+
+@cache
+def of_nines(grid, probe=PROBE):
+    """Voxels of 9, and 7 outside, on a grid of the same shape as all others."""
+    volume = labelled(np.full(SHAPE, 9, np.uint8))
+    return jv.scan_convert(volume, jv.ToroidalMap(*probe), fill_value=7, **GRID | dict(grid))
+
+
+def test_nodes_on_the_faces_are_inside():
+    """The middle beam begins at depth 0 and ends at 60: z from 50 to 110."""
+    found = of_nines((("spacing", 6.0), ("origin", (0.0, 0.0, 44.0))))
+    np.testing.assert_array_equal(found.data[0, 0], [7, *[9] * 11, *[7] * 10])
+
+
+def test_behind_the_apex_and_the_axis_there_is_nothing():
+    """The torus that continues the sector's faces comes back there."""
+    probe = (20.0, 30.0, (0.0, np.pi), (0.0, np.pi), (0.0, 60.0))
+    grid = (("spacing", 10.0), ("origin", (-117.0, -98.0, -107.0)))
+    x, y, z = np.moveaxis(nodes(GRID | dict(grid)), -1, 0)
+    away = np.hypot(y, z) - 20
+    depth = np.hypot(x, away)
+    expected = (z >= 0) & (away >= 0) & (depth >= 30) & (depth <= 90)
+    np.testing.assert_array_equal(np.asarray(of_nines(grid, probe).data) == 9, expected)
+    assert 0.05 < expected.mean() < 0.5
+
+
+def test_the_grid_encloses_the_sector_and_is_centred_on_it():
+    probe, volume = jv.ToroidalMap(*PROBE), labelled(np.full(SHAPE, 200, np.uint8))
+    found = jv.scan_convert(volume, probe)
+    np.testing.assert_allclose(found.spacing, [5.0] * 3, rtol=1e-6)  # that of samples along a beam
+    np.testing.assert_allclose(found.center, probe.center, atol=1e-4)
+    assert set(np.unique(found.data)) == {0, 200}
+    for wide in ([5.0] * 3, [3.0] * 3, [3.0, 4.0, 7.0]):
+        shape, first = scan_conversion._grid(probe, jnp.asarray(wide), None, None)
+        if wide == [5.0] * 3:
+            assert shape == found.shape
+        last = np.asarray(first) + (np.array(shape) - 1) * wide
+        excess = np.stack([np.asarray(probe.corners[0]) - first, last - np.asarray(probe.corners[1])])
+        assert np.all(excess > -1e-3)
+        assert np.all(excess < np.array(wide) / 2)
+
+
+def test_gradients_are_central_differences():
+    with in_float64():
+        rng = np.random.default_rng(0)
+        data, weights = (jnp.asarray(rng.normal(size=shape)) for shape in (SHAPE, GRID["shape"]))
+        # a node that crosses a face or a plane of samples has no derivative there
+        at, _ = coordinates(PROBE)
+        smooth = np.all(np.abs(at - np.rint(at)) > 1e-4, -1) | np.isnan(at[..., 0])
+        weights = jnp.where(smooth, weights, 0)
+
+        @jax.jit
+        @jax.value_and_grad
+        def total(scene):
+            data, probe = scene
+            return jnp.sum(weights * jv.scan_convert(jv.Volume(data), probe, **GRID).data)
+
+        scene = data, jv.ToroidalMap(*PROBE)
+        leaves, rebuild = jax.tree.flatten(scene)
+        for i, slopes in enumerate(jax.tree.leaves(total(scene)[1])):
+            change = [np.zeros(leaf.shape) for leaf in leaves]
+            change[i] = rng.normal(size=leaves[i].shape)
+            ahead, behind = (
+                total(
+                    rebuild.unflatten([np.asarray(p) + h * d for p, d in zip(leaves, change, strict=True)])
+                )[0]
+                for h in (1e-6, -1e-6)
+            )
+            slope = float(np.vdot(slopes, change[i]))
+            assert slope == pytest.approx(float(ahead - behind) / 2e-6, rel=1e-6)
+            assert abs(slope) > 1e-3
+
+
+def test_memory_beside_the_result_is_that_of_a_plane():
+    volume, probe = jv.Volume(np.zeros(SHAPE, np.uint8)), jv.ToroidalMap(*PROBE)
+    shape = (256, 64, 64)
+    arguments = volume, probe, jnp.zeros(3), jnp.ones(3), shape, np.dtype("uint8"), 0.0
+    resampled: Any = scan_conversion._resampled
+    compiled = resampled.lower(*arguments).compile().compiled
+    assert compiled.memory_analysis().temp_size_in_bytes < 16 * 4 * shape[1] * shape[2]
+
+
+BAD = [
+    ({"volume": np.zeros(SHAPE)}, "volume must be a Volume"),
+    ({"probe": jv.March(1.0)}, "probe must be a ToroidalMap; got a March"),
+    ({"spacing": 0.0}, "spacing must be positive"),
+    ({"spacing": (1, -1, 1)}, "spacing must be positive"),
+    ({"spacing": (1, 1)}, r"spacing must have shape \(3,\)"),
+    ({"spacing": 1e-30}, r"fewer than 2\*\*31 nodes; got \("),
+    ({"shape": 64}, "shape must be three numbers of nodes"),
+    ({"shape": (64, 1, 64)}, "shape must be an integer of at least 2; got 1"),
+    ({"shape": (2000, 2000, 2000)}, r"fewer than 2\*\*31 nodes"),
+    ({"shape": (4, 4, 4), "origin": (0, 0, np.nan)}, "origin must be finite"),
+    ({"fill_value": "black"}, "fill_value must be a number; got 'black'"),
+    ({"fill_value": -1}, r"fill_value must be .* uint8; got -1\. .*float32"),
+    ({"fill_value": 0.5}, "fill_value must be .* uint8; got 0.5"),
+    ({"fill_value": np.nan, "dtype": "float32"}, "fill_value must be .* float32; got nan"),
+    ({"dtype": "int32"}, "dtype must be one of uint8, .*got 'int32'"),
+    ({"dtype": "rgb"}, "dtype must be one of uint8"),
+    ({"spacing": 1.0, "shape": (200,) * 3}, r"200 x 200 x 200 nodes \(spacing, shape\): asks for"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_bad_arguments_are_named_before_a_grid_is_made(changes, message, monkeypatch):
+    monkeypatch.setattr("jaxvol._util.memory.memory_of_device", lambda: 2**20)
+    good: dict[str, Any] = {"volume": jv.Volume(acquired("uint8")), "probe": jv.ToroidalMap(*PROBE)}
+    with pytest.raises(ValueError, match=message):
+        jv.scan_convert(**(good | changes))
+
+
+def test_a_traced_probe_needs_a_grid():
+    volume = jv.Volume(acquired("uint8"))
+    with pytest.raises(ValueError, match="shape, spacing and origin must be given where the probe is traced"):
+        jax.jit(partial(jv.scan_convert, volume))(jv.ToroidalMap(*PROBE))

@@ -1,0 +1,322 @@
+"""The methods that a march calls on its transforms, and custom transforms."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.march.march import Cell
+from jaxvol.scene.space import Affine
+
+from ..scenes import around, scaled_phantom, slow, soft_transfer, uniform_transfer
+from ..switch import switch
+
+
+class Shift(jv.Transform):
+    """Puts the first sample half a step in."""
+
+    def start(self, steps, ray):
+        return steps + 0.5
+
+
+class Late(jv.Transform):
+    """Shifts the samples behind empty space by a fraction of a step."""
+
+    by: jax.Array
+
+    def __init__(self, by):
+        self.by = jnp.asarray(by, jnp.float32)  # an array, so that all values share one program
+
+    def shift(self, ray):
+        return jnp.broadcast_to(self.by, ray.length.shape)
+
+
+class Halves(jv.Transform):
+    """Splits each cell into halves, sampled separately."""
+
+    def cut(self, cell, ray, volume):
+        half = cell.width / 2
+        return Cell(cell.front, half, cell.cut), Cell(cell.front + half, half, cell.cut)
+
+
+class Long(jv.Transform):
+    """Cells of so many steps in runs that begin at the grid coordinate x = `beyond` or behind it."""
+
+    steps: jax.Array = eqx.field(converter=jnp.asarray)  # arrays, so that all values share one program
+    beyond: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
+
+    @property
+    def longest_stride(self) -> int:
+        return 4
+
+    def stride_error(self, ray, run):
+        x, _, _ = ray.path(run.front)
+        allowed = (x >= self.beyond) & (run.stride <= self.steps)
+        return jnp.where(allowed, 0, jnp.inf).astype(x.dtype), jnp.ones_like(x)
+
+
+class Three(Long):
+    @property
+    def longest_stride(self):
+        return 3
+
+
+class NoParts(jv.Transform):
+    @property
+    def subdivision(self):
+        return 0
+
+
+class Moved(jv.Transform):
+    """Places the volume elsewhere in the world."""
+
+    def locate(self, space, volume):
+        return Affine(jv.Volume(volume.data, volume.spacing, volume.origin + 10.0))
+
+
+BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
+RAY = ([[-1.0, 1.0, 1.0]], [[1.0, 0.0, 0.0]])
+
+
+@eqx.filter_jit
+def reference(march):
+    return jv.render_ray_reference(
+        BOX, uniform_transfer(1.0), jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march
+    )
+
+
+def opacity(quadrature="left", step=0.3, *, most=80, **on):
+    """Opacity, number of samples, and whether the last cell was cut, by both engines, with these transforms;
+    all of which are in one program."""
+    every = {
+        "shift": Shift(),
+        "late": Late(on.get("late", 0.0)),
+        "halves": Halves(),
+        "long": Long(on.get("long", 1.0), on.get("beyond", 0.0)),
+        "aligned": jv.AlphaCorrection(),
+        "ended": jv.EarlyTermination(on.get("ended", 0.5)),
+    }
+    transforms = tuple(switch(each, name in on) for name, each in every.items())
+    fast = jv.render_rays(BOX, uniform_transfer(1.0), *RAY, jv.March(step, transforms, quadrature))
+    alone = reference(jv.March(step, transforms, quadrature, max_samples=most))
+    found = [
+        (float(each.rgba[..., 3].sum()), int(each.samples.sum()), bool(each.aligned.any()))
+        for each in (fast, alone)
+    ]
+    assert found[0][0] == pytest.approx(found[1][0], abs=1e-6)
+    assert found[0][1:] == found[1][1:]
+    return found[0]
+
+
+def seen(length):
+    return pytest.approx(1 - np.exp(-length), abs=1e-6)
+
+
+def test_cells_reach_past_the_exit_unless_they_are_cut_there():
+    assert opacity() == (seen(7 * 0.3), 7, False)  # samples at 0, 0.3, … 1.8
+    assert opacity(aligned=True) == (seen(2), 7, True)
+    assert opacity(shift=True) == (seen(7 * 0.3), 7, False)  # at 0.15, … 1.95
+    assert opacity(shift=True, aligned=True) == (seen(2 - 0.15), 7, True)
+
+
+def test_midpoint_samples_only_inside():
+    assert opacity("midpoint") == (seen(7 * 0.3), 7, False)  # at 0.15, … 1.95
+    assert opacity("midpoint", 0.55) == (seen(4 * 0.55), 4, False)  # 1.925; the next would be 2.475
+    assert opacity("midpoint", 0.6) == (seen(3 * 0.6), 3, False)  # 1.5; the next would be 2.1
+    assert opacity("midpoint", 0.6, aligned=True) == (seen(2), 4, True)
+
+
+def test_cut_may_divide_a_cell():
+    assert opacity(halves=True) == (seen(2.1), 14, False)  # half cells at 0, 0.15, … 1.95
+    length, _, aligned = opacity(halves=True, aligned=True)
+    assert length == seen(2)
+    assert aligned
+
+
+def test_early_termination_stops_where_little_is_left():
+    # exp(-0.7) is the first below one half
+    assert opacity(step=0.1, ended=0.5)[:2] == (seen(0.7), 7)
+
+
+@pytest.mark.parametrize(("by", "samples"), [(0.0, 7), (-0.5, 8), (-3.0, 8), (0.5, 7)])
+def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, samples):
+    clear = jv.TransferFunction(np.linspace(0, 1, 8), np.ones((8, 3)), np.zeros(8))
+    rendering = jv.render_rays(BOX, clear, *RAY, jv.March(0.3, (Late(by),)))
+    # at 0, and on from 0.3 (1 + by), limited to between 0 and 0.3
+    assert int(rendering.samples[0]) == samples
+    assert opacity(late=by)[1] == 7, "where nothing is transparent"
+
+
+@pytest.mark.parametrize(
+    ("on", "length", "samples"),
+    [
+        ({"long": 1.0}, 2.04, 34),
+        ({"long": 2.0}, 2.04, 18),  # four runs of eight steps; two more would reach past the exit
+        ({"long": 3.0}, 2.04, 18),  # no power of two
+        ({"long": 4.0}, 2.04, 10),  # two runs of sixteen steps
+        ({"long": 50.0}, 2.04, 10),  # no longer than the longest stride
+        ({"long": 0.1}, 2.04, 34),  # one step is always allowed
+        (
+            {"long": 4.0, "beyond": 1.7},
+            2.04,
+            22,
+        ),  # the second run of sixteen begins behind 1.7, but only that
+        ({"shift": True, "long": 4.0}, 1.98, 9),  # half a step later
+        ({"halves": True, "long": 4.0}, 2.01, 19),  # half cells
+    ],
+)
+def test_stride_lengthens_cells(on, length, samples):
+    """On a ray of 33.3 steps."""
+    assert opacity(step=0.06, **on)[:2] == (seen(length), samples)
+
+
+def test_a_run_may_reach_past_the_exit_where_cells_are_cut_there():
+    origin, direction = (jnp.asarray(end[0]) for end in RAY)
+    march = jv.March(0.06, (jv.AlphaCorrection(), Long(4.0)))
+    found = jv.render_ray_reference(BOX, uniform_transfer(1.0), origin, direction, march)
+    assert float(found.rgba[3]) == seen(2)
+    assert int(found.samples) == 9
+
+
+@pytest.mark.parametrize(("limit", "cells"), [(5, 2), *slow((1, 1), (33, 9))])
+def test_cells_of_several_steps_begin_within_the_limit(limit, cells):
+    """Eight cells of four steps, and two of one, in all engines."""
+    march, box = jv.March(0.06, (Long(4),), max_samples=limit), (BOX, uniform_transfer(1.0))
+    found = [jv.render_rays(*box, *RAY, march, adjoint=adjoint) for adjoint in ("replay", "direct")]
+    found.append(
+        jv.render_rays(*box, *RAY, jv.March(0.06, (*march.transforms, jv.SpaceLeaping()), max_samples=limit))
+    )
+    alone = jv.render_ray_reference(*box, jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march)
+    for rendering in (*(jax.tree.map(lambda leaf: leaf[0], each) for each in found), alone):
+        assert float(rendering.rgba[3]) == seen(0.24 * min(cells, 8) + 0.06 * max(cells - 8, 0))
+        assert int(rendering.samples) == cells
+        assert bool(rendering.exhausted) == (cells < 10)
+
+
+def test_locate_replaces_the_space():
+    origins, directions = np.array(RAY)
+    march = jv.March(0.3, (Moved(), jv.AlphaCorrection()))
+    rendering = jv.render_rays(
+        BOX, uniform_transfer(1.0), np.concatenate([origins, origins + 10]), directions.repeat(2, 0), march
+    )
+    np.testing.assert_allclose(rendering.rgba[:, 3], [0, 1 - np.exp(-2)], atol=1e-5)
+
+
+def test_early_termination_errs_by_less_than_what_is_left():
+    volume, transfer = scaled_phantom("head"), soft_transfer(0.1)
+    camera = around(volume)
+    full = jv.render(volume, transfer, camera, jv.March(0.05, (switch(jv.EarlyTermination(), False),)))
+    for left in (1 / 255, 0.1):
+        ended = jv.render(
+            volume, transfer, camera, jv.March(0.05, (switch(jv.EarlyTermination(left), True),))
+        )
+        off = np.asarray(full.rgba - ended.rgba)
+        assert (off > -1e-6).all()
+        assert 0 < off.max() <= left
+        assert (ended.samples <= full.samples).all()
+        assert int(ended.samples.sum()) < int(full.samples.sum())
+
+
+def test_a_march_that_runs_out_of_samples_says_so():
+    march = jv.March(0.3, max_samples=5)
+    rendering = jv.render_rays(BOX, uniform_transfer(1.0), [RAY[0][0]] * 2, [[1, 0, 0], [0, 1, 0]], march)
+    np.testing.assert_array_equal(rendering.exhausted, [True, False])
+    assert int(rendering.samples[0]) == 5
+    assert not jv.render_rays(BOX, uniform_transfer(1.0), *RAY, jv.March(0.3)).exhausted[0]
+
+
+def test_whole_numbers_of_any_library_are_taken():
+    for given in (5, np.int64(5), np.array(5), jnp.asarray(5)):
+        assert type(jv.March(0.3, max_samples=given).max_samples) is int
+    for step in (np.float64(0.25), np.array(0.25), jnp.float16(0.25)):
+        assert float(jv.March(step).step) == 0.25
+
+
+BAD = {
+    "step 0": (lambda: jv.March(0), "step must be greater than 0; got 0"),
+    "negative step": (lambda: jv.March(-0.1), "step must be greater than 0; got -0.1"),
+    "NaN step": (lambda: jv.March(np.nan), "step must be finite; got nan"),
+    "text": (lambda: jv.March("half"), "step must be a number"),
+    "two steps": (lambda: jv.March([0.1, 0.2]), "step must have shape"),
+    "a transform twice": (
+        lambda: jv.March(0.1, (jv.AlphaCorrection(), jv.EarlyTermination(0.1), jv.AlphaCorrection())),
+        "transforms must each be given once; got AlphaCorrection 2 times",
+    ),
+    "a class": (lambda: jv.March(0.1, (jv.AlphaCorrection,)), "transforms must hold jaxvol transforms"),
+    "a stride of three": (
+        lambda: jv.March(0.1, (Three(1),)),
+        "Three.longest_stride must be a power of two; got 3",
+    ),
+    "steps in no parts": (
+        lambda: jv.March(0.1, (NoParts(),)),
+        "NoParts.subdivision must be an integer from 1 to 64; got 0",
+    ),
+    "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
+    "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),
+    **{
+        f"max_samples={bad!r}": (
+            lambda bad=bad: jv.March(0.1, max_samples=bad),
+            rf"max_samples must be an integer from 1 to 16777216; got {shown}\.",
+        )
+        for bad, shown in [
+            (0, "0"),
+            (2**31, "2147483648"),
+            (2.5, "2.5"),
+            (5.0, "5.0"),
+            (True, "True"),
+            ("5", "'5'"),
+            (np.array([5]), r"a NumPy array of shape \(1,\) and type int64"),
+        ]
+    },
+    "beyond float32": (lambda: jv.March(1e300), r"step must be finite in float32; got 1e\+300"),
+    "complex": (lambda: jv.March(1j), "step must be a number"),
+    "opacity left 0": (
+        lambda: jv.EarlyTermination(0),
+        "opacity_left must be greater than 0 and less than 1; got 0",
+    ),
+    "opacity left 1": (lambda: jv.EarlyTermination(1), "opacity_left must be .*; got 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+class Faulty(jv.Transform):
+    """Answers one of the seams with `answer`."""
+
+    seam: str = eqx.field(static=True)
+    answer: Any = eqx.field(static=True)
+
+    def locate(self, space, volume):
+        return self.answer if self.seam == "locate" else space
+
+    def start(self, steps, ray):
+        return self.answer if self.seam == "start" else steps
+
+    def shift(self, ray):
+        return self.answer if self.seam == "shift" else jnp.zeros_like(ray.length)
+
+    def empty_space(self, occupancy, view):
+        return self.answer if self.seam == "empty_space" else None
+
+    def cut(self, cell, ray, volume):
+        return self.answer if self.seam == "cut" else (cell,)
+
+    def stop(self, stopped, transmittance):
+        return self.answer if self.seam == "stop" else stopped
+
+
+@pytest.mark.parametrize("seam", ["locate", "start", "shift", "empty_space", "cut", "stop"])
+@pytest.mark.parametrize("answer", [3, ()], ids=repr)
+def test_a_wrong_answer_of_a_transform_is_named(seam, answer):
+    march = jv.March(0.1, (Faulty(seam, answer),))
+    with pytest.raises(ValueError, match=f"Faulty.{seam} must return"):
+        jv.render_rays(jv.phantom("sphere", 8), soft_transfer(), [[-3.0, 0, 0]], [[1.0, 0, 0]], march)
