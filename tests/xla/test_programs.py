@@ -19,7 +19,7 @@ with socket.create_server(("localhost", 0)) as free:
     port = free.getsockname()[1]
 jax.distributed.initialize(f"localhost:{port}", 1, 0)
 jax.jit(lambda x: x + 1)(1.0)  # JAX has decided by now that it keeps no programs
-jv.programs.SHORTEST = 0.0
+programs.SHORTEST = 0.0
 print(jv.keep_programs(sys.argv[1]))
 jax.jit(lambda x: x + 2)(1.0)
 """
