@@ -18,7 +18,7 @@ from .._util.vec3 import Vec3
 from ..engine.batch import CellRange
 from ..engine.rays import vmap_rays
 from ..march.march import RUN, March
-from ..reference import Progress
+from ..ray import Progress
 from ..scene.space import Ray, Straight, slab_interval
 from .grid import BrickGrid
 

@@ -20,7 +20,7 @@ from ..engine.image import RenderOptions
 from ..engine.scene import Scene
 from ..march.march import March
 from ..march.transforms import ToroidalMap
-from ..reference import Progress
+from ..ray import Progress
 from ..scene.camera import Camera
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import BrickReport

@@ -11,7 +11,7 @@ from .._util.checks import check_answer
 from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.march import EmptySpaceIndex, March, View
-from ..reference import Pipeline, end
+from ..ray import Pipeline, end
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Transfer, classification_of
 from ..scene.variation import Windows

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..march.beams import Box
 from ..march.march import EmptySpaceIndex, March
-from ..reference import Pipeline, Progress, front, move, with_stride
+from ..ray import Pipeline, Progress, front, move, with_stride
 from ..scene.occupancy import Occupancy
 from ..scene.space import Ray
 from ..xla.sharding import varying

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import jax
 
 from ..compositing.selection import Selection
-from ..reference import resolves
+from ..ray import resolves
 from ..scene.rendering import Rendering
 from ..xla.sharding import varying
 from ..xla.trees import strong

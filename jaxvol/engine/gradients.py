@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..lighting.shading import Shader, Surroundings
 from ..march.march import EmptySpaceIndex
-from ..reference import Pipeline
+from ..ray import Pipeline
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..scene.volume import Volume, with_voxels, without_voxels

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.compositing import Outputs
 from ..lighting.shading import lit_classification
-from ..reference import Pipeline, begin, end, has_fault, step
+from ..ray import Pipeline, begin, end, has_fault
+from ..reference import step
 from ..scene.rendering import Rendering
 from ..scene.space import Ray, Space
 from ..xla.sharding import varying

@@ -16,7 +16,7 @@ from .._util.vec3 import Vec3, along
 from ..compositing.selection import Selection
 from ..lighting.shading import Sample, Shader
 from ..march.march import Cell
-from ..reference import Pipeline
+from ..ray import Pipeline
 from ..scene.space import Ray
 from ..scene.volume import with_fetch
 from ..xla.trees import PyTree

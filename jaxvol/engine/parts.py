@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ..march.march import March
-from ..reference import Pipeline, Progress, begin, end, front, stopped
+from ..ray import Pipeline, Progress, begin, end, front, stopped
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from .acceleration import VolumeAcceleration, empty_space_of

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Int
 
-from ..reference import begin
+from ..ray import begin
 from ..scene.rendering import Rendering
 from ..xla.trees import PyTree
 from .acceleration import VolumeAcceleration

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float, Int
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing.compositing import Weighting
 from ..lighting.shading import Shader
-from ..reference import Pipeline, Progress, measure, pieces
+from ..ray import Pipeline, Progress, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..scene.transfer import Transfer, classification_of

@@ -1,6 +1,6 @@
 """Computes pixels after the march, by chunks of those that are not transparent.
 
-For modes that resolve, and for lightings that shade pixels: `reference.resolve` says what of each.
+For modes that resolve, and for lightings that shade pixels: `ray.resolve` says what of each.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar
 from ..compositing.selection import Selection
-from ..reference import resolve
+from ..ray import resolve
 from ..scene.space import Line
 from ..xla.compaction import in_front, in_place
 from ..xla.trees import PyTree

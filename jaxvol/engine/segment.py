@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Int
 from .._util.vec3 import Scalar, Vec3
 from ..compositing.selection import Selection
 from ..march.march import RUN, Cell, March
-from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
+from ..ray import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.trees import PyTree

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
-from ..reference import Pipeline
+from ..ray import Pipeline
 from ..scene.space import Ray
 from ..scene.volume import read_as
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add

@@ -14,7 +14,7 @@ from .._util.vec3 import Scalar, Vec3, along
 from ..compositing.compositing import Composite, Weighting
 from ..lighting.shading import Sample, Shader
 from ..march.march import Cell
-from ..reference import Pipeline, Progress, stopped
+from ..ray import Pipeline, Progress, stopped
 from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..xla.compaction import Chosen

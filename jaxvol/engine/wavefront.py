@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.compositing import Outputs, Weighting
 from ..march.march import EmptySpaceIndex
-from ..reference import Pipeline, Progress, begin, is_sample, measure, move, opacity, pieces, with_stride
+from ..ray import Pipeline, Progress, begin, is_sample, measure, move, opacity, pieces, with_stride
 from ..scene.space import Ray
 from ..xla.compaction import in_front
 from ..xla.sharding import varying

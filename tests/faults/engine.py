@@ -56,7 +56,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "shift: at every transparent cell",
-        "reference:move",
+        "ray:move",
         shifting_again,
         (f"{MARCH}test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty",),
     ),
