@@ -7,7 +7,9 @@ from ._util.checks import described
 from .lighting.shading import Lighting
 from .march.march import March
 from .scene.camera import Camera
-from .scene.transfer import Transfer
+from .scene.labels import LabelTransferFunction
+from .scene.transfer import Transfer, TransferFunction
+from .scene.transfer2d import TransferFunction2D
 from .scene.volume import Volume
 
 
@@ -41,6 +43,17 @@ EXPECTED: dict[str, tuple[tuple[type, ...], str, str]] = {
 """For each argument name: its allowed types, their description, and how to make one."""
 
 
+OWN_TRANSFER = "Subclass jaxvol.scene.transfer.Transfer instead."
+
+FINAL: dict[type, str] = {
+    Volume: "Subclass jaxvol.Field instead, and pass it as Volume(..., field=...).",
+    TransferFunction: OWN_TRANSFER,
+    TransferFunction2D: OWN_TRANSFER,
+    LabelTransferFunction: OWN_TRANSFER,
+}
+"""Classes that must not be subclassed, and what is instead."""
+
+
 def check_arguments(call: str, **arguments: Any) -> None:
     """Check that arguments are of the types that their names say.
 
@@ -52,12 +65,12 @@ def check_arguments(call: str, **arguments: Any) -> None:
     for name, value in arguments.items():
         kinds, expected, remedy = EXPECTED[name]
         if isinstance(value, kinds):
-            if isinstance(value, Volume) and type(value) is not Volume:
-                raise ValueError(
-                    f"{name} must be a jaxvol Volume itself; got its subclass {type(value).__name__}, whose "
-                    "methods the fast engine would not call. Subclass jaxvol.Field instead, and pass it as "
-                    "Volume(..., field=...)."
-                )
+            for final, instead in FINAL.items():
+                if isinstance(value, final) and type(value) is not final:
+                    raise ValueError(
+                        f"{name} must be a jaxvol {final.__name__} itself; got its subclass "
+                        f"{type(value).__name__}, whose methods the fast engine would not call. {instead}"
+                    )
             continue
         elsewhere = [
             n for n, (other, *_) in EXPECTED.items() if value is not None and isinstance(value, other)

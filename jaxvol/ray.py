@@ -136,8 +136,8 @@ def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False
     # `test_render_agrees_with_the_reference`).
     ends = march.ends(piece, ray)
     front, back = (measured(s) if recorded else in_memory(march.step > 0, measured, s) for s in ends)
-    beside = classification.beside(ray.path(march.sample(piece)))
-    return classification.spanned(beside, *(classification.searched(end) for end in (front, back)))
+    attributes = classification.attributes(ray.path(march.sample(piece)))
+    return classification.spanned(attributes, *(classification.searched(end) for end in (front, back)))
 
 
 def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Scalar:

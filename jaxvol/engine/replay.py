@@ -180,9 +180,9 @@ class Replay(SampleVisitor):
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
-            transfer = self.transfer
-            pull = transfer.pull_integrated if self.pipeline.march.integrates else transfer.pull
-            of_transfer, of_read = pull(measured, of_color[i], of_extinction)
+            of_transfer, of_read = self.transfer.vjp(
+                measured, of_color[i], of_extinction, integrated=self.pipeline.march.integrates
+            )
             sum_ = added(total.transfer, of_transfer)
             total = Total(sum_, total.march, total.volume, total.voxels, total.shader)
             if shaded is not None:

@@ -215,7 +215,7 @@ def _measured_over(
     march, classification = pipeline.march, pipeline.classification
     at = vmap_cells(lambda ray, depth: classification.measure(ray.path(depth))[:1], (False, True))
     between = vmap_cells(
-        lambda ray, piece: classification.beside(ray.path(march.sample(piece))), (False, True)
+        lambda ray, piece: classification.attributes(ray.path(march.sample(piece))), (False, True)
     )
     ends_of = vmap_cells(lambda ray, piece: march.ends(piece, ray), (False, True))
 
@@ -228,7 +228,7 @@ def _measured_over(
         first = jnp.concatenate([ends[0][0][:1], ends[-1][1]])
         return [at(ray, first), *(at(ray, back) for _, back in ends[:-1])]
 
-    beside = in_memory(live, lambda _: [between(ray, piece) for piece in cells()], live)
+    attributes = in_memory(live, lambda _: [between(ray, piece) for piece in cells()], live)
     read = _searched(classification, live, in_memory(live, measured, live))
     if not march.joins:
         fronts, backs = read[::2], read[1::2]
@@ -236,7 +236,7 @@ def _measured_over(
         joints, *inner = read
         backs = [*inner, jax.tree.map(lambda leaf: leaf[1:], joints)]
         fronts = [jax.tree.map(lambda leaf: leaf[:-1], joints), *inner]
-    return [classification.spanned(*each) for each in zip(beside, fronts, backs, strict=True)]
+    return [classification.spanned(*each) for each in zip(attributes, fronts, backs, strict=True)]
 
 
 def _taken(

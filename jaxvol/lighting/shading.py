@@ -89,7 +89,7 @@ class Surroundings(eqx.Module):
     @property
     def classification(self) -> Classification:
         """The transfer function, applied to the volume."""
-        return self.transfer.classification(self.volume) if self.tables is None else self.tables
+        return classification_of(self.transfer, self.volume) if self.tables is None else self.tables
 
     def stored(self, f: Callable[[], T]) -> T:
         """`f()`, computed once for all its uses."""

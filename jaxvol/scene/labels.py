@@ -114,7 +114,7 @@ class LabelTransferFunction(Transfer):
         extinction = self.stacked.extinction * factor[:, None]
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 
-    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+    def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """The label at a grid coordinate."""
         return (volume.label(coordinate),)
 

@@ -176,7 +176,7 @@ class TransferFunction2D(Transfer):
     def reads_gradient(self) -> bool:
         return True
 
-    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+    def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """The magnitude of the gradient at a grid coordinate."""
         return (length(volume.gradient(coordinate)),)
 
@@ -201,7 +201,9 @@ class TransferFunction2D(Transfer):
 
         return classify
 
-    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple[Transfer, Measured]:
+    def vjp(
+        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+    ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         value, magnitude, cell, along, across = measured
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
