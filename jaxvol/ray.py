@@ -25,8 +25,8 @@ from .scene.rendering import Details, Rendering
 from .scene.space import Line, Ray, Space, enter, world_gradient
 from .scene.transfer import Classification, Measured
 from .scene.volume import Volume, without_voxels
+from .xla.memory import in_memory
 from .xla.trees import PyTree
-from .xla.xla import in_memory
 
 
 class Pipeline(NamedTuple):

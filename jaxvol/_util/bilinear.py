@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..xla.xla import gather
+from ..xla.memory import gather
 from .piecewise_linear import points_below
 from .vec3 import Scalar
 

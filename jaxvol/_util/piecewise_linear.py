@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..xla.memory import gather
 from ..xla.platform import on_gpu
-from ..xla.xla import gather
 from .vec3 import Scalar, Vec3
 
 

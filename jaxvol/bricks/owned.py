@@ -28,8 +28,8 @@ from ..engine.parts import Underway, arrive, joined, march_part, set_out
 from ..engine.scene import Scene
 from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
+from ..xla.compiling import compiled
 from ..xla.trees import PyTree
-from ..xla.xla import compiled
 from .cells import behind_straight, of_straight
 from .grid import BrickGrid, Node
 from .stream import Stream

@@ -35,9 +35,10 @@ from ..scene.labels import LabelTransferFunction
 from ..scene.rendering import Details, Rendering
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, part_of
+from ..xla.compiling import compiled
+from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree, strong
-from ..xla.xla import compiled, forward_mode, transformations
 from .grid import is_straight
 from .levels import level_for
 from .opening import OF_RAW, OF_ZARR, levels_of

@@ -26,7 +26,7 @@ from ..scene.occupancy import BLOCK
 from ..scene.rendering import BrickReport
 from ..scene.space import Ray, Space
 from ..scene.volume import Volume, part_of, with_voxels
-from ..xla.xla import compiled
+from ..xla.compiling import compiled
 from .cells import Found, Turn, of_curved, of_straight, widened
 from .choice import cheapest, counts as counted, visible
 from .dtypes import range_of

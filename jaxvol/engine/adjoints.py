@@ -15,8 +15,9 @@ from ..march.march import March
 from ..reference import steps_across
 from ..scene.rendering import Rendering
 from ..scene.volume import Volume
+from ..xla.compiling import compiled, recomputed
+from ..xla.differentiation import forward_mode, forward_only, transformations
 from ..xla.platform import is_traced
-from ..xla.xla import compiled, forward_mode, forward_only, recomputed, transformations
 from .acceleration import VolumeAcceleration
 from .gradients import render_vjp
 from .image import RenderOptions, march_image, scan_image

@@ -14,9 +14,9 @@ from ..march.march import EmptySpaceIndex, March
 from ..ray import Pipeline, Progress, front, move, with_stride
 from ..scene.occupancy import Occupancy
 from ..scene.space import Ray
+from ..xla.memory import gather, in_memory
 from ..xla.sharding import varying
 from ..xla.trees import PyTree
-from ..xla.xla import gather, in_memory
 from .segment import Samples, SampleVisitor, always, begins, march_segment, regular_from_here
 from .tiling import Tiling
 

@@ -19,8 +19,8 @@ from ..march.march import Cell
 from ..ray import Pipeline
 from ..scene.space import Ray
 from ..scene.volume import with_fetch
+from ..xla.memory import in_memory
 from ..xla.trees import PyTree
-from ..xla.xla import in_memory
 
 
 def inline_shader(pipeline: Pipeline) -> Shader | None:

@@ -21,8 +21,8 @@ from ..march.beams import Box
 from ..scene.camera import Camera
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
+from ..xla.memory import in_memory
 from ..xla.trees import PyTree, added
-from ..xla.xla import in_memory
 from . import devices
 from .tiling import Tiling
 

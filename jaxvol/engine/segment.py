@@ -23,8 +23,8 @@ from ..march.march import RUN, Cell, March
 from ..ray import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
+from ..xla.memory import in_memory
 from ..xla.trees import PyTree
-from ..xla.xla import in_memory
 from .inline_shading import inline_shader, light_terms, lit_colors
 from .tiling import Tiling
 from .visible_samples import shaded_colors

@@ -22,9 +22,9 @@ from ..scene.space import Line, Space
 from ..scene.transfer import Classification, Measured, Transfer, classification_of
 from ..scene.volume import Volume, read_as, with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import OneByOne
+from ..xla.memory import in_memory
 from ..xla.sharding import varying
 from ..xla.trees import PyTree
-from ..xla.xla import in_memory
 
 
 T = TypeVar("T")

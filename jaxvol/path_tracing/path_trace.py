@@ -26,8 +26,8 @@ from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
+from ..xla.compiling import compiled
 from ..xla.platform import is_traced
-from ..xla.xla import compiled
 from .lanes import PathResults, walk_all
 from .majorants import Majorants
 from .medium import Medium

@@ -20,7 +20,7 @@ from .._util.piecewise_linear import (
 )
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
-from ..xla.xla import gather
+from ..xla.memory import gather
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume

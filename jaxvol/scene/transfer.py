@@ -28,8 +28,7 @@ from .._util.piecewise_linear import (
 )
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
-from ..xla.row_sums import row_sums
-from ..xla.xla import gather
+from ..xla.memory import gather, row_sums
 from .occupancy import Blocks
 from .variation import Variation, Windows
 from .volume import Volume

@@ -21,8 +21,8 @@ from .._util.bilinear import (
 from .._util.checks import Arrayable, described, finite_array, increasing, number, require, unit_interval
 from .._util.piecewise_linear import ROUNDING, table_row
 from .._util.vec3 import Scalar, Vec3, length
+from ..xla.memory import row_sums
 from ..xla.platform import is_traced
-from ..xla.row_sums import row_sums
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction, extinction_of
 from .volume import Volume

@@ -135,7 +135,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "vmap: the batch in reverse order",
-        "xla.xla:_batch",
+        "xla.compiling:_batch",
         lambda f: lambda *given: jax.tree.map(lambda leaf: leaf[::-1], f(*given)),
         ("engine/test_gradients.py::test_vmap_is_a_loop_for_image_and_gradient",),
     ),

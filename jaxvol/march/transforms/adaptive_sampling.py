@@ -13,7 +13,7 @@ from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import BLOCK
 from ...scene.space import Ray, Space, node_distance
 from ...scene.variation import MARGIN, Variation, Windows
-from ...xla.xla import gather, in_memory
+from ...xla.memory import gather, in_memory
 from ..march import RUN, March, Run, Transform
 
 

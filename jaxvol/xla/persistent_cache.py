@@ -28,7 +28,7 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     others are compiled beside them. To be rid of them, delete the folder.
 
     **Arguments:** `folder`: made if it does not exist. By default the folder that
-    `JAX_COMPILATION_CACHE_DIR` names, or else `jaxvol/xla/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
+    `JAX_COMPILATION_CACHE_DIR` names, or else `jaxvol/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
 
     **Returns:** the folder.
 
