@@ -8,35 +8,141 @@ independent check is `tests/oracle.py`.
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._util.checks import all_finite, check_answer
+from ._util.checks import all_finite, check_answer, described
 from ._util.vec3 import Scalar, Vec3
-from .compositing.compositing import Compositing, Fragment, Outputs, Weighting
+from .compositing.compositing import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
-from .lighting.shading import Lighting
+from .lighting.shading import Lighting, lit_classification
 from .march.march import Cell, March
+from .scene.camera import Camera
+from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
 from .scene.space import Line, Ray, Space, enter, world_gradient
-from .scene.transfer import Classification, Measured
+from .scene.transfer import Classification, Measured, Transfer, TransferFunction
+from .scene.transfer2d import TransferFunction2D
+from .scene.variation import Windows
 from .scene.volume import Volume, without_voxels
 from .xla.memory import in_memory
 from .xla.trees import PyTree
 
 
-class Pipeline(NamedTuple):
-    """What turns the rays of an image into pixels: how they step, through which volume; how its samples are
-    measured, classified and shaded; how cells are composited."""
+class Scene(NamedTuple):
+    """All that an image depends on: what `render` is given, and what is `prepared` from that.
 
-    march: March
+    - `source`: where rays come from, a `Camera` or `GivenRays`; None where there is a single ray.
+    - `space`: in which rays meet the volume. `classification`: how samples are measured, classified and
+      shaded.
+    """
+
     volume: Volume
-    classification: Classification
-    compositing: Compositing[Any]
+    transfer: Transfer
+    source: Any
+    march: March
+    compositing: Compositing[Any] = Over()
+    lighting: Lighting | None = None
+    space: Space = cast(Space, None)
+    classification: Classification = cast(Classification, None)
+
+    def prepared(self, windows: Windows | None = None) -> "Scene":
+        """The scene with what is computed once for each image. `windows`: of the volume, where the march
+        `looks_ahead`."""
+        space, march = self.march.locate(self.volume), self.march
+        lit = lit_classification(
+            self.volume, self.transfer, space, self.lighting, integrated=march.integrates
+        )
+        march = march.prepared(space, windows, partial(self.compositing.variation, self.transfer))
+        return self._replace(march=march, space=space, classification=lit)
+
+    @property
+    def has_fault(self) -> Bool[Array, ""]:
+        """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
+        Comparisons with NaN are false and would make it invisible, so that a fit that diverged would look
+        converged. Rays and voxels are checked ray by ray."""
+        parts = without_voxels(self.volume), self.march, self.transfer, self.compositing, self.lighting
+        return ~(all_finite(parts) & (self.march.step > 0))
+
+    @property
+    def resolves(self) -> bool:
+        """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
+        return self.compositing.resolves or (self.lighting is not None and self.lighting.shades_pixels)
+
+    @property
+    def marched(self) -> "Scene":
+        """The scene as its rays are marched: if it `resolves`, without light, and by the march and the
+        transfer function of its mode."""
+        if not self.resolves:
+            return self
+        transfer, march = self.compositing.marched(self.transfer, self.march, self.volume)
+        return self._replace(transfer=transfer, march=march, lighting=None)
+
+
+EXPECTED: dict[str, tuple[type, str, str]] = {
+    "volume": (
+        Volume,
+        "a jaxvol Volume",
+        "Pass jv.Volume(data, spacing=...) for an array, jv.load(path) for a file, or jv.phantom(name).",
+    ),
+    "transfer": (
+        Transfer,
+        "a transfer function",
+        "Pass jv.preset(name), jv.colormap(cmap, clim) or jv.TransferFunction.from_points(points).",
+    ),
+    "camera": (
+        Camera,
+        "a jaxvol Camera",
+        "Pass jv.Camera.looking_at(volume) or jv.Camera(position, focal_point).",
+    ),
+    "march": (
+        March,
+        "a jaxvol March",
+        'Pass jv.March(step) or jv.March(step, transforms), or "auto" to jv.render.',
+    ),
+    "lighting": (
+        Lighting,
+        "None or a Lighting",
+        "Pass jv.lighting.Phong(lights) or jv.lighting.ScattererTemplates(materials, lights).",
+    ),
+}
+"""For each argument name: its type, a description, and how to make one."""
+
+FINAL: dict[type, str] = {
+    Volume: "jaxvol.Field instead, and pass it as Volume(..., field=...)",
+    TransferFunction: "jaxvol.scene.transfer.Transfer instead",
+    TransferFunction2D: "jaxvol.scene.transfer.Transfer instead",
+    LabelTransferFunction: "jaxvol.scene.transfer.Transfer instead",
+}
+"""Classes whose subclasses would not be asked by the fast engine, and what to subclass."""
+
+
+def check_arguments(call: str, **arguments: Any) -> None:
+    """Check that arguments are of the types that their names say.
+
+    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`,
+    quoted when arguments are swapped.
+
+    **Raises:** `ValueError` naming the first such argument, what came, and what to pass.
+    """
+    for name, value in arguments.items():
+        kind, expected, remedy = EXPECTED[name]
+        for final, other in FINAL.items():
+            if isinstance(value, final) and type(value) is not final:
+                raise ValueError(
+                    f"{name} must be a jaxvol {final.__name__} itself; got its subclass "
+                    f"{type(value).__name__}, whose methods the fast engine would not call. Subclass {other}."
+                )
+        if isinstance(value, kind) or (name == "lighting" and value is None):
+            continue
+        for other, (kind, _, _) in EXPECTED.items():
+            if isinstance(value, kind):
+                remedy = f"That is the {other}: the order is {call}."
+        raise ValueError(f"{name} must be {expected}; got {described(value)}. {remedy}")
 
 
 class Progress(eqx.Module):
@@ -68,16 +174,9 @@ class SampleStats(eqx.Module):
     error: Scalar | None
 
 
-def has_fault(volume: Volume, march: March, *others: Any) -> Bool[Array, ""]:
-    """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
-    Comparisons with NaN are false and would make it invisible, so that a fit that diverged would look
-    converged. Rays and voxels are checked ray by ray."""
-    return ~(all_finite((without_voxels(volume), march, others)) & (march.step > 0))
-
-
-def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+def begin(scene: Scene, ray: Ray, outputs: Outputs | None = "all") -> Progress:
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
-    march, _, _, compositing = pipeline
+    march, compositing = scene.march, scene.compositing
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count, strides = jnp.zeros(ray.length.shape, jnp.int32), march.strides_vary
     return Progress(
@@ -93,38 +192,38 @@ def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Prog
 
 
 def with_stride(
-    pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Array, ""] | int = 0
+    scene: Scene, ray: Ray, at: Progress, steps: Int[Array, ""] | int = 0
 ) -> tuple[Progress, Int[Array, ""] | int]:
     """The ray, with the stride of the cells that begin so many steps ahead of it, up to which all is
     transparent; and the steps to where the first of them begins."""
     if at.stride is None:
         return at, steps
-    transmittance = pipeline.compositing.transmittance(at.composite)
-    ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance, at.phase)
-    leaves = (steps > 0) & (front(pipeline.march, at, steps) >= ray.length)  # all the way
+    transmittance = scene.compositing.transmittance(at.composite)
+    ahead = scene.march.strides(ray, at.index, at.stride, at.index + steps, transmittance, at.phase)
+    leaves = (steps > 0) & (front(scene.march, at, steps) >= ray.length)  # all the way
     begin, stride = jnp.where(leaves, steps, ahead.begin - at.index), jnp.where(leaves, 1, ahead.stride)
     stats = at.stats
     if stats is not None:
         assert stats.error is not None
-        ended = leaves | at.finished | (ray.length <= 0) | (at.index >= pipeline.march.most_samples)
+        ended = leaves | at.finished | (ray.length <= 0) | (at.index >= scene.march.most_samples)
         error = jnp.where(ended, 0, ahead.error)
         stats = replace(stats, error=stats.error + error**2)
     return replace(at, stride=stride, stats=stats), begin
 
 
-def pieces(pipeline: Pipeline, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
+def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
     """The pieces of the ray's next cell, or the one so many cells behind it in its run."""
-    march, stride = pipeline.march, 1 if at.stride is None else at.stride
+    march, stride = scene.march, 1 if at.stride is None else at.stride
     width = jnp.asarray(stride, march.step.dtype) * march.step
     begin = front(march, at, number * stride)
-    return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, pipeline.volume)
+    return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
-def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
+def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
     """The measured values at a piece's sample, or over the piece where it is integrated, and what the
     transfer function's search finds for them. `recorded`: for the engine's `Recording`, which cannot record
     fetches inside branches."""
-    march, classification = pipeline.march, pipeline.classification
+    march, classification = scene.march, scene.classification
     if not march.integrates:
         return classification.at(ray.path(march.sample(piece)))
 
@@ -140,10 +239,10 @@ def measure(pipeline: Pipeline, ray: Ray, piece: Cell, *, recorded: bool = False
     return classification.spanned(attributes, *(classification.searched(end) for end in (front, back)))
 
 
-def opacity(pipeline: Pipeline, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
+def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     """Opacity of a piece; 0 past the exit, and in gaps."""
-    _, extinction = pipeline.classification.of_cells(measured)
-    inside = ray.contains(pipeline.march.sample(piece))
+    _, extinction = scene.classification.of_cells(measured)
+    inside = ray.contains(scene.march.sample(piece))
     optical_depth = jnp.where(inside, extinction, 0) * piece.width
     # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
     t = jnp.tanh(optical_depth / 2)
@@ -159,7 +258,7 @@ def is_sample(march: March, ray: Ray, piece: Cell, *, alone: bool) -> Bool[Array
 
 
 def add(
-    pipeline: Pipeline,
+    scene: Scene,
     ray: Ray,
     at: Progress,
     piece: Cell,
@@ -171,7 +270,7 @@ def add(
 ) -> Progress:
     """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: of `Fragment`.
     `alone`: of `is_sample`."""
-    march, _, _, compositing = pipeline
+    march, compositing = scene.march, scene.compositing
     depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece, alone=alone)
     alpha = jnp.where(at.finished, 0, alpha)
     fragment = Fragment(alpha, depth, piece, measured, color, taken & ray.contains(depth))
@@ -185,14 +284,14 @@ def add(
     return replace(at, composite=composite, stats=stats)
 
 
-def stop(pipeline: Pipeline, at: Progress) -> Progress:
+def stop(scene: Scene, at: Progress) -> Progress:
     """Finishes a ray that needs no other cell."""
-    return replace(at, finished=at.finished | stopped(pipeline, at.composite))
+    return replace(at, finished=at.finished | stopped(scene, at.composite))
 
 
-def stopped(pipeline: Pipeline, composite: Any) -> Bool[Array, ""]:
+def stopped(scene: Scene, composite: Any) -> Bool[Array, ""]:
     """Whether a ray in this state of compositing needs no other cell."""
-    march, _, _, compositing = pipeline
+    march, compositing = scene.march, scene.compositing
     stops, finished = march.stop(compositing.transmittance(composite)), compositing.finished(composite)
     check_answer(compositing, "finished", finished, stops)
     return stops | finished
@@ -213,11 +312,11 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
     return (at.offset + (at.index + ahead).astype(at.offset.dtype)) * march.step
 
 
-def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
+def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
     """The rendering of a ray, with the outputs that it was begun with. Modes that resolve leave the pixel to
     `resolve`."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
-    rgba, depth = pipeline.compositing.end(at.composite)
+    rgba, depth = scene.compositing.end(at.composite)
     # a product, since the derivative of a `where` would be 0
     rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
     if depth is not None:
@@ -226,14 +325,9 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
         details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
         if at.stats.error is not None:
             details = details._replace(error=jnp.where(valid, jnp.sqrt(at.stats.error), jnp.nan))
-    if isinstance(pipeline.compositing, Selection):
+    if isinstance(scene.compositing, Selection):
         details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)
-
-
-def resolves(compositing: Compositing[Any], lighting: Lighting | None) -> bool:
-    """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
-    return compositing.resolves or (lighting is not None and lighting.shades_pixels)
 
 
 class Pixel(NamedTuple):
@@ -245,41 +339,30 @@ class Pixel(NamedTuple):
     normal: Float[Array, "3"] | None = None
 
 
-def resolve(
-    pipeline: Pipeline,
-    lighting: Lighting | None,
-    space: Space,
-    line: Line,
-    rgba: Float[Array, "4"],
-    depth: Scalar,
-    selected: PyTree,
-) -> Pixel:
+def resolve(scene: Scene, line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Pixel:
     """The pixel of a ray that is not transparent, from what its march found: by the compositing mode, or else
     by the lighting."""
-    compositing = pipeline.compositing
+    compositing = scene.compositing
     if isinstance(compositing, Selection):
-        return _selected(compositing, pipeline, space, line, rgba, selected)
+        return _selected(compositing, scene, line, rgba, selected)
     if compositing.resolves:
         assert isinstance(compositing, Weighting)
-        found = compositing.resolved(pipeline.classification, rgba)
+        found = compositing.resolved(scene.classification, rgba)
         check_answer(compositing, "resolved", found, rgba)
         return Pixel(found, depth)
-    assert lighting is not None
-    return Pixel(lighting.shade_pixel(pipeline.classification, space, line, rgba, depth), depth)
+    assert scene.lighting is not None
+    pixel = scene.lighting.shade_pixel(scene.classification, scene.space, line, rgba, depth)
+    return Pixel(pixel, depth)
 
 
 def _selected(
-    compositing: Selection[Any],
-    pipeline: Pipeline,
-    space: Space,
-    line: Line,
-    rgba: Float[Array, "4"],
-    state: PyTree,
+    compositing: Selection[Any], scene: Scene, line: Line, rgba: Float[Array, "4"], state: PyTree
 ) -> Pixel:
-    ray, (march, volume, classification, _) = enter(space, *line), pipeline
+    ray, march = enter(scene.space, *line), scene.march
     # 1, with a derivative: the selected depths are numbers of steps, and so grow with the step
     scale = march.step / jax.lax.stop_gradient(march.step)
-    sampler = RaySampler(ray, classification, scale, partial(world_gradient, volume, space))
+    gradient = partial(world_gradient, scene.volume, scene.space)
+    sampler = RaySampler(ray, scene.classification, scale, gradient)
     found = compositing.pixel(sampler, jax.lax.stop_gradient(state))
     check_answer(compositing, "pixel", found, (rgba, rgba[3]))
     pixel, depth = found

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -11,31 +10,29 @@ from jaxtyping import Array, Float
 
 from ._util.checks import Arrayable, finite_array
 from ._util.vec3 import apart
-from .arguments import check_arguments
 from .compositing.compositing import Compositing
 from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
-from .lighting.shading import Lighting, lit_classification
+from .lighting.shading import Lighting
 from .march.march import March
 from .ray import (
-    Pipeline,
     Progress,
+    Scene,
     add,
     begin,
+    check_arguments,
     end,
-    has_fault,
     measure,
     move,
     opacity,
     pieces,
     resolve,
-    resolves,
     stop,
     with_stride,
 )
 from .scene.rendering import Rendering
 from .scene.space import Line, Ray, enter, invalid
-from .scene.transfer import Transfer, classification_of
+from .scene.transfer import Transfer
 from .scene.variation import Windows
 from .scene.volume import Volume
 from .xla.platform import is_traced
@@ -73,62 +70,54 @@ def render_ray_reference(
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
-    mode = compositing_of(compositing)
-    origin, direction = _vector("origin", origin), _vector("direction", direction)
-    column, row = pixel
-    pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
     march = march.divided()
-    length, space = steps_across(volume, march), march.locate(volume)
-    line = Line(apart(origin), apart(direction), pixel)
-    ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
-    lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
-    pipeline = shown = Pipeline(march, volume, lit, mode)
-    if later := resolves(mode, lighting):
-        transfer, march = mode.marched(transfer, march, volume)
-        unlit = classification_of(transfer, volume, integrated=march.integrates)
-        pipeline = Pipeline(march, volume, unlit, mode)
-    windows = Windows.of(volume) if march.looks_ahead else None
-    pipeline = pipeline._replace(march=march.prepared(space, windows, partial(mode.variation, transfer)))
+    scene = Scene(volume, transfer, None, march, compositing_of(compositing), lighting)
+    length, shown = steps_across(volume, march), scene.prepared()
+    column, row = (jnp.asarray(number, jnp.int32) for number in pixel)
+    line = Line(apart(_vector("origin", origin)), apart(_vector("direction", direction)), (column, row))
+    ray = invalid(enter(shown.space, *line), scene.has_fault)
+    marched = scene.marched.prepared(Windows.of(volume) if march.looks_ahead else None)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
-        return step(pipeline, ray, at), None
+        return step(marched, ray, at), None
 
-    start = varying(begin(pipeline, ray), ray)
-    at, _ = jax.lax.scan(one, start, None, length=length)
-    rendering = end(pipeline, ray, at)
-    if not later:
-        return rendering
-    visible, details = rendering.rgba[3] != 0, rendering.details
-    # a transparent ray has no depth at which anything could be computed
-    given = jax.tree.map(
-        lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), (rendering.depth, details.selected)
-    )
-    found = resolve(shown, lighting, space, line, rendering.rgba, *given)
-    rgba, depth = jnp.where(visible, found.rgba, 0), jnp.where(visible, found.depth, jnp.inf)
-    normal = None if found.normal is None else jnp.where(visible, found.normal, 0)
-    return replace(rendering, rgba=rgba, details=details._replace(depth=depth, normal=normal, selected=None))
+    at, _ = jax.lax.scan(one, varying(begin(marched, ray), ray), None, length=length)
+    rendering = end(marched, ray, at)
+    return resolved(shown, line, rendering) if scene.resolves else rendering
 
 
-def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
+def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
-    march, _, classification, compositing = pipeline
-    at, _ = with_stride(pipeline, ray, at)
-    stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, classification)
+    march, compositing = scene.march, scene.compositing
+    at, _ = with_stride(scene, ray, at)
+    stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, scene.classification)
     after, alphas, color = at, [], None
-    cut = pieces(pipeline, ray, at)
+    cut = pieces(scene, ray, at)
     for piece in cut:
-        measured = measure(pipeline, ray, piece)
-        alphas.append(opacity(pipeline, ray, piece, measured))
+        measured = measure(scene, ray, piece)
+        alphas.append(opacity(scene, ray, piece, measured))
         if not isinstance(compositing, Selection):
             transmittance = compositing.transmittance(after.composite)
-            classified = classification.of_cells(measured)
+            classified = scene.classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
-        after = add(pipeline, ray, after, piece, measured, color, alphas[-1], alone=len(cut) == 1)
+        after = add(scene, ray, after, piece, measured, color, alphas[-1], alone=len(cut) == 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    after = move(march, ray, stop(pipeline, after), transparent, stride)
+    after = move(march, ray, stop(scene, after), transparent, stride)
     if at.stride is None:  # a scan has as many steps as a ray may take
         return after
     return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
+
+
+def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:
+    """The rendering of a ray whose pixel is computed after the march. A transparent ray has no depth at which
+    anything could be computed."""
+    visible, details = rendering.rgba[3] != 0, rendering.details
+    found = rendering.depth, details.selected
+    found = jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), found)
+    pixel = resolve(scene, line, rendering.rgba, *found)
+    rgba, depth = jnp.where(visible, pixel.rgba, 0), jnp.where(visible, pixel.depth, jnp.inf)
+    normal = None if pixel.normal is None else jnp.where(visible, pixel.normal, 0)
+    return replace(rendering, rgba=rgba, details=details._replace(depth=depth, normal=normal, selected=None))
 
 
 def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, require
-from .arguments import check_arguments
 from .compositing.compositing import Compositing
 from .compositing.modes import Mode, compositing_of
 from .engine.adjoints import Adjoint
@@ -20,6 +19,7 @@ from .engine.scene import Scene
 from .lighting.shading import Lighting
 from .march.march import March
 from .planning import plan
+from .ray import check_arguments
 from .scene.camera import Camera
 from .scene.rendering import Rendering
 from .scene.transfer import Transfer

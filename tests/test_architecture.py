@@ -15,7 +15,7 @@ from jaxvol.scene.space import Path as RayPath
 ROOT = Path(jv.__file__).parent
 
 NAMES = """
-    xla _util scene march lighting compositing arguments ray reference engine planning render path_tracing
+    xla _util scene march lighting compositing ray reference engine planning render path_tracing
     metrics io bricks fitting app __main__ __init__
 """
 ORDER = [str(name) for name in NAMES.split()]

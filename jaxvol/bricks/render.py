@@ -12,7 +12,6 @@ from jax.sharding import Mesh
 
 from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
-from ..arguments import check_arguments
 from ..compositing.compositing import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
@@ -30,6 +29,7 @@ from ..engine.tiling import Tiling
 from ..lighting.shading import Lighting
 from ..march.march import March
 from ..march.transforms import SpaceLeaping, ToroidalMap
+from ..ray import check_arguments
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
 from ..scene.rendering import Details, Rendering

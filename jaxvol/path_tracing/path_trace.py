@@ -17,10 +17,10 @@ from .._util.checks import Arrayable, all_finite, described, flag, integer, numb
 from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
-from ..arguments import check_arguments
 from ..engine.packing import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
+from ..ray import check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
