@@ -22,7 +22,9 @@ from .compositing.compositing import Compositing, Fragment, Outputs, Weighting
 from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
+from .march import strides
 from .march.march import Cell, March
+from .march.strides import Strides, steps_of
 from .scene.rendering import Details, Rendering
 from .scene.space import Line, Ray, Space, enter, invalid, world_gradient
 from .scene.transfer import Classification, Measured, Transfer, classification_of
@@ -50,9 +52,8 @@ class Progress(eqx.Module):
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
     the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
-    first transparent cell, and is 0 from then on. `stride`: steps of each cell of the current run, which ends
-    at a multiple of RUN of them, counted from `phase` steps before the ray's first cell. What is not asked
-    for, or not needed, is None.
+    first transparent cell, and is 0 from then on. What is not asked for, or not needed, is None: `strides`
+    where all cells are one step long.
     """
 
     index: Int[Array, ""]
@@ -61,16 +62,14 @@ class Progress(eqx.Module):
     stats: "SampleStats | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
-    stride: Int[Array, ""] | None = None
-    phase: Int[Array, ""] | None = None
+    strides: Strides | None = None
 
 
 class SampleStats(eqx.Module):
-    """What `Rendering.samples` and `Rendering.aligned` report, and the square of `Rendering.error`."""
+    """What `Rendering.samples` and `Rendering.aligned` report."""
 
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
-    error: Scalar | None
 
 
 def has_fault(volume: Volume, march: March, *others: Any) -> Bool[Array, ""]:
@@ -84,44 +83,39 @@ def begin(pipeline: Pipeline, ray: Ray, outputs: Outputs | None = "all") -> Prog
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
     march, _, _, compositing = pipeline
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
-    count, strides = jnp.zeros(ray.length.shape, jnp.int32), march.strides_vary
+    count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
         index=count,
         offset=march.start(ray),
         composite=compositing.begin(zero, outputs),
-        stats=SampleStats(count, no, zero if strides else None) if outputs == "all" else None,
+        stats=SampleStats(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
-        stride=count + 1 if strides else None,
-        phase=march.phase(ray) if strides else None,
+        strides=strides.begin(march, ray, estimate=outputs == "all"),
     )
 
 
 def with_stride(
-    pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Array, ""] | int = 0
+    pipeline: Pipeline, ray: Ray, at: Progress, ahead: Int[Array, ""] | int = 0
 ) -> tuple[Progress, Int[Array, ""] | int]:
-    """The ray, with the stride of the cells that begin so many steps ahead of it, up to which all is
-    transparent; and the steps to where the first of them begins."""
-    if at.stride is None:
-        return at, steps
-    transmittance = pipeline.compositing.transmittance(at.composite)
-    ahead = pipeline.march.strides(ray, at.index, at.stride, at.index + steps, transmittance, at.phase)
-    leaves = (steps > 0) & (front(pipeline.march, at, steps) >= ray.length)  # all the way
-    begin, stride = jnp.where(leaves, steps, ahead.begin - at.index), jnp.where(leaves, 1, ahead.stride)
-    stats = at.stats
-    if stats is not None:
-        assert stats.error is not None
-        ended = leaves | at.finished | (ray.length <= 0) | (at.index >= pipeline.march.most_samples)
-        error = jnp.where(ended, 0, ahead.error)
-        stats = replace(stats, error=stats.error + error**2)
-    return replace(at, stride=stride, stats=stats), begin
+    """The ray, with the stride of the run that holds the step `ahead`, up to which all is transparent; and
+    the steps to where the next cell begins."""
+    if at.strides is None:
+        return at, ahead
+    march, transmittance = pipeline.march, pipeline.compositing.transmittance(at.composite)
+    leaves = (ahead > 0) & (front(march, at, ahead) >= ray.length)
+    finished = at.finished | (ray.length <= 0) | (at.index >= march.most_samples)
+    chosen, ahead = at.strides.next(
+        march, ray, at.index, ahead, transmittance, leaves=leaves, finished=finished
+    )
+    return replace(at, strides=chosen), ahead
 
 
 def pieces(pipeline: Pipeline, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
     """The pieces of the ray's next cell, or the one so many cells behind it in its run."""
-    march, stride = pipeline.march, 1 if at.stride is None else at.stride
-    width = jnp.asarray(stride, march.step.dtype) * march.step
-    begin = front(march, at, number * stride)
+    march, steps = pipeline.march, steps_of(at.strides)
+    width = jnp.asarray(steps, march.step.dtype) * march.step
+    begin = front(march, at, number * steps)
     return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, pipeline.volume)
 
 
@@ -222,7 +216,7 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, _, classification, compositing = pipeline
     at, _ = with_stride(pipeline, ray, at)
-    stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, classification)
+    sampler = RaySampler(ray, classification)
     after, alphas, color = at, [], None
     cut = pieces(pipeline, ray, at)
     for piece in cut:
@@ -234,8 +228,8 @@ def step(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
         after = add(pipeline, ray, after, piece, measured, color, alphas[-1], alone=len(cut) == 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    after = move(march, ray, stop(pipeline, after), transparent, stride)
-    if at.stride is None:  # a scan has as many steps as a ray may take
+    after = move(march, ray, stop(pipeline, after), transparent, steps_of(at.strides))
+    if at.strides is None:  # a scan has as many steps as a ray may take
         return after
     return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
 
@@ -251,8 +245,8 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
     if at.stats is not None:
         details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
-        if at.stats.error is not None:
-            details = details._replace(error=jnp.where(valid, jnp.sqrt(at.stats.error), jnp.nan))
+    if at.strides is not None and at.strides.error is not None:
+        details = details._replace(error=jnp.where(valid, jnp.sqrt(at.strides.error), jnp.nan))
     if isinstance(pipeline.compositing, Selection):
         details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)
@@ -355,7 +349,6 @@ def render_ray_reference(
     origin, direction = _vector("origin", origin), _vector("direction", direction)
     column, row = pixel
     pixel = jnp.asarray(column, jnp.int32), jnp.asarray(row, jnp.int32)
-    march = march.divided()
     length, space = steps_across(volume, march), march.locate(volume)
     line = Line(apart(origin), apart(direction), pixel)
     ray = invalid(enter(space, *line), has_fault(volume, march, transfer, mode, lighting))
@@ -365,8 +358,9 @@ def render_ray_reference(
         transfer, march = mode.marched(transfer, march, volume)
         unlit = classification_of(transfer, volume, integrated=march.integrates)
         pipeline = Pipeline(march, volume, unlit, mode)
-    windows = Windows.of(volume) if march.looks_ahead else None
-    pipeline = pipeline._replace(march=march.prepared(space, windows, partial(mode.variation, transfer)))
+    windows = None if strides.stride_control(march) is None else Windows.of(volume)
+    march = strides.predicted(march, space, windows, partial(mode.variation, transfer))
+    pipeline = pipeline._replace(march=march)
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(pipeline, ray, at), None

@@ -29,6 +29,7 @@ from ..engine.scene import Scene
 from ..engine.tiling import Tiling
 from ..lighting.shading import Lighting
 from ..march.march import March
+from ..march.strides import stride_control
 from ..march.transforms import SpaceLeaping, ToroidalMap
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
@@ -226,7 +227,7 @@ def _scene_of(
     volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
-    return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
+    return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
 
 
 def _marched(scene: Scene) -> Scene:
@@ -435,7 +436,7 @@ def _check_owned(scene: Scene, method: Method) -> None:
         f"method={method!r}": method != "overlap",
         f"compositing by {type(mode).__name__}, which does not join parts of a ray": not mode.joins,
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
-        "AdaptiveSampling, whose strides depend on what lies in front": march.strides_vary,
+        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
         "gradients": is_traced(scene),
     }

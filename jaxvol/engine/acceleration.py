@@ -11,6 +11,7 @@ from .._util.checks import check_answer
 from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.march import EmptySpaceIndex, March, View
+from ..march.strides import stride_control
 from ..reference import Pipeline, end
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Transfer, classification_of
@@ -47,7 +48,7 @@ class VolumeAcceleration(eqx.Module):
             words_of(volume) if packs else None,
             slopes_of(volume) if slopes else None,
             Blocks.of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
-            Windows.of(volume) if march.looks_ahead else None,
+            None if stride_control(march) is None else Windows.of(volume),
         )
 
     def packed(self, scene: Scene) -> Scene:

@@ -177,7 +177,7 @@ def march_batch(
     return (jax.tree.map(scatter, at, here), visited), groups(job.alive(here))
 
 
-def with_fields(at: Progress, **changes: Array) -> Progress:
+def with_fields(at: Progress, **changes: PyTree) -> Progress:
     """`at` with other values for these fields, of many rays (`dataclasses.replace` would check the shapes of
     one)."""
     return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
@@ -185,9 +185,9 @@ def with_fields(at: Progress, **changes: Array) -> Progress:
 
 def _staying(here: Progress, after: Progress) -> Progress:
     """`after`, but where rays were finished before, where they are."""
-    names = [name for name in ("index", "offset", "shift", "stride") if getattr(here, name) is not None]
-    moved = {n: jnp.where(here.finished, getattr(here, n), getattr(after, n)) for n in names}
-    return with_fields(after, **moved)
+    names = "index", "offset", "shift", "strides"
+    there, moved = ({n: getattr(at, n) for n in names if getattr(at, n) is not None} for at in (here, after))
+    return with_fields(after, **jax.tree.map(partial(jnp.where, here.finished), there, moved))
 
 
 def over_transparent(pipeline: Pipeline, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
@@ -209,7 +209,7 @@ def _to_next_cell(
     steps = None if job.empty_space is None else _leap(job, job.empty_space, beam, rays, at)
     if steps is not None and range_ is not None:  # behind it, nothing is known
         steps = jnp.minimum(steps, jnp.maximum(range_.until - at.index, 0))
-    if at.stride is not None:
+    if at.strides is not None:
         ahead = jnp.zeros_like(at.index) if steps is None else steps
         # in memory, since all that computes with cells would decide it again
         at, found = in_memory(always(at), jax.vmap(partial(with_stride, pipeline)), rays, at, ahead)

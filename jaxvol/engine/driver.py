@@ -35,7 +35,7 @@ def render_scene(
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
     tiling = Tiling.of_backend(mesh_of(devices)) if tiling is None else tiling
     check_not_sharded(tiling.devices, scene)
-    scene = strong(scene._replace(march=scene.march.divided()))
+    scene = strong(scene)
     volume, transfer, _, march, _, lighting = scene
     how = adjoint_of(adjoint, volume, march)
     if lighting is not None:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.compositing import Outputs
 from ..lighting.shading import lit_classification
+from ..march import strides
 from ..reference import Pipeline, begin, end, has_fault, step
 from ..scene.rendering import Rendering
 from ..scene.space import Ray, Space
@@ -73,7 +74,7 @@ def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, 
     volume, transfer, _, march, compositing, lighting = scene
     space = march.locate(volume)
     lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
-    march = march.prepared(space, acceleration.windows, partial(compositing.variation, transfer))
+    march = strides.predicted(march, space, acceleration.windows, partial(compositing.variation, transfer))
     return space, Pipeline(march, volume, lit, compositing)
 
 

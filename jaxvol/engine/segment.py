@@ -19,7 +19,8 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Scalar, Vec3
 from ..compositing.selection import Selection
-from ..march.march import RUN, Cell, March
+from ..march.march import Cell, March
+from ..march.strides import RUN, steps_of
 from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
@@ -33,7 +34,7 @@ from .visible_samples import shaded_colors
 def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
     """Steps to where the next cells of rays begin: (cells,), or (cells, rays) where strides differ."""
     number = jnp.arange(cells, dtype=at.index.dtype)
-    return number if at.stride is None else number[:, None] * at.stride[None]
+    return number if at.strides is None else number[:, None] * at.strides.steps[None]
 
 
 class Samples(NamedTuple):
@@ -94,13 +95,11 @@ def march_segment(
     at the end of a run; or to `until`, where that is given. `regular`: no ray has a shift or such an end
     ahead of it."""
     march, classification = pipeline.march, pipeline.classification
-    number = tiling.cells if at.stride is None else min(tiling.cells, RUN)
+    number = tiling.cells if at.strides is None else min(tiling.cells, RUN)
     every = samples = _sampled(pipeline, number, ray, at)
     taken: Int[Array, " rays"] | None = None
     shifted = None
-    # otherwise runs begin and end with segments
-    partly = at.phase is not None or RUN % number > 0
-    if not regular or (at.stride is not None and partly):
+    if not regular or (at.strides is not None and at.strides.ends_within(number)):
         fewer = in_memory(always(at), partial(_taken, march), at, every.opacity, until)
         (taken, shifted), samples = fewer, _without(every, fewer[0], ray)
     colors: list[Vec3] | list[None]
@@ -137,8 +136,7 @@ def march_segment(
     order = jnp.arange(number, dtype=at.index.dtype)
     after, _ = jax.lax.scan(next_, at, (order, cells), unroll=number)
     steps = jnp.full_like(at.index, number) if taken is None else taken
-    steps = steps if at.stride is None else steps * at.stride
-    return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples
+    return jax.vmap(partial(move, march))(ray, after, shifted, steps * steps_of(at.strides)), samples
 
 
 def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples:
@@ -183,8 +181,8 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
 def always(at: Progress) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
     # In a pass there are at most some `march.most_samples` / cells segments, in each of which an index grows
-    # by at most cells * `longest_stride`, finished or not: with 2**24 samples and strides of 64 it stays
-    # below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
+    # by at most cells times the longest stride, finished or not: with 2**24 samples and strides of 64 it
+    # stays below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
     return at.index[0] >= 0
 
 
@@ -247,12 +245,9 @@ def _taken(
     left = march.most_samples - at.index
     if until is not None:
         left = jnp.clip(until - at.index, 0, left)
-    number = jnp.arange(opacity[0].shape[0], dtype=at.index.dtype)
-    if at.stride is not None:
-        run, phase = RUN * at.stride, 0 if at.phase is None else at.phase
-        steps = jnp.minimum(left, run - ((at.index + phase) & (run - 1)))
-        left = jnp.sum(begins(at, number.size) < steps[None], axis=0, dtype=left.dtype)
-    cells = number.size
+    if at.strides is not None:
+        left = at.strides.cells_left(at.index, left)
+    cells = opacity[0].shape[0]
     # cell by cell, back to front: a reduction over all of them would be a loop of its own
     first = jnp.full_like(left, cells + 1)
     for k in reversed(range(cells)):

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.compositing import Outputs, Weighting
 from ..march.march import EmptySpaceIndex
+from ..march.strides import steps_of
 from ..reference import Pipeline, Progress, begin, is_sample, measure, move, opacity, pieces, with_stride
 from ..scene.space import Ray
 from ..xla.compaction import in_front
@@ -108,11 +109,10 @@ def _past_first_cell(pipeline: Pipeline, ray: Ray, at: Progress) -> Progress:
 
     def one(ray: Ray, at: Progress) -> Progress:
         begun, _ = with_stride(pipeline, ray, at)
-        stride = 1 if begun.stride is None else begun.stride
         cut = pieces(pipeline, ray, begun)
         alphas = [opacity(pipeline, ray, piece, measure(pipeline, ray, piece)) for piece in cut]
         moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
-        moved = move(march, ray, begun, jnp.ones((), bool), stride)
+        moved = move(march, ray, begun, jnp.ones((), bool), steps_of(begun.strides))
         if moved.stats is not None:
             taken = jnp.sum(jnp.stack([is_sample(march, ray, piece, alone=len(cut) == 1) for piece in cut]))
             samples = moved.stats.samples + taken.astype(moved.stats.samples.dtype)
