@@ -20,7 +20,9 @@ from ._util.vec3 import Scalar, Vec3
 from .compositing.compositing import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
+from .march import strides
 from .march.march import Cell, March
+from .march.strides import Strides, steps_of
 from .scene.camera import Camera
 from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
@@ -51,13 +53,15 @@ class Scene(NamedTuple):
     classification: Classification = cast(Classification, None)
 
     def prepared(self, windows: Windows | None = None) -> "Scene":
-        """The scene with what is computed once for each image. `windows`: of the volume, where the march
-        `looks_ahead`."""
+        """The scene with what is computed once for each image. `windows`: of the volume, where a transform
+        chooses strides."""
         space, march = self.march.locate(self.volume), self.march
         lit = lit_classification(
             self.volume, self.transfer, space, self.lighting, integrated=march.integrates
         )
-        march = march.prepared(space, windows, partial(self.compositing.variation, self.transfer))
+        if windows is not None:
+            variation = partial(self.compositing.variation, self.transfer)
+            march = strides.predicted(march, space, windows, variation)
         return self._replace(march=march, space=space, classification=lit)
 
     @property
@@ -151,9 +155,8 @@ class Progress(eqx.Module):
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
     the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
-    first transparent cell, and is 0 from then on. `stride`: steps of each cell of the current run, which ends
-    at a multiple of RUN of them, counted from `phase` steps before the ray's first cell. What is not asked
-    for, or not needed, is None.
+    first transparent cell, and is 0 from then on. What is not asked for, or not needed, is None: `strides`
+    where all cells are one step long.
     """
 
     index: Int[Array, ""]
@@ -162,60 +165,53 @@ class Progress(eqx.Module):
     stats: "SampleStats | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
-    stride: Int[Array, ""] | None = None
-    phase: Int[Array, ""] | None = None
+    strides: Strides | None = None
 
 
 class SampleStats(eqx.Module):
-    """What `Rendering.samples` and `Rendering.aligned` report, and the square of `Rendering.error`."""
+    """What `Rendering.samples` and `Rendering.aligned` report."""
 
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
-    error: Scalar | None
 
 
 def begin(scene: Scene, ray: Ray, outputs: Outputs | None = "all") -> Progress:
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
     march, compositing = scene.march, scene.compositing
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
-    count, strides = jnp.zeros(ray.length.shape, jnp.int32), march.strides_vary
+    count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
         index=count,
         offset=march.start(ray),
         composite=compositing.begin(zero, outputs),
-        stats=SampleStats(count, no, zero if strides else None) if outputs == "all" else None,
+        stats=SampleStats(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
-        stride=count + 1 if strides else None,
-        phase=march.phase(ray) if strides else None,
+        strides=strides.begin(march, ray, estimate=outputs == "all"),
     )
 
 
 def with_stride(
-    scene: Scene, ray: Ray, at: Progress, steps: Int[Array, ""] | int = 0
+    scene: Scene, ray: Ray, at: Progress, ahead: Int[Array, ""] | int = 0
 ) -> tuple[Progress, Int[Array, ""] | int]:
-    """The ray, with the stride of the cells that begin so many steps ahead of it, up to which all is
-    transparent; and the steps to where the first of them begins."""
-    if at.stride is None:
-        return at, steps
-    transmittance = scene.compositing.transmittance(at.composite)
-    ahead = scene.march.strides(ray, at.index, at.stride, at.index + steps, transmittance, at.phase)
-    leaves = (steps > 0) & (front(scene.march, at, steps) >= ray.length)  # all the way
-    begin, stride = jnp.where(leaves, steps, ahead.begin - at.index), jnp.where(leaves, 1, ahead.stride)
-    stats = at.stats
-    if stats is not None:
-        assert stats.error is not None
-        ended = leaves | at.finished | (ray.length <= 0) | (at.index >= scene.march.most_samples)
-        error = jnp.where(ended, 0, ahead.error)
-        stats = replace(stats, error=stats.error + error**2)
-    return replace(at, stride=stride, stats=stats), begin
+    """The ray, with the stride of the run that holds the step `ahead`, up to which all is transparent; and
+    the steps to where the next cell begins."""
+    if at.strides is None:
+        return at, ahead
+    march, transmittance = scene.march, scene.compositing.transmittance(at.composite)
+    leaves = (ahead > 0) & (front(march, at, ahead) >= ray.length)
+    finished = at.finished | (ray.length <= 0) | (at.index >= march.most_samples)
+    chosen, ahead = at.strides.next(
+        march, ray, at.index, ahead, transmittance, leaves=leaves, finished=finished
+    )
+    return replace(at, strides=chosen), ahead
 
 
 def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
     """The pieces of the ray's next cell, or the one so many cells behind it in its run."""
-    march, stride = scene.march, 1 if at.stride is None else at.stride
-    width = jnp.asarray(stride, march.step.dtype) * march.step
-    begin = front(march, at, number * stride)
+    march, steps = scene.march, steps_of(at.strides)
+    width = jnp.asarray(steps, march.step.dtype) * march.step
+    begin = front(march, at, number * steps)
     return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
@@ -249,12 +245,12 @@ def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     return 2 * t / (1 + t)
 
 
-def is_sample(march: March, ray: Ray, piece: Cell, *, alone: bool) -> Bool[Array, ""]:
-    """Whether a piece counts as a sample. `alone`: cells are never divided; otherwise some pieces of those
-    that are not have width 0."""
+def is_sample(march: March, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
+    """Whether a piece counts as a sample. `divided`: transforms divide cells, so that pieces may have
+    width 0."""
     before_exit = march.sample(piece) < ray.length
-    # not where it is known: it would take 15 % of a frame whose last cells are cut
-    return before_exit if alone else before_exit & (piece.width > 0)
+    # not in general: it would take 15 % of a frame whose last cells are cut
+    return before_exit & (piece.width > 0) if divided else before_exit
 
 
 def add(
@@ -266,12 +262,12 @@ def add(
     color: Vec3 | None,
     alpha: Scalar,
     *,
-    alone: bool,
+    divided: bool,
 ) -> Progress:
     """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: of `Fragment`.
-    `alone`: of `is_sample`."""
+    `divided`: of `is_sample`."""
     march, compositing = scene.march, scene.compositing
-    depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece, alone=alone)
+    depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece, divided=divided)
     alpha = jnp.where(at.finished, 0, alpha)
     fragment = Fragment(alpha, depth, piece, measured, color, taken & ray.contains(depth))
     stats = at.stats
@@ -323,8 +319,8 @@ def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
     if at.stats is not None:
         details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
-        if at.stats.error is not None:
-            details = details._replace(error=jnp.where(valid, jnp.sqrt(at.stats.error), jnp.nan))
+    if at.strides is not None and at.strides.error is not None:
+        details = details._replace(error=jnp.where(valid, jnp.sqrt(at.strides.error), jnp.nan))
     if isinstance(scene.compositing, Selection):
         details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)

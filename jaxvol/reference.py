@@ -15,6 +15,7 @@ from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting
 from .march.march import March
+from .march.strides import steps_of, stride_control
 from .ray import (
     Progress,
     Scene,
@@ -70,13 +71,12 @@ def render_ray_reference(
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
-    march = march.divided()
     scene = Scene(volume, transfer, None, march, compositing_of(compositing), lighting)
     length, shown = steps_across(volume, march), scene.prepared()
     column, row = (jnp.asarray(number, jnp.int32) for number in pixel)
     line = Line(apart(_vector("origin", origin)), apart(_vector("direction", direction)), (column, row))
     ray = invalid(enter(shown.space, *line), scene.has_fault)
-    marched = scene.marched.prepared(Windows.of(volume) if march.looks_ahead else None)
+    marched = scene.marched.prepared(None if stride_control(march) is None else Windows.of(volume))
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(marched, ray, at), None
@@ -90,7 +90,7 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, compositing = scene.march, scene.compositing
     at, _ = with_stride(scene, ray, at)
-    stride, sampler = 1 if at.stride is None else at.stride, RaySampler(ray, scene.classification)
+    sampler = RaySampler(ray, scene.classification)
     after, alphas, color = at, [], None
     cut = pieces(scene, ray, at)
     for piece in cut:
@@ -100,10 +100,10 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
             transmittance = compositing.transmittance(after.composite)
             classified = scene.classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
-        after = add(scene, ray, after, piece, measured, color, alphas[-1], alone=len(cut) == 1)
+        after = add(scene, ray, after, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    after = move(march, ray, stop(scene, after), transparent, stride)
-    if at.stride is None:  # a scan has as many steps as a ray may take
+    after = move(march, ray, stop(scene, after), transparent, steps_of(at.strides))
+    if at.strides is None:  # a scan has as many steps as a ray may take
         return after
     return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
 

@@ -11,16 +11,13 @@ from jaxtyping import Array, Float, Int
 from ._util.checks import Arrayable, described, finite_array, require
 from .compositing.compositing import Compositing
 from .compositing.modes import Mode, compositing_of
-from .engine.adjoints import Adjoint
 from .engine.devices import Devices
-from .engine.driver import Asked, render_scene
-from .engine.rays import OwnRays
-from .engine.scene import Scene
+from .engine.image import Adjoint, RenderOutputs, render_scene
 from .lighting.shading import Lighting
 from .march.march import March
 from .planning import plan
-from .ray import check_arguments
-from .scene.camera import Camera
+from .ray import Scene, check_arguments
+from .scene.camera import Camera, GivenRays
 from .scene.rendering import Rendering
 from .scene.transfer import Transfer
 from .scene.volume import Volume
@@ -40,7 +37,7 @@ def render(
     tolerance: float | Any | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
-    outputs: Asked | Any = "all",
+    outputs: RenderOutputs | Any = "all",
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
@@ -125,7 +122,7 @@ def render_rays(
     pixels: Arrayable | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
-    outputs: Asked | Any = "all",
+    outputs: RenderOutputs | Any = "all",
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
@@ -159,7 +156,7 @@ def render_rays(
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
-    source = OwnRays(origins, directions, _pixels(pixels, origins), first)
+    source = GivenRays(origins, directions, _pixels(pixels, origins), first)
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
     return render_scene(scene, outputs, adjoint, devices=devices)
 

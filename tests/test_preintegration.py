@@ -8,10 +8,10 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.piecewise_means import mean_by_rows, mean_by_spans, span_rows
-from jaxvol.engine.driver import render_scene
-from jaxvol.engine.scene import Scene
+from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.march.march import Cell
+from jaxvol.ray import Scene
 from jaxvol.scene.transfer import Transfer
 
 from . import oracle

@@ -15,12 +15,11 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.memory import give_back
 from ..engine import devices
-from ..engine.batch import CellRange
-from ..engine.image import RenderOptions
-from ..engine.scene import Scene
+from ..engine.tiling import RenderOptions
+from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..march.transforms import ToroidalMap
-from ..ray import Progress
+from ..ray import Progress, Scene
 from ..scene.camera import Camera
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import BrickReport

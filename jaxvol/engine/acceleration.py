@@ -19,6 +19,7 @@ from .._util.checks import check_answer
 from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.march import EmptySpaceIndex, March, View
+from ..march.strides import stride_control
 from ..ray import Scene, end
 from ..scene.camera import GivenRays
 from ..scene.occupancy import Blocks
@@ -39,8 +40,8 @@ LIMIT = 2**30
 
 class VolumeAcceleration(eqx.Module):
     """What depends on the voxels alone: a packed copy for fetching, the slopes of nodes, the ranges of
-    blocks, and how values vary around them; None where the image has no use for it. Made once for each array of
-    voxels."""
+    blocks, and how values vary around them; None where the image has no use for it. Made once for each array
+    of voxels."""
 
     words: UInt32[Array, " voxels"] | None
     slopes: UInt32[Array, " voxels"] | None
@@ -60,7 +61,7 @@ class VolumeAcceleration(eqx.Module):
             words_of(volume) if packs else None,
             slopes_of(volume) if slopes else None,
             Blocks.of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
-            Windows.of(volume) if march.looks_ahead else None,
+            None if stride_control(march) is None else Windows.of(volume),
         )
 
     def packed(self, scene: Scene) -> Scene:

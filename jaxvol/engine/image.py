@@ -55,7 +55,7 @@ def render_scene(
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
     tiling = Tiling.of_backend(mesh_of(devices)) if tiling is None else tiling
     check_not_sharded(tiling.devices, scene)
-    scene = strong(scene._replace(march=scene.march.divided()))
+    scene = strong(scene)
     volume, march, lighting = scene.volume, scene.march, scene.lighting
     steps = None
     if adjoint == "direct":

@@ -14,7 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.checks import all_finite
 from ..march.beams import Box
@@ -169,7 +169,9 @@ class _GivenRayTiles(RayTiles):
     def rays(self, source: GivenRays, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
-            source = GivenRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
+            source = GivenRays(
+                *(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions))
+            )
         size = self.tiling.rays_per_beam
         number = (self.beams(tile)[:, None] * size + jnp.arange(size)[None]).reshape(-1, self.tiling.group)
         known = jnp.minimum(number, max(count - 1, 0))

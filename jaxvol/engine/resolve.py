@@ -12,17 +12,15 @@ from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar
 from ..compositing.selection import Selection
-from ..ray import resolve
+from ..ray import Scene, resolve
 from ..scene.space import Line
 from ..xla.compaction import in_front, in_place
 from ..xla.trees import PyTree
 from . import devices
 from .acceleration import VolumeAcceleration
 from .devices import on_devices
-from .image import RenderOptions, fault_of, pipeline_of
 from .rays import lines_at
-from .scene import Scene
-from .tiling import Tiling
+from .tiling import RenderOptions, Tiling
 
 
 NUMBERS = 5
@@ -36,13 +34,11 @@ def resolve_pixels(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
     """Pixels, their depths, and their normals where these are asked for, from what the march found."""
-    scene = acceleration.packed(scene)
-    space, pipeline = pipeline_of(scene, acceleration)
-    mode = scene.compositing
+    prepared, mode = acceleration.packed(scene).prepared(), scene.compositing
     with_normal = isinstance(mode, Selection) and mode.has_normal and options.outputs == "all"
 
     def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, " numbers"]:
-        pixel = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)
+        pixel = resolve(prepared, line, rgba, depth, selected)
         normal = [pixel.normal] if with_normal and pixel.normal is not None else []
         return jnp.concatenate([pixel.rgba, pixel.depth[None], *normal])
 
@@ -50,7 +46,7 @@ def resolve_pixels(
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
     resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal)
-    return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
+    return resolved * jnp.where(scene.has_fault, jnp.nan, 1).astype(resolved.dtype)
 
 
 resolve_image = on_devices("whole")(resolve_pixels)

@@ -17,7 +17,7 @@ from .._util.checks import Arrayable, all_finite, described, flag, integer, numb
 from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
-from ..engine.packing import with_words, words_of
+from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
 from ..ray import check_arguments

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.engine.driver import render_scene
-from jaxvol.engine.scene import Scene
+from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import Tiling
+from jaxvol.ray import Scene
 from jaxvol.scene.transfer import Transfer
 
 from ..scenes import anisotropic_noise, around, slow, soft_transfer
