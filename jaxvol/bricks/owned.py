@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Int, Shaped
 from .._util.axes import permuted
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.brick_march import RayStates, begin_rays, finish_image, join_segments, march_brick
-from ..engine.devices import AXIS, DEALT, WHOLE
+from ..engine.devices import AXIS, REPLICATED, SHARDED
 from ..engine.tiling import RenderOptions
 from ..engine.wavefront import CellRange
 from ..ray import Scene
@@ -114,7 +114,7 @@ def _placed(stream: Stream, mesh: Mesh, turn: Turn) -> tuple[Array, Array, Array
             first[d], coming = turn.reading[d]
             part = coming.result()
         voxels.append(jax.device_put(part[None], device))
-    sharding = NamedSharding(mesh, DEALT)
+    sharding = NamedSharding(mesh, SHARDED)
     return (
         jnp.asarray(turn.bricks),
         jax.make_array_from_callback(first.shape, sharding, lambda index: first[index]),
@@ -129,8 +129,8 @@ def _on_each(mesh: Mesh, one: Any, *shares: PyTree, whole: bool = False) -> PyTr
         found = one(*jax.tree.map(lambda leaf: leaf[0], parts))
         return found if whole else jax.tree.map(lambda leaf: leaf[None], found)
 
-    out = WHOLE if whole else DEALT
-    return jax.shard_map(own, mesh=mesh, in_specs=DEALT, out_specs=out, check_vma=False)(*shares)
+    out = REPLICATED if whole else SHARDED
+    return jax.shard_map(own, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
 
 
 @compiled

@@ -36,7 +36,7 @@ class RayStates(eqx.Module):
     at: Progress
 
 
-@on_devices("dealt")
+@on_devices("sharded")
 def begin_rays(scene: Scene, options: RenderOptions) -> RayStates:
     """All rays at their entries. Of the volume, no voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), scene.has_fault
@@ -50,7 +50,7 @@ def begin_rays(scene: Scene, options: RenderOptions) -> RayStates:
     return tiles.map(one)
 
 
-@on_devices("dealt", dealt=("states", "ranges"))
+@on_devices("sharded", sharded=("states", "ranges"))
 def march_brick(
     scene: Scene,
     options: RenderOptions,
@@ -98,7 +98,7 @@ def opaque(scene: Scene, at: Progress) -> Bool[Array, "groups rays"]:
     return vmap_rays(partial(stopped, scene))(at.composite)
 
 
-@on_devices("whole", dealt=("before", "after"))
+@on_devices("replicated", sharded=("before", "after"))
 def resolve_brick(
     scene: Scene,
     options: RenderOptions,
@@ -152,7 +152,7 @@ def join_segments(scene: Scene, parts: RayStates) -> RayStates:
     return RayStates(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(jax.vmap(vmap_rays(join)), each))
 
 
-@on_devices("whole", dealt=("states",))
+@on_devices("replicated", sharded=("states",))
 def finish_image(scene: Scene, options: RenderOptions, states: RayStates) -> Rendering:
     """The image of rays that have passed all bricks."""
     states = RayStates(states.rays, _passed(scene.march, states.at))
@@ -200,7 +200,7 @@ def begin_vjp(
     return sums, image.tiles.map(one, *jax.tree.map(image.tiles.disassemble, (rendering, cotangent)))
 
 
-@on_devices("both", dealt=("replayed", "ranges"))
+@on_devices("both", sharded=("replayed", "ranges"))
 def vjp_of_brick(
     scene: Scene,
     perturbed: Any,
@@ -226,7 +226,7 @@ def vjp_of_brick(
     return image.tiles.scan(one, sums, replayed, ranges)
 
 
-@on_devices("whole", dealt=("replayed",))
+@on_devices("replicated", sharded=("replayed",))
 def finish_vjp(
     scene: Scene,
     perturbed: Any,

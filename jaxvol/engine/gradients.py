@@ -192,7 +192,7 @@ def _of_voxels(scene: Scene, perturbed: Any) -> bool:
     return eqx.is_inexact_array(scene.volume.data) and perturbed.volume.data
 
 
-@on_devices("whole", dealt=("ranges",))
+@on_devices("replicated", sharded=("ranges",))
 def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,

@@ -139,7 +139,7 @@ def march_image(
     return _over_tiles(prepared, tiles, marched)
 
 
-@on_devices("whole")
+@on_devices("replicated")
 def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
     """The image, by `options.steps` steps of the reference engine along each ray, which JAX can
     differentiate."""

@@ -1,7 +1,7 @@
 """How is an image divided into tiles, and a tile into beams and groups of rays?
 
 Only one tile's rays are in memory beside the finished pixels, however large the image; or one on each device,
-to which beams are dealt out in turn (`devices`). They are arrays (groups, rays in a group), in which equally
+between which beams are sharded (`devices`). They are arrays (groups, rays in a group), in which equally
 many groups in a row make up a beam.
 """
 
@@ -87,13 +87,13 @@ class RayTiles(eqx.Module):
         """From (tiles, groups, rays in a group, *rest) of each device to (beams, rays of a beam, *rest) of
         all, in their order."""
         beams = leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
-        return devices.collected(self.tiling.devices, beams)
+        return devices.gathered(self.tiling.devices, beams)
 
     def of_tiles(self, beams: Array) -> Array:
         """The inverse of `of_beams`; 0 for beams that are missing."""
         mesh, rest, count = self.tiling.devices, beams.shape[2:], self.number * self.beam_count
         missing = count * devices.number_of(mesh) - beams.shape[0]
-        beams = devices.mine(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
+        beams = devices.own_share(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 

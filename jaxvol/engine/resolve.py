@@ -83,7 +83,7 @@ def of_visible(
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
     starts = jnp.arange(0, chosen.size, size, dtype=jnp.int32) if size > 0 else chosen
-    own = devices.mine(mesh, starts)
+    own = devices.own_share(mesh, starts)
     pixels = jax.lax.map(chunk, own) if size > 0 else computed(own)
-    pixels = devices.collected(mesh, pixels).reshape(-1, numbers)
+    pixels = devices.gathered(mesh, pixels).reshape(-1, numbers)
     return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)

@@ -30,7 +30,7 @@ class Tiling(NamedTuple):
     - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
       many steps as the slowest ray among them.
     - `chunk`: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
-    - `devices`: to which beams are dealt out, a mesh of one axis; None where JAX decides.
+    - `devices`: between which beams are sharded, a mesh of one axis; None where JAX decides.
     """
 
     cells: int = 8
