@@ -267,13 +267,13 @@ def add(
     """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: of `Fragment`.
     `divided`: of `is_sample`."""
     march, compositing = scene.march, scene.compositing
-    depth, taken = march.sample(piece), ~at.finished & is_sample(march, ray, piece, divided=divided)
+    depth, counts = march.sample(piece), ~at.finished & is_sample(march, ray, piece, divided=divided)
     alpha = jnp.where(at.finished, 0, alpha)
-    fragment = Fragment(alpha, depth, piece, measured, color, taken & ray.contains(depth))
+    fragment = Fragment(alpha, depth, piece, measured, color, counts & ray.contains(depth))
     stats = at.stats
     if stats is not None:
         shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
-        samples = stats.samples + taken.astype(stats.samples.dtype)
+        samples = stats.samples + counts.astype(stats.samples.dtype)
         stats = replace(stats, samples=samples, aligned=stats.aligned | (piece.cut & shows))
     composite = compositing.add(at.composite, fragment)
     check_answer(compositing, "add", composite, at.composite)

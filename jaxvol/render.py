@@ -47,7 +47,7 @@ def render(
 
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
-    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image,
+    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called for each image,
       without transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
       `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render `found.volume` by
       `found.march` with `found.lighting`.
@@ -76,7 +76,7 @@ def render(
     **Returns:** a `Rendering` with leading shape (height, width), in JAX's default float type. If a number on
     which all pixels depend is NaN or infinite (an entry of a transfer function whose fit diverged, say), all
     of the image is NaN, and so is its gradient. A voxel that is NaN makes those pixels NaN whose rays meet
-    it, or leave the volume beside it.
+    it, or leave the volume next to it.
 
     `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so for
     gradients, as a loop would. `"direct"` renders them side by side, and so does `"forward"` where the image

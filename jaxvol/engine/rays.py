@@ -1,8 +1,8 @@
 """How is an image divided into tiles, and a tile into beams and groups of rays?
 
-Only one tile's rays are in memory beside the finished pixels, however large the image; or one on each device,
-between which beams are sharded (`devices`). They are arrays (groups, rays in a group), in which equally
-many groups in a row make up a beam.
+Besides the finished pixels, only one tile's rays are in memory, however large the image; or one on each
+device, between which beams are sharded (`devices`). They are arrays (groups, rays in a group), in which
+equally many groups in a row make up a beam.
 """
 
 import math
@@ -65,7 +65,7 @@ class RayTiles(eqx.Module):
     def scan(
         self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
     ) -> tuple[PyTree, PyTree]:
-        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what it returns beside. What it adds to
+        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what else it returns. What it adds to
         `sums` is summed over all devices."""
         mesh, every = self.tiling.devices, (jnp.arange(self.number), *each)
         if mesh is None:

@@ -294,8 +294,8 @@ def _past_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
     moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
     moved = move(march, ray, begun, jnp.ones((), bool), steps_of(begun.strides))
     if moved.stats is not None:
-        taken = jnp.sum(jnp.stack([is_sample(march, ray, piece, divided=len(cut) > 1) for piece in cut]))
-        samples = moved.stats.samples + taken.astype(moved.stats.samples.dtype)
+        count = jnp.sum(jnp.stack([is_sample(march, ray, piece, divided=len(cut) > 1) for piece in cut]))
+        samples = moved.stats.samples + count.astype(moved.stats.samples.dtype)
         moved = eqx.tree_at(lambda moved: moved.stats.samples, moved, samples)
     return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
 

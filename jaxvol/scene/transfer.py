@@ -1,6 +1,6 @@
 """Which colour and extinction has this value?
 
-A transfer function answers three questions: what it reads at a place beside the value (`attributes`), how
+A transfer function answers three questions: what it reads at a place besides the value (`attributes`), how
 that becomes colour and extinction (`classifier`), and how great the extinction can be in a block of the
 volume (`majorant`). Only the second has no default.
 """
@@ -52,7 +52,7 @@ class Classification(NamedTuple):
 
     measure: Callable[[Vec3], Measured]
     attributes: Callable[[Vec3], Measured]
-    """What is measured beside the value."""
+    """What is measured besides the value."""
     classify: Classify
     search: Callable[[Measured], Measured] | None = None
     """`Transfer.search`; what it finds is appended to the measured values."""
@@ -97,7 +97,7 @@ class Transfer(eqx.Module):
         once, outside the march's loop."""
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """What is read from the volume at a grid coordinate beside the value; by default nothing."""
+        """What is read from the volume at a grid coordinate besides the value; by default nothing."""
         return ()
 
     @property
