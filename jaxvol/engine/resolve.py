@@ -49,7 +49,7 @@ def resolve_pixels(
     return resolved * jnp.where(scene.has_fault, jnp.nan, 1).astype(resolved.dtype)
 
 
-resolve_image = on_devices("whole")(resolve_pixels)
+resolve_image = on_devices("replicated")(resolve_pixels)
 
 
 def of_visible(

@@ -100,8 +100,8 @@ def march_segment(
     kept: Int[Array, " rays"] | None = None
     shifts = None
     if not regular or (at.strides is not None and at.strides.ends_within(number)):
-        kept, shifts = in_memory(always(at), partial(_kept, march), at, every.opacity, until)
-        samples = _truncated(every, kept, ray)
+        fewer = in_memory(always(at), partial(_kept, march), at, every.opacity, until)
+        (kept, shifts), samples = fewer, _truncated(every, fewer[0], ray)
     colors: list[Vec3] | list[None]
     values = [read[:1] for read in every.measured]
     if isinstance(scene.compositing, Selection):
