@@ -39,7 +39,7 @@ LEFT = 1e-4
 """Rays end where so little is left: 1/255, as in `speed`, would be the error of the most accurate images."""
 FINEST, LONGEST = 0.25, 4
 FINEST_OF = {1e-1: 4, 3e-2: 4, 1e-2: 4, 3e-3: 4, 1e-3: 8}
-"""By tolerance, into how many parts of a voxel the shortest cells divide it."""
+"""By tolerance, into how many parts of a voxel the shortest cells divide it; `LONGEST` counts voxels."""
 ADAPTIVE = "adaptive"
 FINER = 16
 ERRORS = (1e-2, 5e-3, 2e-3)
@@ -62,8 +62,8 @@ def march(scene: Scene, quadrature: str, step: float) -> jv.March:
 
 def adaptive(scene: Scene, tolerance: float) -> jv.March:
     plain = march(scene, "midpoint", 1)
-    sampling = jv.AdaptiveSampling(tolerance, LONGEST, FINEST_OF[tolerance])
-    return jv.March(plain.step, (*plain.transforms, sampling), plain.quadrature)
+    sampling = jv.AdaptiveSampling(tolerance, LONGEST * FINEST_OF[tolerance])
+    return jv.March(plain.step / FINEST_OF[tolerance], (*plain.transforms, sampling), plain.quadrature)
 
 
 def samples(scene: Scene, under: jv.March) -> float:

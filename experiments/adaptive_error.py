@@ -60,10 +60,10 @@ def measure(scene: Scene) -> dict[str, dict[str, Any]]:
     truth = np.asarray(jv.render(volume, transfer, camera, exact).image())
     found = {}
     for tolerance, finest in FINEST_OF.items():
-        sampling = jv.AdaptiveSampling(tolerance, LONGEST, finest)
+        sampling = jv.AdaptiveSampling(tolerance, LONGEST * finest)
         transforms = jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(OPACITY_LEFT), sampling
         rendering, jittered = (
-            jv.render(volume, transfer, camera, jv.March(step, (*jitter, *transforms), "midpoint"))
+            jv.render(volume, transfer, camera, jv.March(step / finest, (*jitter, *transforms), "midpoint"))
             for jitter in ((), (jv.EmptySpaceJitter(1),))
         )
         error = np.sqrt(np.mean((np.asarray(rendering.image()) - truth) ** 2, axis=-1))

@@ -29,13 +29,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.engine.driver import render_scene
-from jaxvol.engine.scene import Scene as EngineScene
+from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import Lighting, Phong
 from jaxvol.lighting.phong import PhongShading
 from jaxvol.lighting.shading import Shading, Surroundings
 from jaxvol.metrics import rmse
+from jaxvol.ray import Scene as EngineScene
 
 from . import common, marches, timing
 from .common import plt

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvol.bricks.cells import Turn
 from jaxvol.bricks.stream import Load, Stream
-from jaxvol.reference import Progress
+from jaxvol.ray import Progress
 from jaxvol.scene.space import Ray
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.xla.xla import OPTIONS
+from jaxvol.xla.compiling import OPTIONS
 
 from . import timing
 from .pareto_points import BASE, GRADIENTS, Setting

@@ -109,7 +109,9 @@ UNLIT: dict[str, Setting] = {
         for step in STEPS
     },
     **{
-        f"adaptive, tolerance {t:g}": Setting("adaptive", ours(jv.AdaptiveSampling(t, LONGEST, finest)))
+        f"adaptive, tolerance {t:g}": Setting(
+            "adaptive", ours(jv.AdaptiveSampling(t, LONGEST * finest), step=1 / finest)
+        )
         for t, finest in FINEST_OF.items()
     },
     **{

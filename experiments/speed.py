@@ -35,7 +35,7 @@ from matplotlib.lines import Line2D
 import jaxvol as jv
 from jaxvol.metrics import rmse
 from jaxvol.scene.occupancy import Blocks, Sums
-from jaxvol.xla.xla import OPTIONS
+from jaxvol.xla.compiling import OPTIONS
 
 from . import common, fresh, marches, peer_vtk, timing
 from .common import plt

@@ -64,4 +64,4 @@ from .scene.rendering import Rendering as Rendering
 from .scene.transfer import TransferFunction as TransferFunction
 from .scene.transfer2d import TransferFunction2D as TransferFunction2D
 from .scene.volume import Field as Field, Volume as Volume
-from .xla.programs import keep_programs as keep_programs
+from .xla.persistent_cache import keep_programs as keep_programs

@@ -9,18 +9,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, require
-from .arguments import check_arguments
 from .compositing.compositing import Compositing
 from .compositing.modes import Mode, compositing_of
-from .engine.adjoints import Adjoint
 from .engine.devices import Devices
-from .engine.driver import Asked, render_scene
-from .engine.rays import OwnRays
-from .engine.scene import Scene
+from .engine.image import Adjoint, RenderOutputs, render_scene
 from .lighting.shading import Lighting
 from .march.march import March
 from .planning import plan
-from .scene.camera import Camera
+from .ray import Scene, check_arguments
+from .scene.camera import Camera, GivenRays
 from .scene.rendering import Rendering
 from .scene.transfer import Transfer
 from .scene.volume import Volume
@@ -40,7 +37,7 @@ def render(
     tolerance: float | Any | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
-    outputs: Asked | Any = "all",
+    outputs: RenderOutputs | Any = "all",
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
@@ -50,7 +47,7 @@ def render(
 
     - `volume`, `transfer`: what is there, and how it looks.
     - `camera`: makes one ray for each pixel.
-    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called anew for each image,
+    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called for each image,
       without transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
       `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render `found.volume` by
       `found.march` with `found.lighting`.
@@ -79,7 +76,7 @@ def render(
     **Returns:** a `Rendering` with leading shape (height, width), in JAX's default float type. If a number on
     which all pixels depend is NaN or infinite (an entry of a transfer function whose fit diverged, say), all
     of the image is NaN, and so is its gradient. A voxel that is NaN makes those pixels NaN whose rays meet
-    it, or leave the volume beside it.
+    it, or leave the volume next to it.
 
     `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so for
     gradients, as a loop would. `"direct"` renders them side by side, and so does `"forward"` where the image
@@ -125,7 +122,7 @@ def render_rays(
     pixels: Arrayable | None = None,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
-    outputs: Asked | Any = "all",
+    outputs: RenderOutputs | Any = "all",
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
@@ -159,7 +156,7 @@ def render_rays(
     directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
-    source = OwnRays(origins, directions, _pixels(pixels, origins), first)
+    source = GivenRays(origins, directions, _pixels(pixels, origins), first)
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
     return render_scene(scene, outputs, adjoint, devices=devices)
 

@@ -1,7 +1,7 @@
 """A transform that a traced number turns on or off, so that all subsets of transforms share one program.
 
 `switch(transform, on)` answers the seams that the transform overrides: as it does where `on` is true, and by
-the defaults elsewhere. (The longest stride and the subdivision of steps are static: as if it were on.)
+the defaults elsewhere.
 Programs of a march with it contain the transform whether it is on or not: that a transform which is not asked
 for costs nothing is for static tests to show.
 """
@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool
 
 import jaxvol as jv
 from jaxvol.march.march import EmptySpaceIndex
+from jaxvol.march.strides import StrideControl
 from jaxvol.scene.space import Space
 
 from .scenes import BOX, PLANE
@@ -115,17 +116,6 @@ def _empty_space(self, occupancy, view):
     return _Index(self.inner.empty_space(occupancy, view), self.on)
 
 
-def _prepared(self, march, space, windows, variation):
-    inner = self.inner.prepared(march, space, windows, variation)
-    return eqx.tree_at(lambda switch: switch.inner, self, inner)
-
-
-def _stride_error(self, ray, run):
-    error, tolerated = self.inner.stride_error(ray, run)
-    # what is known is allowed for strides of 1 alone
-    return either(self.on, (error, tolerated), (jnp.full_like(error, jnp.inf), jnp.zeros_like(error)))
-
-
 def _cut(self, cell, ray, volume):
     first, *others = self.inner.cut(cell, ray, volume)
     end = cell.front + cell.width
@@ -142,14 +132,12 @@ SEAMS = {
     "start": _start,
     "shift": _shift,
     "empty_space": _empty_space,
-    "prepared": _prepared,
-    "stride_error": _stride_error,
     "cut": _cut,
     "stop": _stop,
 }
 
 
-STATIC = "joins", "ends_at_exit", "longest_stride", "subdivision"
+STATIC = "joins", "ends_at_exit"
 
 
 @cache
@@ -159,9 +147,6 @@ def _class(kind: type[jv.Transform], part: str) -> type[_Switch]:
     members = {
         name: seam for name, seam in SEAMS.items() if getattr(kind, name) is not getattr(jv.Transform, name)
     }
-    for name in ("longest_stride", "subdivision"):
-        if getattr(kind, name) is not getattr(jv.Transform, name):
-            members[name] = property(lambda self, name=name: getattr(self.inner, name))
     # off, it cuts nothing, and so leaves joined what is; but it does not end cells at the exit
     members |= {"joins": kind.joins, "__annotations__": {}}
     return type(f"Switched{kind.__name__}{part}", (_Switch,), members)
@@ -172,6 +157,9 @@ def switch(transform: jv.Transform, on, part: str = "") -> jv.Transform:
     takes each class of transforms once."""
     if type(transform).locate is not jv.Transform.locate:
         raise ValueError("a space is static: compare marches with and without it.")
+    if isinstance(transform, StrideControl):  # no error is tolerated, so that cells are one step long
+        off = jnp.full_like(transform.tolerance, -1)
+        return eqx.tree_at(lambda of: of.tolerance, transform, either(on, transform.tolerance, off))
     return _class(type(transform), part)(transform, jnp.asarray(on, bool))
 
 

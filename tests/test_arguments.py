@@ -29,7 +29,18 @@ class Denser(jv.Volume):
         return 2 * super().value(coordinate)
 
 
+class Dimmed(jv.TransferFunction):
+    """Overrides what engines do not ask."""
+
+    def classifier(self):
+        return lambda measured: ((measured[0],) * 3, measured[0])
+
+
 BAD = {
+    "a transfer function of another class": (
+        lambda: jv.render(VOLUME, cast(Any, Dimmed)((0, 1), np.ones((2, 3)), (0, 1)), CAMERA, MARCH),
+        r"transfer must be a jaxvol TransferFunction itself; got its subclass Dimmed, .*Subclass .*Transfer ",
+    ),
     "a class": (lambda: jv.render(VOLUME, TRANSFER, CAMERA, jv.March), "got the class March"),
     "lights": (
         lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting=(LIGHT, LIGHT)),

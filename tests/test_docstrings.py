@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import jaxvol as jv
-from jaxvol import arguments
+from jaxvol import ray
 from jaxvol._util import checks
 
 from .reference import entries
@@ -20,7 +20,7 @@ ENTRIES = {
 }
 CHECKS = {
     name
-    for module in (checks, arguments)
+    for module in (checks, ray)
     for name, value in vars(module).items()
     if inspect.isfunction(value) and re.search(r"\braise\b", inspect.getsource(value))
 }

@@ -39,13 +39,13 @@ def _waves_truth(size: int) -> np.ndarray:
 def tolerances(tolerance: float, size: int) -> dict[str, float]:
     found = {}
     for finest in (1, 8):
-        image = waves_image(size, jv.AdaptiveSampling(tolerance, 8, finest))
+        image = waves_image(size, jv.AdaptiveSampling(tolerance, 8 * finest), finest)
         found[f"finest={finest}"] = rmse(image, _waves_truth(size)) / tolerance
     return found
 
 
 def tolerance_picture(tolerance: float, size: int) -> np.ndarray:
-    image = waves_image(size, jv.AdaptiveSampling(tolerance, 8, 1))
+    image = waves_image(size, jv.AdaptiveSampling(tolerance, 8))
     return signed(image - _waves_truth(size), 0.05)
 
 
@@ -60,8 +60,8 @@ TOLERANCE = Entry(
     judged="finest=1",
     limit=1.0,
     outcome="documented",
-    does="No cell is shorter than step / finest: below the error of an image of such cells the tolerance "
-    "means nothing. A larger finest moves the edge.",
+    does="No cell is shorter than a step, here a voxel / finest: below the error of an image of such cells "
+    "the tolerance means nothing. A shorter step moves the edge.",
     picture=tolerance_picture,
     shows="error of the image with finest=1, ± 0.05 from blue to red",
     pictured=(0.1, 1e-3),

@@ -11,6 +11,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, overlap_of
 from jaxvol.scene.space import enter
+from jaxvol.scene.transfer import classification_of
 
 from ..naive_bricks import each_at_once
 from .entry import Entry, colors
@@ -139,7 +140,7 @@ class Samples(NamedTuple):
 def samples(size: int) -> Samples:
     """All samples of each ray, as it meets them one after the other."""
     space, view = jv.March(FINE, (PROBE,)).locate(hidden()), across(size)
-    classification = PAINT.classification(hidden())
+    classification = classification_of(PAINT, hidden())
     depths = jnp.arange(0, float(space.diagonal), FINE)
 
     def ray(column: jax.Array, row: jax.Array) -> Any:

@@ -8,13 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..xla.xla import gather
-from .piecewise_linear import points_below
+from ..xla.memory import gather
+from .piecewise_linear import Range, points_below, run_maxima
 from .vec3 import Scalar
-
-
-Lines = tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]
-"""The first and the last of some lines, inclusive."""
 
 
 def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, "..."], Scalar]:
@@ -54,18 +50,7 @@ def interpolate_corners(row: tuple[Scalar, ...], along: Scalar, across: Scalar) 
     return mix(along, first, second)
 
 
-def lines_between(
-    lines: Float[Array, " n"], low: Float[Array, "*blocks"], high: Float[Array, "*blocks"]
-) -> Lines:
-    """The lines on which a function depends from `low` to `high`: those within, and the next ones around."""
-    low, high = low.astype(lines.dtype), high.astype(lines.dtype)
-    first = jnp.maximum(points_below(lines, low) - 1, 0)
-    # the first line at or above `high`; the second of two lines at `high`
-    last = jnp.maximum(points_below(lines, high, strictly=True), points_below(lines, high) - 1)
-    return first, jnp.minimum(last, lines.shape[0] - 1)
-
-
-def any_between(marked: Bool[Array, "n m"], rows: Lines, columns: Lines) -> Bool[Array, "*blocks"]:
+def any_between(marked: Bool[Array, "n m"], rows: Range, columns: Range) -> Bool[Array, "*blocks"]:
     """Whether any crossing of these lines is marked: a summed-area table."""
     table = jnp.pad(marked.astype(jnp.int32), ((1, 0), (1, 0)))
     table = jnp.cumsum(jnp.cumsum(table, axis=0, dtype=jnp.int32), axis=1, dtype=jnp.int32)
@@ -79,12 +64,12 @@ def any_between(marked: Bool[Array, "n m"], rows: Lines, columns: Lines) -> Bool
     return below(rows[1] + 1) > below(rows[0])
 
 
-def greatest_between(table: Float[Array, "n m"], rows: Lines, columns: Lines) -> Float[Array, "*blocks"]:
+def greatest_between(table: Float[Array, "n m"], rows: Range, columns: Range) -> Float[Array, "*blocks"]:
     """The greatest entry where these lines cross: four look-ups in tables of the maxima of all rectangles
     whose sides are powers of two."""
-    maxima = jnp.stack([jnp.stack(_runs(wide, 1)) for wide in _runs(table, 0)])
+    maxima = jnp.stack([jnp.stack(run_maxima(wide, 1)) for wide in run_maxima(table, 0)])
 
-    def starts(lines: Lines, levels: int) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], ...]]:
+    def starts(lines: Range, levels: int) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], ...]]:
         """Two runs that cover some lines: the level of their length, and where they begin."""
         first, last = lines
         level = sum(
@@ -96,15 +81,3 @@ def greatest_between(table: Float[Array, "n m"], rows: Lines, columns: Lines) ->
         starts(lines, maxima.shape[axis]) for axis, lines in enumerate((rows, columns))
     )
     return jnp.max(jnp.stack([maxima[wide, long, i, j] for i in begins for j in others]), axis=0)
-
-
-def _runs(table: Float[Array, "n m"], axis: int) -> list[Float[Array, "n m"]]:
-    """The maxima of 1, 2, 4, … entries from each one on along an axis."""
-    runs, length = [table], 1
-    while 2 * length <= table.shape[axis]:
-        later = jax.lax.slice_in_dim(runs[-1], length, None, axis=axis)
-        # the last ones are never asked for
-        rest = jax.lax.slice_in_dim(runs[-1], table.shape[axis] - length, None, axis=axis)
-        runs.append(jnp.maximum(runs[-1], jnp.concatenate([later, rest], axis)))
-        length *= 2
-    return runs

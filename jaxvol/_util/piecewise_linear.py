@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..xla.memory import gather
 from ..xla.platform import on_gpu
-from ..xla.xla import gather
 from .vec3 import Scalar, Vec3
 
 
@@ -23,6 +23,9 @@ ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
 
 Row: TypeAlias = tuple[Scalar, ...]
 """One row of a table."""
+
+Range: TypeAlias = tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]
+"""The first and the last of some control points, inclusive."""
 
 
 def clip_below(value: Scalar, least: Scalar) -> Scalar:
@@ -60,6 +63,18 @@ def points_below(
     return jax.lax.cond(even, counted, searched, value)
 
 
+def points_around(
+    values: Float[Array, " n"], low: Float[Array, "*blocks"], high: Float[Array, "*blocks"]
+) -> Range:
+    """The control points on which a function depends from `low` to `high`: those within, and the next ones
+    around."""
+    low, high = low.astype(values.dtype), high.astype(values.dtype)
+    first = jnp.maximum(points_below(values, low) - 1, 0)
+    # the first point at or above `high`; the second of two points at `high`
+    last = jnp.maximum(points_below(values, high, strictly=True), points_below(values, high) - 1)
+    return first, jnp.minimum(last, values.shape[0] - 1)
+
+
 def table_row(rows: Float[Array, "points columns"], point: Int[Array, "..."]) -> Row:
     """One row. Each entry is looked up by itself, so that batched entries are whole arrays from the start."""
     point = jnp.clip(point, 0, rows.shape[0] - 1)
@@ -85,11 +100,8 @@ def positive_between(
     if n > FEW:  # counting by look-up costs less than comparing with each point
         before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
         # between two points the extinction is positive wherever it is at one of the two
-        from_point = jnp.maximum(points_below(values, low) - 1, 0)
-        # the first point at or above `high`; the second of two points at `high`
-        to_point = jnp.maximum(points_below(values, high, strictly=True), points_below(values, high) - 1)
-        to_point = jnp.minimum(to_point, n - 1)
-        return before[to_point + 1] > before[from_point]
+        first, last = points_around(values, low, high)
+        return before[last + 1] > before[first]
     seen = jnp.zeros(low.shape, bool)
     for point in range(n):
         # a point's extinction reaches from the point before it to the one behind it
@@ -178,11 +190,7 @@ def _maximum_of_range(
 ) -> Float[Array, "*batch"]:
     """Maximum of the entries from `first` to before `end`; 0 where there are none. Two look-ups in a table of
     the maxima of all runs whose length is a power of two."""
-    runs, length = [entries], 1
-    while 2 * length <= entries.shape[0]:
-        shorter = runs[-1]
-        runs.append(jnp.maximum(shorter, jnp.concatenate([shorter[length:], shorter[-length:]])))
-        length *= 2
+    runs = run_maxima(entries, 0)
     table, n = jnp.stack(runs), entries.shape[0]
     count = end - first
     level = sum((count >= 2**k).astype(jnp.int32) for k in range(1, len(runs)))
@@ -190,3 +198,15 @@ def _maximum_of_range(
     left = table[level, jnp.clip(first, 0, n - 1)]
     right = table[level, jnp.clip(end - 2**level, 0, n - 1)]
     return jnp.where(count > 0, jnp.maximum(left, right), 0)
+
+
+def run_maxima(table: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:
+    """The maxima of 1, 2, 4, … entries from each one on along an axis."""
+    runs, length, n = [table], 1, table.shape[axis]
+    while 2 * length <= n:
+        later = jax.lax.slice_in_dim(runs[-1], length, None, axis=axis)
+        # the last ones are never asked for
+        rest = jax.lax.slice_in_dim(runs[-1], n - length, None, axis=axis)
+        runs.append(jnp.maximum(runs[-1], jnp.concatenate([later, rest], axis)))
+        length *= 2
+    return runs

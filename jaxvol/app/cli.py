@@ -11,7 +11,7 @@ from typing import NoReturn
 import jax
 
 from .._util.whole_files import remove_unfinished
-from ..xla.programs import SHORTEST
+from ..xla.persistent_cache import SHORTEST
 from .commands.animate import add_animate
 from .commands.datasets import add_datasets
 from .commands.demo import add_demo

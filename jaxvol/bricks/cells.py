@@ -15,10 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Vec3
-from ..engine.batch import CellRange
 from ..engine.rays import vmap_rays
-from ..march.march import RUN, March
-from ..reference import Progress
+from ..engine.wavefront import CellRange
+from ..march.march import March
+from ..march.strides import longest_run
+from ..ray import Progress
 from ..scene.space import Ray, Straight, slab_interval
 from .grid import BrickGrid
 
@@ -32,7 +33,7 @@ CHUNK = 8
 
 def reach(march: March, segment: int) -> int:
     """Steps before and behind a brick's cells of a ray, in which its cells may read voxels."""
-    return SLACK + max(segment, RUN * march.longest_stride)
+    return SLACK + max(segment, longest_run(march))
 
 
 class Turn(eqx.Module):

@@ -21,15 +21,15 @@ from jaxtyping import Array, Bool, Int, Shaped
 
 from .._util.axes import permuted
 from ..engine.acceleration import VolumeAcceleration
-from ..engine.batch import CellRange
-from ..engine.devices import AXIS, DEALT, WHOLE
-from ..engine.image import RenderOptions
-from ..engine.parts import Underway, arrive, joined, march_part, set_out
-from ..engine.scene import Scene
+from ..engine.brick_march import RayStates, begin_rays, finish_image, join_segments, march_brick
+from ..engine.devices import AXIS, REPLICATED, SHARDED
+from ..engine.tiling import RenderOptions
+from ..engine.wavefront import CellRange
+from ..ray import Scene
 from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
+from ..xla.compiling import compiled
 from ..xla.trees import PyTree
-from ..xla.xla import compiled
 from .cells import behind_straight, of_straight
 from .grid import BrickGrid, Node
 from .stream import Stream
@@ -39,7 +39,7 @@ class Share(eqx.Module):
     """What a device marches of an image: all rays, and which of their cells lie in its bricks. Arrays of many
     shares have one more axis in front, which is sharded."""
 
-    underway: Underway
+    underway: RayStates
     own: CellRange
 
     def of_brick(self, grid: BrickGrid, scene: Scene, brick: Int[Array, ""]) -> CellRange:
@@ -114,7 +114,7 @@ def _placed(stream: Stream, mesh: Mesh, turn: Turn) -> tuple[Array, Array, Array
             first[d], coming = turn.reading[d]
             part = coming.result()
         voxels.append(jax.device_put(part[None], device))
-    sharding = NamedSharding(mesh, DEALT)
+    sharding = NamedSharding(mesh, SHARDED)
     return (
         jnp.asarray(turn.bricks),
         jax.make_array_from_callback(first.shape, sharding, lambda index: first[index]),
@@ -129,20 +129,20 @@ def _on_each(mesh: Mesh, one: Any, *shares: PyTree, whole: bool = False) -> PyTr
         found = one(*jax.tree.map(lambda leaf: leaf[0], parts))
         return found if whole else jax.tree.map(lambda leaf: leaf[None], found)
 
-    out = WHOLE if whole else DEALT
-    return jax.shard_map(own, mesh=mesh, in_specs=DEALT, out_specs=out, check_vma=False)(*shares)
+    out = REPLICATED if whole else SHARDED
+    return jax.shard_map(own, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
 
 
 @compiled
-def _set_out(mesh: Mesh, scene: Scene, options: RenderOptions) -> Underway:
-    return _on_each(mesh, lambda _: set_out(scene, options), jnp.arange(mesh.size))
+def _set_out(mesh: Mesh, scene: Scene, options: RenderOptions) -> RayStates:
+    return _on_each(mesh, lambda _: begin_rays(scene, options), jnp.arange(mesh.size))
 
 
 @compiled
-def _in_view(mesh: Mesh, grid: BrickGrid, scene: Scene, underway: Underway) -> Bool[Array, " bricks"]:
+def _in_view(mesh: Mesh, grid: BrickGrid, scene: Scene, underway: RayStates) -> Bool[Array, " bricks"]:
     """For each brick, whether any ray meets it."""
 
-    def met(underway: Underway) -> Bool[Array, " bricks"]:
+    def met(underway: RayStates) -> Bool[Array, " bricks"]:
         def one(brick: Int[Array, ""]) -> Bool[Array, ""]:
             cells = of_straight(grid, scene.march, underway.rays, underway.rays.length > 0, brick)
             return jnp.any(cells.until > cells.first)
@@ -157,13 +157,13 @@ def _divided(
     mesh: Mesh,
     grid: BrickGrid,
     scene: Scene,
-    underway: Underway,
+    underway: RayStates,
     order: Int[Array, " bricks"],
     bounds: Int[Array, "devices 2"],
 ) -> Share:
     """Each device's own cells. `bounds`: its first brick in the order, and the one behind its last."""
 
-    def one(underway: Underway, bounds: Int[Array, "2"]) -> Share:
+    def one(underway: RayStates, bounds: Int[Array, "2"]) -> Share:
         first, until = (behind_straight(grid, scene.march, underway.rays, order, end) for end in bounds)
         return Share(underway, CellRange(first, until))
 
@@ -200,7 +200,7 @@ def _march(
         part = part_of(with_voxels(scene.volume, voxels), first, grid.shape)
         acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
         cells, here = share.of_brick(grid, scene, brick), scene._replace(volume=part)
-        after = march_part(here, options, acceleration, share.underway, cells, exact=True)
+        after = march_brick(here, options, acceleration, share.underway, cells, exact=True)
         return Share(after, share.own)
 
     return _on_each(mesh, one, share, bricks, first, voxels)
@@ -213,6 +213,6 @@ def _join(mesh: Mesh, scene: Scene, options: RenderOptions, share: Share) -> Ren
     def one(share: Share) -> Rendering:
         at = jax.lax.all_gather(share.underway.at, AXIS)
         rays = jax.tree.map(lambda leaf: leaf[None], share.underway.rays)
-        return arrive(scene, options, joined(scene, Underway(rays, at)))
+        return finish_image(scene, options, join_segments(scene, RayStates(rays, at)))
 
     return _on_each(mesh, one, share, whole=True)

@@ -12,32 +12,42 @@ from jax.sharding import Mesh
 
 from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
-from ..arguments import check_arguments
 from ..compositing.compositing import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration
-from ..engine.batch import CellRange
+from ..engine.brick_march import (
+    NO_ACCELERATION,
+    RayStates,
+    ReplayState,
+    begin_rays,
+    begin_vjp,
+    finish_image,
+    finish_vjp,
+    march_brick,
+    resolve_brick,
+    vjp_of_brick,
+)
 from ..engine.devices import Devices, check_not_sharded, mesh_of, number_of, on_all
-from ..engine.driver import Asked
 from ..engine.gradients import Sums, of_all_outputs, of_perturbed
-from ..engine.image import RenderOptions
-from ..engine.parts import NOTHING, Underway, arrive, march_part, resolve_part, set_out
-from ..engine.parts_gradient import Pulled, end_pull, pull_part, start_pull
+from ..engine.image import RenderOutputs
 from ..engine.resolve import resolve_image
-from ..engine.scene import Scene
-from ..engine.tiling import Tiling
+from ..engine.tiling import RenderOptions, Tiling
+from ..engine.wavefront import CellRange
 from ..lighting.shading import Lighting
 from ..march.march import March
+from ..march.strides import stride_control
 from ..march.transforms import SpaceLeaping, ToroidalMap
+from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
 from ..scene.rendering import Details, Rendering
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, part_of
+from ..xla.compiling import compiled
+from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree, strong
-from ..xla.xla import compiled, forward_mode, transformations
 from .grid import is_straight
 from .levels import level_for
 from .opening import OF_RAW, OF_ZARR, levels_of
@@ -64,7 +74,7 @@ def render_bricks(
     method: Method | Any = "overlap",
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
-    outputs: Asked | Any = "all",
+    outputs: RenderOutputs | Any = "all",
     level: int | Literal["auto"] | Any = "auto",
     progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
@@ -226,7 +236,7 @@ def _scene_of(
     volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
-    return strong(Scene(volume, transfer, camera, march.divided(), compositing_of(compositing), lighting))
+    return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
 
 
 def _marched(scene: Scene) -> Scene:
@@ -248,7 +258,7 @@ class _Job:
     memory: int
     counts: tuple[int, int, int] | None
     method: Method
-    outputs: Asked
+    outputs: RenderOutputs
     progress: Callable[[int, int], Any] | None
     devices: Mesh | None
     owned: bool
@@ -274,9 +284,9 @@ class _Job:
         return stream
 
 
-_set_out, _march_part, _arrive = map(compiled, (set_out, march_part, arrive))
-_resolve_part, _resolve = map(compiled, (resolve_part, resolve_image))
-_start_pull, _pull_part, _end_pull = map(compiled, (start_pull, pull_part, end_pull))
+_set_out, _march_part, _arrive = map(compiled, (begin_rays, march_brick, finish_image))
+_resolve_part, _resolve = map(compiled, (resolve_brick, resolve_image))
+_start_pull, _pull_part, _end_pull = map(compiled, (begin_vjp, vjp_of_brick, finish_vjp))
 
 
 def _image(scene: Scene, job: _Job) -> Rendering:
@@ -290,8 +300,8 @@ def _image(scene: Scene, job: _Job) -> Rendering:
     exact = callable(job.method)
 
     def march_brick(
-        part: Volume, cells: CellRange, state: tuple[Underway, PyTree]
-    ) -> tuple[Underway, PyTree]:
+        part: Volume, cells: CellRange, state: tuple[RayStates, PyTree]
+    ) -> tuple[RayStates, PyTree]:
         underway, pixels = state
         after = _march_part(*_on(part, marched, options), underway, cells, exact)
         if selects:
@@ -305,7 +315,7 @@ def _image(scene: Scene, job: _Job) -> Rendering:
     if not mode.resolves:
         return rendering
     if not selects:
-        pixels = _resolve(scene, options, NOTHING, (rendering.rgba, rendering.depth, None))
+        pixels = _resolve(scene, options, NO_ACCELERATION, (rendering.rgba, rendering.depth, None))
     elif pixels is None:  # no brick was read
         pixels = jnp.zeros((*rendering.rgba.shape[:-1], 5), rendering.rgba.dtype).at[..., 4].set(jnp.inf)
     details = Details()
@@ -351,12 +361,14 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         stream = replace(stream, visible=np.ones_like(stream.visible))
 
-    def pull_brick(part: Volume, cells: CellRange, state: tuple[Sums, Pulled]) -> tuple[Sums, Pulled]:
+    def pull_brick(
+        part: Volume, cells: CellRange, state: tuple[Sums, ReplayState]
+    ) -> tuple[Sums, ReplayState]:
         here, options_, acceleration = _on(part, scene, options)
         return _pull_part(here, perturbed, options_, acceleration, *state, cells)
 
     state = _start_pull(scene, perturbed, options, rendering, whole)
-    state = stream.through(state[1].underway.rays, state, lambda state: state[1].underway.at, pull_brick)
+    state = stream.through(state[1].states.rays, state, lambda state: state[1].states.at, pull_brick)
     found = _end_pull(scene, perturbed, options, *state, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
@@ -407,7 +419,7 @@ def _counts(bricks: Any) -> tuple[int, int, int] | None:
 def _check(
     march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any, own: Any
 ) -> None:
-    words = (("outputs", outputs, get_args(Asked)), ("own", own, get_args(Own)))
+    words = (("outputs", outputs, get_args(RenderOutputs)), ("own", own, get_args(Own)))
     for name, given, known in (*words, *(() if callable(method) else (("method", method, METHODS),))):
         if not isinstance(given, str) or given not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
@@ -435,7 +447,7 @@ def _check_owned(scene: Scene, method: Method) -> None:
         f"method={method!r}": method != "overlap",
         f"compositing by {type(mode).__name__}, which does not join parts of a ray": not mode.joins,
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
-        "AdaptiveSampling, whose strides depend on what lies in front": march.strides_vary,
+        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
         "gradients": is_traced(scene),
     }

@@ -9,10 +9,11 @@ import numpy as np
 
 from .._util.checks import integer
 from .._util.files import MOST_VOXELS
-from ..engine.scene import Scene
-from ..march.march import RUN, March
+from ..march.march import March
+from ..march.strides import longest_run, stride_control
 from ..march.transforms import ToroidalMap
 from ..march.transforms.adaptive_sampling import FARTHEST
+from ..ray import Scene
 from ..scene.occupancy import BLOCK
 from ..scene.space import Space
 from .cells import reach
@@ -66,9 +67,9 @@ class Margin:
         length = (steps + (0 if is_straight(space) else 4)) * float(march.step)
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
         around = 2 if slopes else 1
-        if march.looks_ahead:  # blocks around a run's own, and the windows of these
+        if stride_control(march) is not None:  # blocks around a run's own, and the windows of these
             shortest = min(_distances(space, np.zeros(3), np.asarray(shape) + BLOCK))
-            rounds = RUN * march.longest_stride * float(march.step) / max(2 * BLOCK * shortest, 1e-30)
+            rounds = longest_run(march) * float(march.step) / max(2 * BLOCK * shortest, 1e-30)
             around += BLOCK * (math.ceil(min(rounds, FARTHEST)) + 2)  # runs that touch more are not made
         light = 0.0 if lighting is None else lighting.farthest_read
         assert light is not None

@@ -15,18 +15,17 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.memory import give_back
 from ..engine import devices
-from ..engine.batch import CellRange
-from ..engine.image import RenderOptions
-from ..engine.scene import Scene
+from ..engine.tiling import RenderOptions
+from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..march.transforms import ToroidalMap
-from ..reference import Progress
+from ..ray import Progress, Scene
 from ..scene.camera import Camera
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import BrickReport
 from ..scene.space import Ray, Space
 from ..scene.volume import Volume, part_of, with_voxels
-from ..xla.xla import compiled
+from ..xla.compiling import compiled
 from .cells import Found, Turn, of_curved, of_straight, widened
 from .choice import cheapest, counts as counted, visible
 from .dtypes import range_of

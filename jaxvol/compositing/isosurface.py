@@ -95,7 +95,7 @@ class Isosurface(Selection[Crossing]):
         depth = self._implicit(sampler, jax.lax.stop_gradient(self._root(sampler, state)))
         classification = sampler.classification
         # the value itself rather than that at the root, which is rounded
-        measured = self.value, *classification.beside(sampler.coordinate(depth))
+        measured = self.value, *classification.attributes(sampler.coordinate(depth))
         measured = classification.searched(measured)
         color = sampler.color(depth, measured, classification.classify(measured), jnp.ones_like(depth))
         known = jnp.where(jnp.isnan(depth), jnp.nan, jnp.ones_like(depth))

@@ -155,7 +155,7 @@ class Average(Weighting):
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         """Through a fog of constant extinction that shows the values as colours. The optical depths of its
         cells are their widths."""
-        if type(transfer).beside is not Transfer.beside:
+        if type(transfer).attributes is not Transfer.attributes:
             raise ValueError(
                 "compositing by an average needs a transfer function that depends on the value alone; "
                 f"{type(transfer).__name__} reads more."

@@ -1,9 +1,9 @@
 """Which device does which part of the work?
 
-A program of the engine runs on all devices (`split`), each with the whole scene. There, things of about the
-same cost, beams of rays and chunks of pixels, are dealt out in turn, so that each device has its share of
-what is expensive wherever that lies in the image (`mine`). What they find is put together again
-(`collected`), or summed (`summed`). Without several devices, all of this changes nothing.
+A program of the engine runs on all devices (`split`), to which the scene is replicated. Beams of rays and
+chunks of pixels are sharded round-robin (`own_share`), so that each device has its share of what is expensive
+wherever that lies in the image. What they find is gathered (`gathered`), or summed (`summed`). Without
+several devices, all of this changes nothing.
 """
 
 import inspect
@@ -33,7 +33,7 @@ Devices: TypeAlias = Sequence[Any] | Mesh
 AXIS = "devices"
 """Name of the mesh axis."""
 
-WHOLE, DEALT = PartitionSpec(), PartitionSpec(AXIS)
+REPLICATED, SHARDED = PartitionSpec(), PartitionSpec(AXIS)
 """An array that every device has; and one of which each has its part along the first axis."""
 
 LARGE = 2**16
@@ -68,48 +68,47 @@ def number_of(mesh: Mesh | None) -> int:
 
 
 def split(
-    mesh: Mesh | None, program: Callable[..., tuple[PyTree, PyTree]], whole: PyTree, dealt: PyTree
+    mesh: Mesh | None, program: Callable[..., tuple[PyTree, PyTree]], replicated: PyTree, sharded: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """What `program(whole, dealt)` returns on all devices.
+    """What `program(replicated, sharded)` returns on all devices.
 
-    - `whole`: what all devices have, not only arrays.
-    - `dealt`: arrays of which each device has a part along the first axis, and is given that.
+    - `replicated`: what all devices have, not only arrays.
+    - `sharded`: arrays of which each device has a part along the first axis, and is given that.
 
-    The program returns the same two: first what is the same on all devices, then what is dealt."""
+    The program returns the same two: first what is the same on all devices, then what is sharded."""
     if mesh is None:
-        return program(whole, dealt)
-    arrays, rest = eqx.partition(whole, eqx.is_array)
+        return program(replicated, sharded)
+    arrays, rest = eqx.partition(replicated, eqx.is_array)
 
-    def own(arrays: PyTree, dealt: PyTree) -> tuple[PyTree, PyTree]:
-        return program(eqx.combine(arrays, rest), dealt)
+    def own(arrays: PyTree, sharded: PyTree) -> tuple[PyTree, PyTree]:
+        return program(eqx.combine(arrays, rest), sharded)
 
     # Types are not checked: every loop, in a user's transform too, would have to start with arrays that vary.
-    specs = (WHOLE, DEALT)
+    specs = (REPLICATED, SHARDED)
     shared = jax.shard_map(own, mesh=mesh, in_specs=specs, out_specs=specs, check_vma=False)
-    return jax.jit(shared)(arrays, dealt)
+    return jax.jit(shared)(arrays, sharded)
 
 
 def on_devices(
-    gives: Literal["whole", "dealt", "both"], *, dealt: tuple[str, ...] = ()
+    gives: Literal["replicated", "sharded", "both"], *, sharded: tuple[str, ...] = ()
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorator: a function of `options` runs by `split` on their devices. `gives`: what it returns, or both
-    in this order. `dealt`: the arguments that are."""
+    in this order. `sharded`: the arguments that are."""
 
     def made(function: Callable[P, T]) -> Callable[P, T]:
         signature = inspect.signature(function)
         called: Callable[..., T] = function
 
-        def program(whole: dict[str, Any], parts: dict[str, Any]) -> tuple[PyTree, PyTree]:
-            given: dict[str, Any] = whole | parts
-            result: Any = called(**given)
-            return {"whole": (result, None), "dealt": (None, result), "both": result}[gives]
+        def program(given: dict[str, Any], parts: dict[str, Any]) -> tuple[PyTree, PyTree]:
+            result: Any = called(**given, **parts)
+            return {"replicated": (result, None), "sharded": (None, result), "both": result}[gives]
 
         @wraps(function)
         def run(*args: P.args, **kwargs: P.kwargs) -> T:
             given = signature.bind(*args, **kwargs).arguments
-            parts = {name: given.pop(name) for name in dealt}
+            parts = {name: given.pop(name) for name in sharded}
             result: Any = split(given["options"].tiling.devices, program, given, parts)
-            return {"whole": result[0], "dealt": result[1], "both": result}[gives]
+            return {"replicated": result[0], "sharded": result[1], "both": result}[gives]
 
         return run
 
@@ -121,15 +120,16 @@ def index_of(mesh: Mesh | None) -> Array | int:
     return 0 if mesh is None else jax.lax.axis_index(AXIS)
 
 
-def mine(mesh: Mesh | None, things: Array) -> Array:
-    """This device's share of things, inside `split`; a multiple of the number of devices."""
+def own_share(mesh: Mesh | None, things: Array) -> Array:
+    """This device's share of things, round-robin, inside `split`. Their number is a multiple of the
+    devices'."""
     if mesh is None:
         return things
     return things.reshape(things.shape[0] // mesh.size, mesh.size, *things.shape[1:])[:, index_of(mesh)]
 
 
-def collected(mesh: Mesh | None, things: Array) -> Array:
-    """The inverse of `mine`, on all devices, inside `split`."""
+def gathered(mesh: Mesh | None, things: Array) -> Array:
+    """The inverse of `own_share`, on all devices, inside `split`."""
     if mesh is None:
         return things
     turns = jax.lax.all_gather(things, AXIS, axis=1)
@@ -161,13 +161,13 @@ def _copier(mesh: Mesh) -> Callable[[Array], Array]:
     def copied(array: Array) -> Array:
         # not `device_put` to all, which would compare the arrays of all processes
         parts = [jax.device_put(array, device) for device in mesh.local_devices]
-        return jax.make_array_from_single_device_arrays(array.shape, NamedSharding(mesh, WHOLE), parts)
+        return jax.make_array_from_single_device_arrays(array.shape, NamedSharding(mesh, REPLICATED), parts)
 
     return copied
 
 
 def check_not_sharded(mesh: Mesh | None, tree: PyTree) -> None:
-    """Raises `ValueError` inside of a `jax.shard_map`, where devices are dealt out already."""
+    """Raises `ValueError` inside of a `jax.shard_map`, where devices are shared out already."""
     if mesh is not None and (jax.sharding.get_abstract_mesh().manual_axes or _varies(tree)):
         raise ValueError(
             "devices cannot be given inside jax.shard_map, which has dealt them out: leave it out there, or "

@@ -14,22 +14,18 @@ from jaxtyping import Array, Bool, Int
 
 from ..lighting.shading import Shader, Surroundings
 from ..march.march import EmptySpaceIndex
-from ..reference import Pipeline
+from ..ray import Progress, Scene
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..scene.volume import Volume, with_voxels, without_voxels
-from ..scene.voxel_fetch import Fetch
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added, floats, zeros_of
 from .acceleration import VolumeAcceleration, empty_space_of
-from .batch import Beams, CellRange
 from .devices import on_devices
-from .image import RenderOptions, fault_of, pipeline_of
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
-from .scene import Scene
-from .tiling import Tiling
-from .wavefront import march_rays
+from .tiling import RenderOptions
+from .wavefront import Beams, CellRange, State, march_rays
 
 
 def render_vjp(
@@ -76,42 +72,38 @@ class Sums(NamedTuple):
     source: PyTree
 
 
-class Pull(NamedTuple):
+class ImageVjp(NamedTuple):
     """What the tiles of an image share.
 
-    `pipeline`: without lighting, since samples are pulled back through `shader`. `lit`: what rays are marched
-    through: with lighting if that is inline, so that invisible samples have their light, too. `pull_shader`:
-    from the shader's leaves to volume, transfer function, march and lighting.
+    - `scene`: as given. `prepared`: without lighting, since samples are pulled back through `shader`. `lit`:
+      through which rays are marched: with lighting if that is inline, so that invisible samples have their
+      light, too.
+    - `pull_shader`: from the shader's leaves to volume, transfer function, march and lighting.
     """
 
     scene: Scene
-    pipeline: Pipeline
-    lit: Pipeline
-    fetch: Fetch
+    prepared: Scene
+    lit: Scene
     empty_space: EmptySpaceIndex | None
     shader: Shader | None
     pull_shader: Callable[[PyTree], Any] | None
     fault: Bool[Array, ""]
     tiles: RayTiles
-    tiling: Tiling
 
     @classmethod
     def of(
         cls, scene: Scene, perturbed: Any, options: RenderOptions, acceleration: VolumeAcceleration
-    ) -> "Pull":
+    ) -> "ImageVjp":
         """That of a scene."""
-        packed, tiling = acceleration.packed(scene), options.tiling
-        index = empty_space_of(scene, acceleration, tiling)
-        _, pipeline = pipeline_of(packed._replace(lighting=None), acceleration)
+        index = empty_space_of(scene, acceleration, options.tiling)
+        lit = prepared = acceleration.prepared(scene._replace(lighting=None))
         shader, pull_shader = None, None
         if scene.lighting is not None:
-            shader, pull_shader = _shader_of(scene, packed.volume, voxels=_of_voxels(scene, perturbed))
-        lit = pipeline
-        if shader is not None and shader.shading.inline:
-            lit = pipeline._replace(classification=pipeline.classification._replace(light=shader))
-        tiles, fetch = RayTiles.of(scene.source, tiling), packed.volume.fetch
-        faulty = fault_of(scene)
-        return cls(scene, pipeline, lit, fetch, index, shader, pull_shader, faulty, tiles, tiling)
+            shader, pull_shader = _shader_of(scene, prepared.volume, voxels=_of_voxels(scene, perturbed))
+            if shader.shading.inline:
+                lit = prepared._replace(classification=prepared.classification._replace(light=shader))
+        tiles = RayTiles.of(scene.source, options.tiling)
+        return cls(scene, prepared, lit, index, shader, pull_shader, scene.has_fault, tiles)
 
     def zeros(self, perturbed: Any) -> Sums:
         """Sums of no tile yet, for what is perturbed."""
@@ -138,13 +130,21 @@ class Pull(NamedTuple):
 
         return eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
 
-    def replay(self, rays: Ray, given: Cotangents, total: Total) -> Replay:
-        """What looks at the samples of rays."""
-        return Replay(self.pipeline, self.scene, self.fetch, rays, given, total, self.shader, self.tiling)
+    def march(
+        self,
+        rays: Ray,
+        number: Int[Array, ""],
+        ranges: CellRange | None,
+        replay: Replay,
+        resumed: Progress | None = None,
+    ) -> State:
+        """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
+        beams = Beams.of(self.tiles, self.scene.source, rays, number, ranges)
+        return march_rays(self.lit, self.empty_space, beams, self.tiles.tiling, None, replay, resumed)
 
-    def beams(self, rays: Ray, number: Int[Array, ""], range_: CellRange | None) -> Beams:
-        """The rays of a tile, to be marched."""
-        return Beams(rays, self.tiles.beam_count, self.tiles.box(self.scene.source, rays, number), range_)
+    def replay(self, rays: Ray, given: Cotangents, total: Total) -> Replay:
+        """What pulls the samples of rays back."""
+        return Replay(self.scene, self.prepared, self.shader, self.tiles.tiling.chunk, rays, given, total)
 
     def of_rays(
         self,
@@ -163,16 +163,36 @@ class Pull(NamedTuple):
             toward = jnp.where(rendering.rgba[..., 3] > 0, cotangent.depth, 0)
             of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
         of_volume, of_source, of_march = pull(of_rays)[0]
-        of_parts = added(total.volume, of_volume), added(total.march, of_march)
-        total = eqx.tree_at(lambda t: (t.volume, t.march), total, of_parts)
+        total = total._replace(volume=added(total.volume, of_volume), march=added(total.march, of_march))
         return Sums(total, added(sums.source, of_source))
+
+    def cotangents(self, sums: Sums) -> Scene:
+        """Those of the scene's parts; 0 for those that are not asked for."""
+        total, volume = sums.total, self.scene.volume
+        parts = without_voxels(volume), self.scene.transfer, self.scene.source, self.scene.march
+        of_parts = total.volume, total.transfer, sums.source, total.march
+        of_volume, of_transfer, of_source, of_march = (
+            zeros_of(part) if found is None else found for part, found in zip(parts, of_parts, strict=True)
+        )
+        if total.voxels is not None:
+            voxels = total.voxels.reshape(volume.data.shape).astype(volume.data.dtype)
+            of_volume = with_voxels(of_volume, voxels)
+        of_lighting = None
+        if self.pull_shader is not None:
+            more_volume, more_transfer, more_march, of_lighting = self.pull_shader(total.shader)[0]
+            of_volume, of_transfer = added(of_volume, more_volume), added(of_transfer, more_transfer)
+            of_march = added(of_march, more_march)
+        # a march does not depend on the parameters of a mode
+        return Scene(
+            of_volume, of_transfer, of_source, of_march, zeros_of(self.scene.compositing), of_lighting
+        )
 
 
 def _of_voxels(scene: Scene, perturbed: Any) -> bool:
     return eqx.is_inexact_array(scene.volume.data) and perturbed.volume.data
 
 
-@on_devices("whole", dealt=("ranges",))
+@on_devices("replicated", sharded=("ranges",))
 def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,
@@ -183,7 +203,7 @@ def _vjp_by_tiles(
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
-    image = Pull.of(scene, perturbed, options, acceleration)
+    image = ImageVjp.of(scene, perturbed, options, acceleration)
     if image.empty_space is not None and ranges is not None:
         image = image._replace(empty_space=image.empty_space.within_ranges())
 
@@ -191,46 +211,18 @@ def _vjp_by_tiles(
         number, range_, rendering, cotangent = each
         rays, pull = image.rays(number)
         replay = image.replay(rays, Cotangents.of(rays, rendering, cotangent), sums.total)
-        beams = image.beams(rays, number, range_)
-        _, (_, of_rays, total) = march_rays(image.lit, image.empty_space, beams, image.tiling, None, replay)
+        _, (_, of_rays, total) = image.march(rays, number, range_, replay)
         return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
     sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), ranges, *parts)
-    return cotangents_of(scene, sums.total, sums.source, image.pull_shader)
-
-
-def cotangents_of(
-    scene: Scene, total: Total, of_source: PyTree, pull_shader: Callable[[PyTree], Any] | None
-) -> Any:
-    """The cotangents of a scene's parts; 0 for those that are not asked for."""
-    volume, transfer, source, march, compositing, _ = scene
-    compositing = zeros_of(compositing)  # a march does not depend on its parameters
-    parts = without_voxels(volume), transfer, source, march
-    sums = total.volume, total.transfer, of_source, total.march
-    of_volume, of_transfer, of_source, of_march = (
-        zeros_of(part) if found is None else found for part, found in zip(parts, sums, strict=True)
-    )
-    if total.voxels is not None:
-        data = volume.data
-        of_volume = with_voxels(of_volume, total.voxels.reshape(data.shape).astype(data.dtype))
-    if pull_shader is None:
-        return Scene(of_volume, of_transfer, of_source, of_march, compositing, None)
-    more_volume, more_transfer, more_march, of_lighting = pull_shader(total.shader)[0]
-    return Scene(
-        added(of_volume, more_volume),
-        added(of_transfer, more_transfer),
-        of_source,
-        added(of_march, more_march),
-        compositing,
-        of_lighting,
-    )
+    return image.cotangents(sums)
 
 
 def _shader_of(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Shader, Callable[[PyTree], Any]]:
     """What shades an image; and the pull-back of its leaves to volume, transfer function, march and
     lighting."""
-    volume, transfer, _, march, _, lighting = scene
+    volume, transfer, march, lighting = scene.volume, scene.transfer, scene.march, scene.lighting
     parts = volume if voxels else without_voxels(volume), transfer, march, lighting
     moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
 

@@ -1,33 +1,124 @@
-"""Marches all rays of an image, tile by tile."""
+"""How does a scene become an image, and by which rule does JAX differentiate it, for each `adjoint=`?
+
+An image is one compiled program, and its gradient another; `gradients` has the VJP of `"replay"`.
+"""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
-from ..compositing.compositing import Outputs
-from ..lighting.shading import lit_classification
-from ..reference import Pipeline, begin, end, has_fault, step
+from ..compositing.selection import Selection
+from ..ray import Scene, begin, end
+from ..reference import step, steps_across
 from ..scene.rendering import Rendering
-from ..scene.space import Ray, Space
+from ..scene.space import Ray
+from ..xla.compiling import compiled, recomputed
+from ..xla.differentiation import forward_mode, forward_only, transformations
+from ..xla.platform import is_traced
 from ..xla.sharding import varying
+from ..xla.trees import strong
 from .acceleration import VolumeAcceleration, empty_space_of
-from .batch import Beams, CellRange, VisibleRangeRecorder
-from .devices import on_devices
+from .devices import check_not_sharded, mesh_of, on_all, on_devices
+from .gradients import render_vjp
 from .rays import RayTiles, vmap_rays
-from .scene import Scene
-from .tiling import Tiling
-from .wavefront import march_rays
+from .resolve import Found, resolve_image
+from .tiling import Adjoint, RenderOptions, Tiling
+from .wavefront import Beams, CellRange, VisibleRangeRecorder, march_rays
 
 
-class RenderOptions(eqx.Module):
-    """What is computed, and how work is divided."""
+RenderOutputs: TypeAlias = Literal["all", "rgba"]
+"""What a caller may ask for. Of the engine's outputs, the depth alone is for lightings that shade pixels."""
 
-    outputs: Outputs = eqx.field(static=True)
-    tiling: Tiling = eqx.field(static=True)
+WRONG_MODE = {
+    "replay": 'adjoint="replay" is for reverse mode (jax.grad, jax.vjp). For forward mode (jax.jvp, '
+    'jax.jacfwd) pass adjoint="forward"; for both, and for higher derivatives, adjoint="direct".',
+    "forward": 'adjoint="forward" is for forward mode (jax.jvp, jax.jacfwd). For reverse mode (jax.grad, '
+    'jax.vjp) pass adjoint="replay", the default; for both, adjoint="direct".',
+}
+
+
+def render_scene(
+    scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None, devices: Any = None
+) -> Rendering:
+    """The image of a scene whose parts are what they should be.
+
+    **Raises:** `ValueError` for unknown outputs or an unknown adjoint; for `"direct"` where the march or the
+    spacing is traced and `march.max_samples` is not given; and as `mesh_of` and `check_not_sharded` do for
+    devices."""
+    for name, given, known in (("outputs", outputs, RenderOutputs), ("adjoint", adjoint, Adjoint)):
+        if given not in get_args(known):
+            raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
+    tiling = Tiling.of_backend(mesh_of(devices)) if tiling is None else tiling
+    check_not_sharded(tiling.devices, scene)
+    scene = strong(scene)
+    volume, march, lighting = scene.volume, scene.march, scene.lighting
+    steps = None
+    if adjoint == "direct":
+        # rounded up to one of few lengths, so that a change of step rarely compiles the program again
+        steps = min(-(-steps_across(volume, march) // 64) * 64, march.most_samples)
+    if lighting is not None:
+        scene = scene._replace(lighting=lighting.prepared(volume, scene.transfer, march))
+    options = RenderOptions(outputs, tiling, adjoint, steps)
+    acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting)
+    scene, acceleration = on_all(tiling.devices, varying((scene, acceleration)))
+    if scene.resolves:
+        return _resolved(scene, options, acceleration)
+    return _image(scene, options, acceleration)
+
+
+def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    """The rays are marched without light, and pixels computed from what that found."""
+    # the march does not depend on parameters of the mode, or what it finds is a constant
+    marched = scene.marched._replace(compositing=jax.lax.stop_gradient(scene.compositing))
+    if isinstance(scene.compositing, Selection):
+        marched = jax.lax.stop_gradient(marched)
+    all_ = options.outputs == "all"
+    options = replace(options, outputs="all" if all_ else "depth")
+    rendering = _image(marched, options, acceleration)
+    details = rendering.details
+    pixels = _pixels(scene, options, acceleration, (rendering.rgba, rendering.depth, details.selected))
+    if not all_:
+        return Rendering(pixels[..., :4], rendering.exhausted)
+    normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
+    details = details._replace(depth=pixels[..., 4], normal=normal, selected=None)
+    return Rendering(pixels[..., :4], rendering.exhausted, details)
+
+
+def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    """The image, with the derivatives of its adjoint."""
+    if options.adjoint == "direct":
+        return _scan(scene, options, acceleration)
+    if options.adjoint == "forward":
+        return forward_only(_march(scene, options, acceleration), WRONG_MODE["forward"])
+    if not is_traced(scene):  # going through a custom rule takes milliseconds
+        return _march_in_turn(scene, options, acceleration)
+    kinds = _checked_for_forward_mode(scene)
+    # inside `jax.shard_map`, JAX has custom rules only under `jax.jit`
+    sharded = any("ShardMapTracer" in kind for kind in kinds)
+    image = _replayed_in_shard if sharded else _replayed
+    return image(scene, options, jax.lax.stop_gradient(acceleration))
+
+
+def _pixels(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found) -> Array:
+    """Pixels that are computed after the march, with the derivatives of its adjoint."""
+    if options.adjoint == "replay":
+        _checked_for_forward_mode(scene)
+        return _resolve_again(scene, options, acceleration, found)
+    pixels = _resolve(scene, options, acceleration, found)
+    return forward_only(pixels, WRONG_MODE["forward"]) if options.adjoint == "forward" else pixels
+
+
+def _checked_for_forward_mode(scene: Scene) -> list[list[str]]:
+    """The transformations of JAX that each leaf of the scene undergoes. Raises where one is forward mode."""
+    kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
+    if forward_mode(kinds):
+        raise ValueError(WRONG_MODE["replay"])
+    return kinds
 
 
 @on_devices("both")
@@ -35,62 +126,85 @@ def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, CellRange | None]:
     """The image, by the fast engine; and, to `record`, each ray's visible cells, where rays leap."""
-    tiling = options.tiling
-    tiles = RayTiles.of(scene.source, tiling)
-    scene = acceleration.packed(scene)
-    index = empty_space_of(scene, acceleration, tiling)
-    space, pipeline = pipeline_of(scene, acceleration)
+    tiles = RayTiles.of(scene.source, options.tiling)
+    index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
+    prepared = acceleration.prepared(scene)
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
-        beams = Beams(rays, tiles.beam_count, tiles.box(scene.source, rays, tile))
+        beams = Beams.of(tiles, scene.source, rays, tile)
         recorder = VisibleRangeRecorder(rays.length.shape) if record and index is not None else None
-        at, (ranges, *_) = march_rays(pipeline, index, beams, tiling, options.outputs, recorder)
-        return vmap_rays(partial(end, pipeline))(rays, at), ranges
+        at, (ranges, *_) = march_rays(prepared, index, beams, options.tiling, options.outputs, recorder)
+        return vmap_rays(partial(end, prepared))(rays, at), ranges
 
-    return _over_tiles(scene, space, tiles, marched)
+    return _over_tiles(prepared, tiles, marched)
 
 
-@on_devices("whole")
-def scan_image(
-    scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, length: int
-) -> Rendering:
-    """The image, by `length` steps of the reference engine along each ray, which JAX can differentiate."""
+@on_devices("replicated")
+def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    """The image, by `options.steps` steps of the reference engine along each ray, which JAX can
+    differentiate."""
     tiles = RayTiles.of(scene.source, options.tiling, direct=True)
-    scene = acceleration.packed(scene)
-    space, pipeline = pipeline_of(scene, acceleration)
+    prepared = acceleration.prepared(scene)
 
-    def scanned(_: Int[Array, ""], rays: Ray) -> Rendering:
-        one = vmap_rays(partial(step, pipeline))
-        start = varying(vmap_rays(lambda ray: begin(pipeline, ray, options.outputs))(rays), rays)
-        at, _ = jax.lax.scan(lambda at, none: (one(rays, at), none), start, None, length=length)
-        return vmap_rays(partial(end, pipeline))(rays, at)
+    def scanned(_: Int[Array, ""], rays: Ray) -> tuple[Rendering, None]:
+        one = vmap_rays(partial(step, prepared))
+        start = varying(vmap_rays(lambda ray: begin(prepared, ray, options.outputs))(rays), rays)
+        at, _ = jax.lax.scan(lambda at, none: (one(rays, at), none), start, None, length=options.steps)
+        return vmap_rays(partial(end, prepared))(rays, at), None
 
-    return _over_tiles(scene, space, tiles, lambda tile, rays: (scanned(tile, rays), None))[0]
-
-
-def pipeline_of(scene: Scene, acceleration: VolumeAcceleration) -> tuple[Space, Pipeline]:
-    """The space of the volume, and the pipeline that the scene's rays go through."""
-    volume, transfer, _, march, compositing, lighting = scene
-    space = march.locate(volume)
-    lit = lit_classification(volume, transfer, space, lighting, integrated=march.integrates)
-    march = march.prepared(space, acceleration.windows, partial(compositing.variation, transfer))
-    return space, Pipeline(march, volume, lit, compositing)
+    return _over_tiles(prepared, tiles, scanned)[0]
 
 
 def _over_tiles(
-    scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
+    scene: Scene, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
 ) -> tuple[Rendering, Any]:
     """Calls `one(tile, rays)` for each tile in turn. Returns the renderings, assembled to an image, and what
     else it returned, stacked."""
-    fault = fault_of(scene)
+    fault = scene.has_fault
 
     def tile(each: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
-        return one(each[0], tiles.rays(scene.source, space, each[0], fault))
+        return one(each[0], tiles.rays(scene.source, scene.space, each[0], fault))
 
     renderings, more = tiles.map(tile)
     return jax.tree.map(tiles.assemble, renderings), more
 
 
-def fault_of(scene: Scene) -> Bool[Array, ""]:
-    """Whether a number on which all pixels depend makes them NaN."""
-    return has_fault(scene.volume, scene.march, scene.transfer, scene.compositing, scene.lighting)
+def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    return march_image(scene, options, acceleration)[0]
+
+
+_march = compiled(_marched_image, has_jvp=True)
+_march_in_turn = compiled(_marched_image)
+_march_recorded = compiled(partial(march_image, record=True))
+_render_vjp = compiled(render_vjp)
+_scan = compiled(scan_image, has_jvp=True)
+_resolve = compiled(resolve_image, has_jvp=True)
+_resolve_again = recomputed(resolve_image)
+
+
+@eqx.filter_custom_vjp
+def _replayed(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    return _march_in_turn(scene, options, acceleration)
+
+
+@_replayed.def_fwd
+def _(
+    perturbed: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
+) -> tuple[Rendering, Any]:
+    rendering, ranges = _march_recorded(scene, options, acceleration)
+    return rendering, (rendering, ranges)
+
+
+@_replayed.def_bwd
+def _(
+    residuals: Any,
+    cotangent: Rendering,
+    perturbed: Any,
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+) -> Any:
+    return _render_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
+
+
+_replayed_in_shard = eqx.filter_jit(_replayed)

@@ -16,34 +16,34 @@ from .._util.vec3 import Vec3, along
 from ..compositing.selection import Selection
 from ..lighting.shading import Sample, Shader
 from ..march.march import Cell
-from ..reference import Pipeline
+from ..ray import Scene
 from ..scene.space import Ray
 from ..scene.volume import with_fetch
+from ..xla.memory import in_memory
 from ..xla.trees import PyTree
-from ..xla.xla import in_memory
 
 
-def inline_shader(pipeline: Pipeline) -> Shader | None:
+def inline_shader(scene: Scene) -> Shader | None:
     """What shades all samples of a march where they are, if anything does."""
-    light = pipeline.classification.light
-    if not isinstance(light, Shader) or isinstance(pipeline.compositing, Selection):
+    light = scene.classification.light
+    if not isinstance(light, Shader) or isinstance(scene.compositing, Selection):
         return None
     return light if light.shading.inline else None
 
 
 def light_terms(
-    shader: Shader, pipeline: Pipeline, live: Bool[Array, ""], ray: Ray, cells: Callable[[], tuple[Cell, ...]]
+    shader: Shader, scene: Scene, live: Bool[Array, ""], ray: Ray, cells: Callable[[], tuple[Cell, ...]]
 ) -> list[PyTree]:
     """The terms of all samples of cells, arrays (cells, rays), in memory. `live`: see `in_memory`."""
     shading, around = shader
     volume = around.volume
 
     def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
-        coordinate = around.space.coordinate(_sample(pipeline, ray, cell).point)
+        coordinate = around.space.coordinate(_sample(scene, ray, cell).point)
         return volume.fetch.base(volume.data, coordinate)
 
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
-        sample = _sample(pipeline, ray, cell)
+        sample = _sample(scene, ray, cell)
         here = replace(around, volume=with_fetch(volume, volume.fetch.of_slopes_at(begin)))
         return shading.term(here, sample, shading.about(here, sample), jnp.zeros((), jnp.int32))
 
@@ -57,20 +57,20 @@ def light_terms(
 
 
 def lit_colors(
-    shader: Shader, pipeline: Pipeline, ray: Ray, cells: list[Cell], colors: list[Vec3], terms: list[PyTree]
+    shader: Shader, scene: Scene, ray: Ray, cells: list[Cell], colors: list[Vec3], terms: list[PyTree]
 ) -> list[Vec3]:
     """The shaded colours of all samples of cells, arrays (cells, rays), from their colours and terms."""
     shading, around = shader
 
     def one(ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
-        sample = _sample(pipeline, ray, cell)._replace(color=color)
+        sample = _sample(scene, ray, cell)._replace(color=color)
         return shading.color(sample, shading.about(around, sample), term)
 
     each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
     return [each(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
 
 
-def _sample(pipeline: Pipeline, ray: Ray, cell: Cell) -> Sample:
-    zero, depth = jnp.zeros_like(cell.front), pipeline.march.sample(cell)
+def _sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
+    zero, depth = jnp.zeros_like(cell.front), scene.march.sample(cell)
     point = along(ray.entry, ray.direction, depth)
     return Sample(point, ray.direction, (), (zero, zero, zero), zero, zero + 1, ray.pixel)

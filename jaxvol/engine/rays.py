@@ -1,8 +1,8 @@
 """How is an image divided into tiles, and a tile into beams and groups of rays?
 
-Only one tile's rays are in memory beside the finished pixels, however large the image; or one on each device,
-to which beams are dealt out in turn (`devices`). They are arrays (groups, rays in a group), in which equally
-many groups in a row make up a beam.
+Besides the finished pixels, only one tile's rays are in memory, however large the image; or one on each
+device, between which beams are sharded (`devices`). They are arrays (groups, rays in a group), in which
+equally many groups in a row make up a beam.
 """
 
 import math
@@ -14,40 +14,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.checks import all_finite
 from ..march.beams import Box
-from ..scene.camera import Camera
+from ..scene.camera import Camera, GivenRays
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
+from ..xla.memory import in_memory
 from ..xla.trees import PyTree, added
-from ..xla.xla import in_memory
 from . import devices
 from .tiling import Tiling
 
 
 Lanes = Int[Array, "groups rays"]
-
-
-class OwnRays(eqx.Module):
-    """Rays given by world origins and unit directions.
-
-    Random numbers along a ray are keyed by its pixel, (column, row); without `pixels` that is
-    (`first` + index in the flattened array, 0)."""
-
-    origins: Float[Array, "*rays 3"]
-    directions: Float[Array, "*rays 3"]
-    pixels: Int[Array, "*rays 2"] | None = None
-    first: Int[Array, ""] | int = 0
-
-    def pixel(self, index: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
-        """The pixels of the rays at these indices."""
-        if self.pixels is None:
-            index = index.astype(jnp.int32)  # from 64 bits under x64
-            return self.first + index, jnp.zeros_like(index)
-        flat = self.pixels.reshape(-1, 2)
-        return flat[index, 0], flat[index, 1]
 
 
 class RayTiles(eqx.Module):
@@ -64,7 +44,7 @@ class RayTiles(eqx.Module):
     tiling: Tiling = eqx.field(static=True)
 
     @classmethod
-    def of(cls, source: Camera | OwnRays, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
+    def of(cls, source: Camera | GivenRays, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
         """The tiles of a camera's pixels, or of given rays; small ones for `"direct"`."""
         side, most = tiling.beam, tiling.direct_tile if direct else tiling.tile
         shares = devices.number_of(tiling.devices)
@@ -80,12 +60,12 @@ class RayTiles(eqx.Module):
             across += shares > 1 and across % shares == 0
             return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
-        return _OwnRayTiles(*divided(-(-math.prod(shape) // tiling.rays_per_beam)), tiling, shape)
+        return _GivenRayTiles(*divided(-(-math.prod(shape) // tiling.rays_per_beam)), tiling, shape)
 
     def scan(
         self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
     ) -> tuple[PyTree, PyTree]:
-        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what it returns beside. What it adds to
+        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what else it returns. What it adds to
         `sums` is summed over all devices."""
         mesh, every = self.tiling.devices, (jnp.arange(self.number), *each)
         if mesh is None:
@@ -107,13 +87,13 @@ class RayTiles(eqx.Module):
         """From (tiles, groups, rays in a group, *rest) of each device to (beams, rays of a beam, *rest) of
         all, in their order."""
         beams = leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
-        return devices.collected(self.tiling.devices, beams)
+        return devices.gathered(self.tiling.devices, beams)
 
     def of_tiles(self, beams: Array) -> Array:
         """The inverse of `of_beams`; 0 for beams that are missing."""
         mesh, rest, count = self.tiling.devices, beams.shape[2:], self.number * self.beam_count
         missing = count * devices.number_of(mesh) - beams.shape[0]
-        beams = devices.mine(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
+        beams = devices.own_share(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
@@ -181,15 +161,17 @@ class _PixelTiles(RayTiles):
         return self.of_tiles(beams)
 
 
-class _OwnRayTiles(RayTiles):
+class _GivenRayTiles(RayTiles):
     """Given rays, in their order."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def rays(self, source: OwnRays, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
+    def rays(self, source: GivenRays, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         count = math.prod(self.shape)
         if count == 0:  # one to look up where there is none
-            source = OwnRays(*(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions)))
+            source = GivenRays(
+                *(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions))
+            )
         size = self.tiling.rays_per_beam
         number = (self.beams(tile)[:, None] * size + jnp.arange(size)[None]).reshape(-1, self.tiling.group)
         known = jnp.minimum(number, max(count - 1, 0))
@@ -198,7 +180,7 @@ class _OwnRayTiles(RayTiles):
         own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
         return entering(space, own, number < count, self.tiling.searched)
 
-    def box(self, source: OwnRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, source: GivenRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
         return lambda occupancy: Box.around(occupancy, by_beam)
 
@@ -214,15 +196,10 @@ class _OwnRayTiles(RayTiles):
         return self.of_tiles(padded.reshape(-(-count // size), size, *rest))
 
 
-def _own_line(source: OwnRays, index: Int[Array, ""]) -> Line:
-    (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[index] for rays in (source.origins, source.directions))
-    return Line((x, y, z), (dx, dy, dz), source.pixel(index))
-
-
-def lines_at(source: Camera | OwnRays, indices: Int[Array, " rays"]) -> Line:
+def lines_at(source: Camera | GivenRays, indices: Int[Array, " rays"]) -> Line:
     """The rays of indices into the flattened image, as the march rounds them."""
     if not isinstance(source, Camera):
-        return jax.vmap(partial(_own_line, source))(indices)
+        return jax.vmap(source.line)(indices)
     rows, columns = jnp.divmod(indices, source.size[0])
     fault = jnp.zeros((), bool)
     return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None], fault))

@@ -30,18 +30,16 @@ from jaxtyping import Array, Float, Int
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing.compositing import Weighting
 from ..lighting.shading import Shader
-from ..reference import Pipeline, Progress, measure, pieces
+from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..scene.transfer import Transfer, classification_of
-from ..scene.volume import Volume, with_fetch, with_voxels, without_voxels
-from ..scene.voxel_fetch import Cube, Fetch, Recording, cubes_of_zeros, scatter_add
+from ..scene.transfer import classification_of
+from ..scene.volume import with_fetch, with_voxels, without_voxels
+from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..xla.trees import PyTree, added, floats, zeros_of
 from .inline_shading import lit_colors
-from .scene import Scene
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
-from .tiling import Tiling
 from .visible_samples import Weights, weights_of
 
 
@@ -68,7 +66,7 @@ class Cotangents(NamedTuple):
         return cls((red, green, blue), opacity, worth, depth, middle)
 
 
-class Total(eqx.Module):
+class Total(NamedTuple):
     """Gradients summed over all rays; None for what is not asked for."""
 
     transfer: PyTree
@@ -108,20 +106,12 @@ class Replay(SampleVisitor):
 
     **Arguments:**
 
-    - `pipeline`: of the rays; without lighting. `scene`: what the gradient is taken by.
-    - `fetch`: of the scene's voxels, from their packed copy where there is one.
-    - `rays`: those that are marched.
-    - `given`: cotangents of the rays.
+    - `scene`: what the gradient is taken by. `prepared`: the same, without lighting.
+    - `shader`: what shades the samples, `chunk` at a time.
+    - `rays`: those that are marched. `given`: their cotangents.
     - `total`: the gradients so far, to which those of these rays are added.
-    - `shader`: what shades the samples.
     """
 
-    volume: Volume
-    fetch: Fetch
-    transfer: Transfer
-    pipeline: Pipeline
-    shader: Shader | None
-    tiling: Tiling
     given: Cotangents
     carry: Scalar
     sums: PyTree
@@ -129,18 +119,16 @@ class Replay(SampleVisitor):
 
     def __init__(
         self,
-        pipeline: Pipeline,
         scene: Scene,
-        fetch: Fetch,
+        prepared: Scene,
+        shader: Shader | None,
+        chunk: int,
         rays: Ray,
         given: Cotangents,
         total: Total,
-        shader: Shader | None,
-        tiling: Tiling,
     ):
-        self.volume, self.fetch, self.transfer = scene.volume, fetch, scene.transfer
-        self.pipeline, self.shader = pipeline, shader
-        self.given, self.total, self.tiling = given, total, tiling
+        self.scene, self.prepared, self.shader, self.chunk = scene, prepared, shader, chunk
+        self.given, self.total = given, total
         self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
         self.sums = zeros_of(rays) if total.geometric else None
 
@@ -149,25 +137,25 @@ class Replay(SampleVisitor):
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
         red, green, blue = each.color
-        classify = vmap_cells(self.pipeline.classification.of_cells)
+        classify = vmap_cells(self.prepared.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
-        depths = [self.pipeline.march.sample(cell) for cell in samples.cells]
-        weights = weights_of(self.pipeline, at, samples.opacity)
+        depths = [self.prepared.march.sample(cell) for cell in samples.cells]
+        weights = weights_of(self.prepared, at, samples.opacity)
         of_color = [(weight * red, weight * green, weight * blue) for weight in weights.weight]
         shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
         if self.shader is not None:
             sums = ShadingTotal(total.shader, total.transfer, total.voxels)
             shaded, sums = shading_vjp(
-                *(self.shader, self.pipeline, ray, samples, weights, of_color),
-                *(self.tiling.chunk, sums),
+                *(self.shader, self.prepared, ray, samples, weights, of_color),
+                *(self.chunk, sums),
             )
-            total = Total(sums.transfer, total.march, total.volume, sums.voxels, sums.shader)
+            total = total._replace(transfer=sums.transfer, voxels=sums.voxels, shader=sums.shader)
             of_color = [part.of_color for part in shaded]
             if samples.light is None:
                 colors = [part.color for part in shaded]
             else:  # also of invisible samples, which are worth something: they would become visible
-                colors = lit_colors(self.shader, self.pipeline, ray, samples.cells, colors, samples.light)
+                colors = lit_colors(self.shader, self.prepared, ray, samples.cells, colors, samples.light)
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [
@@ -180,11 +168,10 @@ class Replay(SampleVisitor):
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
-            transfer = self.transfer
-            pull = transfer.pull_integrated if self.pipeline.march.integrates else transfer.pull
-            of_transfer, of_read = pull(measured, of_color[i], of_extinction)
-            sum_ = added(total.transfer, of_transfer)
-            total = Total(sum_, total.march, total.volume, total.voxels, total.shader)
+            of_transfer, of_read = self.scene.transfer.vjp(
+                measured, of_color[i], of_extinction, integrated=self.prepared.march.integrates
+            )
+            total = total._replace(transfer=added(total.transfer, of_transfer))
             if shaded is not None:
                 of_value, *rest = of_read
                 of_read = (of_value + shaded[i].of_value, *rest)
@@ -197,11 +184,11 @@ class Replay(SampleVisitor):
         (of_march, of_volume, of_rays), bases, of_cubes = self._geometric_vjp(
             ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         )
-        voxels = total.voxels
-        if voxels is not None:
-            voxels = scatter_add(voxels, self.volume.shape, bases, of_cubes)
-        march, volume = added(total.march, of_march), added(total.volume, of_volume)
-        return carry, of_rays, Total(total.transfer, march, volume, voxels, total.shader)
+        total = total._replace(march=added(total.march, of_march), volume=added(total.volume, of_volume))
+        if total.voxels is not None:
+            voxels = scatter_add(total.voxels, self.scene.volume.shape, bases, of_cubes)
+            total = total._replace(voxels=voxels)
+        return carry, of_rays, total
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
@@ -209,7 +196,7 @@ class Replay(SampleVisitor):
         """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
         its depth where the loss depends on that, and of its point where it is shaded; then where the cubes of
         voxels begin that were fetched, and their cotangents. The number of samples counts as constant."""
-        parts = self.pipeline.march, without_voxels(self.volume), ray
+        parts = self.prepared.march, without_voxels(self.scene.volume), ray
         (march, volume, ray), fixed = eqx.partition(parts, eqx.is_inexact_array)
         _, _, ray_fixed = fixed
         voxels = self.total.voxels is not None
@@ -224,13 +211,14 @@ class Replay(SampleVisitor):
             number: Int[Array, ""],
         ) -> tuple[list[Any], list[Array]]:
             march, volume, ray = eqx.combine((march, volume, ray), (*fixed[:2], ray_fixed))
-            whole, record = with_voxels(volume, self.volume.data), Recording(perturbations or [], [])
-            here = with_fetch(whole, record if voxels else self.fetch)
-            found, classification = [], classification_of(self.transfer, here, integrated=march.integrates)
+            whole, record = with_voxels(volume, self.scene.volume.data), Recording(perturbations or [], [])
+            here = with_fetch(whole, record if voxels else self.prepared.volume.fetch)
+            classification = classification_of(self.scene.transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # it is constant here
-            pipeline = self.pipeline._replace(march=march, volume=here, classification=classification)
-            for piece in pieces(pipeline, ray, at, number):
-                depth, measured = march.sample(piece), measure(pipeline, ray, piece, recorded=True)
+            scene = self.prepared._replace(march=march, volume=here, classification=classification)
+            found = []
+            for piece in pieces(scene, ray, at, number):
+                depth, measured = march.sample(piece), measure(scene, ray, piece, recorded=True)
                 point = along(ray.entry, ray.direction, depth)
                 place = None if self.shader is None else (point, ray.direction)
                 at_depth = depth if self.given.depth is not None else None
@@ -247,8 +235,8 @@ class Replay(SampleVisitor):
         moving, perturbations = (march, volume, ray), []
         if voxels:
             _, bases = jax.eval_shape(all_, moving, [])
-            if not bases and self.volume.field is not None:
-                kind = type(self.volume.field).__name__
+            if not bases and self.scene.volume.field is not None:
+                kind = type(self.scene.volume.field).__name__
                 raise ValueError(
                     f"the gradient to the voxels of a volume with the field {kind}, which asks for none by"
                     ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
@@ -267,7 +255,7 @@ class Replay(SampleVisitor):
     ) -> tuple[Scalar, list[Scalar]]:
         """What all samples so far are worth, and the derivative of the loss by each one's optical depth."""
         slopes: list[list[Scalar]] = [[] for _ in worth]
-        compositing = self.pipeline.compositing
+        compositing = self.prepared.compositing
         assert isinstance(compositing, Weighting)
         for k in range(worth[0].shape[0]):
             for i, value in enumerate(worth):

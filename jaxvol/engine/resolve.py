@@ -1,6 +1,6 @@
 """Computes pixels after the march, by chunks of those that are not transparent.
 
-For modes that resolve, and for lightings that shade pixels: `reference.resolve` says what of each.
+For modes that resolve, and for lightings that shade pixels: `ray.resolve` says what of each.
 """
 
 from collections.abc import Callable
@@ -12,17 +12,15 @@ from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar
 from ..compositing.selection import Selection
-from ..reference import resolve
+from ..ray import Scene, resolve
 from ..scene.space import Line
 from ..xla.compaction import in_front, in_place
 from ..xla.trees import PyTree
 from . import devices
 from .acceleration import VolumeAcceleration
 from .devices import on_devices
-from .image import RenderOptions, fault_of, pipeline_of
 from .rays import lines_at
-from .scene import Scene
-from .tiling import Tiling
+from .tiling import RenderOptions, Tiling
 
 
 NUMBERS = 5
@@ -36,13 +34,11 @@ def resolve_pixels(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
     """Pixels, their depths, and their normals where these are asked for, from what the march found."""
-    scene = acceleration.packed(scene)
-    space, pipeline = pipeline_of(scene, acceleration)
-    mode = scene.compositing
+    prepared, mode = acceleration.packed(scene).prepared(), scene.compositing
     with_normal = isinstance(mode, Selection) and mode.has_normal and options.outputs == "all"
 
     def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, " numbers"]:
-        pixel = resolve(pipeline, scene.lighting, space, line, rgba, depth, selected)
+        pixel = resolve(prepared, line, rgba, depth, selected)
         normal = [pixel.normal] if with_normal and pixel.normal is not None else []
         return jnp.concatenate([pixel.rgba, pixel.depth[None], *normal])
 
@@ -50,10 +46,10 @@ def resolve_pixels(
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
     resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal)
-    return resolved * jnp.where(fault_of(scene), jnp.nan, 1).astype(resolved.dtype)
+    return resolved * jnp.where(scene.has_fault, jnp.nan, 1).astype(resolved.dtype)
 
 
-resolve_image = on_devices("whole")(resolve_pixels)
+resolve_image = on_devices("replicated")(resolve_pixels)
 
 
 def of_visible(
@@ -87,7 +83,7 @@ def of_visible(
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
     starts = jnp.arange(0, chosen.size, size, dtype=jnp.int32) if size > 0 else chosen
-    own = devices.mine(mesh, starts)
+    own = devices.own_share(mesh, starts)
     pixels = jax.lax.map(chunk, own) if size > 0 else computed(own)
-    pixels = devices.collected(mesh, pixels).reshape(-1, numbers)
+    pixels = devices.gathered(mesh, pixels).reshape(-1, numbers)
     return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)

@@ -19,12 +19,13 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Scalar, Vec3
 from ..compositing.selection import Selection
-from ..march.march import RUN, Cell, March
-from ..reference import Pipeline, Progress, add, move, opacity, pieces, stop
+from ..march.march import Cell, March
+from ..march.strides import RUN, steps_of
+from ..ray import Progress, Scene, add, move, opacity, pieces, stop
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
+from ..xla.memory import in_memory
 from ..xla.trees import PyTree
-from ..xla.xla import in_memory
 from .inline_shading import inline_shader, light_terms, lit_colors
 from .tiling import Tiling
 from .visible_samples import shaded_colors
@@ -33,12 +34,12 @@ from .visible_samples import shaded_colors
 def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
     """Steps to where the next cells of rays begin: (cells,), or (cells, rays) where strides differ."""
     number = jnp.arange(cells, dtype=at.index.dtype)
-    return number if at.stride is None else number[:, None] * at.stride[None]
+    return number if at.strides is None else number[:, None] * at.strides.steps[None]
 
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, arrays (cells, rays). Cells
-    that a ray does not take are placed beyond its exit. `light`: the terms of shading that is `inline`."""
+    that a ray does not keep are placed beyond its exit. `light`: the terms of shading that is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
@@ -82,7 +83,7 @@ def regular_from_here(at: Progress) -> Bool[Array, "*rays"]:
 
 
 def march_segment(
-    pipeline: Pipeline,
+    scene: Scene,
     tiling: Tiling,
     ray: Ray,
     at: Progress,
@@ -93,60 +94,55 @@ def march_segment(
     """Marches rays by a segment, or to where they are finished, shifted off the cells that were sampled, or
     at the end of a run; or to `until`, where that is given. `regular`: no ray has a shift or such an end
     ahead of it."""
-    march, classification = pipeline.march, pipeline.classification
-    number = tiling.cells if at.stride is None else min(tiling.cells, RUN)
-    every = samples = _sampled(pipeline, number, ray, at)
-    taken: Int[Array, " rays"] | None = None
-    shifted = None
-    # otherwise runs begin and end with segments
-    partly = at.phase is not None or RUN % number > 0
-    if not regular or (at.stride is not None and partly):
-        fewer = in_memory(always(at), partial(_taken, march), at, every.opacity, until)
-        (taken, shifted), samples = fewer, _without(every, fewer[0], ray)
+    march, classification = scene.march, scene.classification
+    number = tiling.cells if at.strides is None else min(tiling.cells, RUN)
+    every = samples = _sampled(scene, number, ray, at)
+    kept: Int[Array, " rays"] | None = None
+    shifts = None
+    if not regular or (at.strides is not None and at.strides.ends_within(number)):
+        fewer = in_memory(always(at), partial(_kept, march), at, every.opacity, until)
+        (kept, shifts), samples = fewer, _truncated(every, fewer[0], ray)
     colors: list[Vec3] | list[None]
     values = [read[:1] for read in every.measured]
-    if isinstance(pipeline.compositing, Selection):
+    if isinstance(scene.compositing, Selection):
         colors, values = [None] * len(every.cells), every.measured
     elif classification.light is None:
-        colors = _colors(pipeline, at, every.measured)
-    elif (shader := inline_shader(pipeline)) is not None:
+        colors = _colors(scene, at, every.measured)
+    elif (shader := inline_shader(scene)) is not None:
         assert every.light is not None
-        parts = every.cells, _colors(pipeline, at, every.measured), every.light
-        colors = lit_colors(shader, pipeline, ray, *parts)
+        parts = every.cells, _colors(scene, at, every.measured), every.light
+        colors = lit_colors(shader, scene, ray, *parts)
     else:
-        colors = shaded_colors(
-            pipeline, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity
-        )
+        colors = shaded_colors(scene, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity)
     cells = tuple(zip(every.cells, values, colors, every.opacity, strict=True))
 
-    def composited(ray: Ray, at: Progress, taken: Bool[Array, ""] | None, cell: Any) -> Progress:
+    def composited(ray: Ray, at: Progress, keeps: Bool[Array, ""] | None, cell: Any) -> Progress:
         finished = at.finished
-        if taken is not None:
-            at = replace(at, finished=finished | ~taken)
+        if keeps is not None:
+            at = replace(at, finished=finished | ~keeps)
         for piece in cell:
-            at = add(pipeline, ray, at, *piece, alone=len(cell) == 1)
-        return stop(pipeline, replace(at, finished=finished))
+            at = add(scene, ray, at, *piece, divided=len(cell) > 1)
+        return stop(scene, replace(at, finished=finished))
 
     def next_(at: Progress, each: tuple[Int[Array, ""], Any]) -> tuple[Progress, None]:
         index, cell = each
         # not from `samples`, whose arrays would have to be stored
-        takes = None if taken is None else index < taken
-        return jax.vmap(composited)(ray, at, takes, cell), None
+        keeps = None if kept is None else index < kept
+        return jax.vmap(composited)(ray, at, keeps, cell), None
 
     # unrolled, so that nothing between two cells is put in memory
     order = jnp.arange(number, dtype=at.index.dtype)
     after, _ = jax.lax.scan(next_, at, (order, cells), unroll=number)
-    steps = jnp.full_like(at.index, number) if taken is None else taken
-    steps = steps if at.stride is None else steps * at.stride
-    return jax.vmap(partial(move, march))(ray, after, shifted, steps), samples
+    steps = jnp.full_like(at.index, number) if kept is None else kept
+    return jax.vmap(partial(move, march))(ray, after, shifts, steps * steps_of(at.strides)), samples
 
 
-def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples:
+def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
     """The samples of so many cells ahead of each ray."""
-    march, classification = pipeline.march, pipeline.classification
+    march, classification = scene.march, scene.classification
 
     def pieces_of(at: Progress) -> tuple[Cell, ...]:
-        rays = jax.vmap(partial(pieces, pipeline), in_axes=(0, 0, None))
+        rays = jax.vmap(partial(pieces, scene), in_axes=(0, 0, None))
         return jax.vmap(rays, in_axes=(None, None, 0))(ray, at, jnp.arange(number, dtype=at.index.dtype))
 
     cut = pieces_of(at)
@@ -166,25 +162,25 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
-        each = vmap_cells(partial(opacity, pipeline), (False, True, True))
+        each = vmap_cells(partial(opacity, scene), (False, True, True))
         return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
 
     live = always(at)
     if march.integrates:
-        values = _measured_over(pipeline, ray, live, partial(cells, at, given))
+        values = _measured_over(scene, ray, live, partial(cells, at, given))
     else:
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
-    shader = inline_shader(pipeline)
-    light = None if shader is None else light_terms(shader, pipeline, live, ray, partial(cells, at, given))
+    shader = inline_shader(scene)
+    light = None if shader is None else light_terms(shader, scene, live, ray, partial(cells, at, given))
     return Samples(list(cells(at, given)), values, alphas, light)
 
 
 def always(at: Progress) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
     # In a pass there are at most some `march.most_samples` / cells segments, in each of which an index grows
-    # by at most cells * `longest_stride`, finished or not: with 2**24 samples and strides of 64 it stays
-    # below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
+    # by at most cells times the longest stride, finished or not: with 2**24 samples and strides of 64 it
+    # stays below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
     return at.index[0] >= 0
 
 
@@ -197,25 +193,25 @@ def _searched(classification: Classification, live: Bool[Array, ""], read: list[
     return [(*each, *more) for each, more in zip(read, found, strict=True)]
 
 
-def _colors(pipeline: Pipeline, at: Progress, measured: list[Measured]) -> list[Vec3]:
+def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
     """The colours of cells, as classified."""
-    classify = vmap_cells(pipeline.classification.of_cells)
+    classify = vmap_cells(scene.classification.of_cells)
 
     def all_(measured: list[Measured]) -> list[Vec3]:
         return [classify(each)[0] for each in measured]
 
     # Means would be computed again for each use if they were fused into the compositing of each cell.
-    return in_memory(always(at), all_, measured) if pipeline.march.integrates else all_(measured)
+    return in_memory(always(at), all_, measured) if scene.march.integrates else all_(measured)
 
 
 def _measured_over(
-    pipeline: Pipeline, ray: Ray, live: Bool[Array, ""], cells: Callable[[], tuple[Cell, ...]]
+    scene: Scene, ray: Ray, live: Bool[Array, ""], cells: Callable[[], tuple[Cell, ...]]
 ) -> list[Measured]:
     """What is measured over the pieces of cells, each end once where they are joined."""
-    march, classification = pipeline.march, pipeline.classification
+    march, classification = scene.march, scene.classification
     at = vmap_cells(lambda ray, depth: classification.measure(ray.path(depth))[:1], (False, True))
     between = vmap_cells(
-        lambda ray, piece: classification.beside(ray.path(march.sample(piece))), (False, True)
+        lambda ray, piece: classification.attributes(ray.path(march.sample(piece))), (False, True)
     )
     ends_of = vmap_cells(lambda ray, piece: march.ends(piece, ray), (False, True))
 
@@ -228,7 +224,7 @@ def _measured_over(
         first = jnp.concatenate([ends[0][0][:1], ends[-1][1]])
         return [at(ray, first), *(at(ray, back) for _, back in ends[:-1])]
 
-    beside = in_memory(live, lambda _: [between(ray, piece) for piece in cells()], live)
+    attributes = in_memory(live, lambda _: [between(ray, piece) for piece in cells()], live)
     read = _searched(classification, live, in_memory(live, measured, live))
     if not march.joins:
         fronts, backs = read[::2], read[1::2]
@@ -236,38 +232,35 @@ def _measured_over(
         joints, *inner = read
         backs = [*inner, jax.tree.map(lambda leaf: leaf[1:], joints)]
         fronts = [jax.tree.map(lambda leaf: leaf[:-1], joints), *inner]
-    return [classification.spanned(*each) for each in zip(beside, fronts, backs, strict=True)]
+    return [classification.spanned(*each) for each in zip(attributes, fronts, backs, strict=True)]
 
 
-def _taken(
+def _kept(
     march: March, at: Progress, opacity: list[Scalar], until: Int[Array, " rays"] | None
 ) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
-    """How many of a segment's cells each ray takes, and whether the last of them shifts it. A ray with a
+    """How many of a segment's cells each ray keeps, and whether the last of them shifts it. A ray with a
     shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
     left = march.most_samples - at.index
     if until is not None:
         left = jnp.clip(until - at.index, 0, left)
-    number = jnp.arange(opacity[0].shape[0], dtype=at.index.dtype)
-    if at.stride is not None:
-        run, phase = RUN * at.stride, 0 if at.phase is None else at.phase
-        steps = jnp.minimum(left, run - ((at.index + phase) & (run - 1)))
-        left = jnp.sum(begins(at, number.size) < steps[None], axis=0, dtype=left.dtype)
-    cells = number.size
+    if at.strides is not None:
+        left = at.strides.cells_left(at.index, left)
+    cells = opacity[0].shape[0]
     # cell by cell, back to front: a reduction over all of them would be a loop of its own
     first = jnp.full_like(left, cells + 1)
     for k in reversed(range(cells)):
         transparent = jnp.all(jnp.stack([alpha[k] for alpha in opacity]) == 0, axis=0)
         first = jnp.where(transparent, k + 1, first)
-    shifted = ~regular_from_here(at) & (first <= jnp.minimum(left, cells))
-    return jnp.minimum(jnp.where(shifted, first, cells), left), shifted
+    shifts = ~regular_from_here(at) & (first <= jnp.minimum(left, cells))
+    return jnp.minimum(jnp.where(shifts, first, cells), left), shifts
 
 
-def _without(samples: Samples, taken: Int[Array, " rays"], ray: Ray) -> Samples:
-    """The samples, with cells that are not taken made transparent and put beyond the exit."""
-    takes = jnp.arange(samples.number, dtype=taken.dtype)[:, None] < taken[None]
+def _truncated(samples: Samples, kept: Int[Array, " rays"], ray: Ray) -> Samples:
+    """The samples, with all cells but the first `kept` made transparent and put beyond the exit."""
+    keeps = jnp.arange(samples.number, dtype=kept.dtype)[:, None] < kept[None]
     cells = [
-        eqx.tree_at(lambda cell: cell.front, cell, jnp.where(takes, cell.front, ray.length[None]))
+        eqx.tree_at(lambda cell: cell.front, cell, jnp.where(keeps, cell.front, ray.length[None]))
         for cell in samples.cells
     ]
-    opacity = [jnp.where(takes, alpha, 0) for alpha in samples.opacity]
+    opacity = [jnp.where(keeps, alpha, 0) for alpha in samples.opacity]
     return samples._replace(cells=cells, opacity=opacity)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
-from ..reference import Pipeline
+from ..ray import Scene
 from ..scene.space import Ray
 from ..scene.volume import read_as
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
@@ -45,7 +45,7 @@ class ShadingVjp(NamedTuple):
 
 def shading_vjp(
     shader: Shader,
-    pipeline: Pipeline,
+    scene: Scene,
     ray: Ray,
     samples: Samples,
     weights: Weights,
@@ -62,7 +62,7 @@ def shading_vjp(
         indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
     ) -> tuple[ShadingVjp, ShadingTotal]:
         found, total = carry
-        some = samples_of(chosen, indices, pipeline, ray, samples.cells, samples.measured, weights)
+        some = samples_of(chosen, indices, scene, ray, samples.cells, samples.measured, weights)
         real = indices < size
         red, green, blue = (jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
         color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)

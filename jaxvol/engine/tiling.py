@@ -1,12 +1,17 @@
 """How is work divided for this machine? All constants of the fast engine, in one place."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
+import equinox as eqx
 from jax.sharding import Mesh
 
+from ..compositing.compositing import Outputs
 from ..xla.compaction import CHUNK
 from ..xla.platform import on_gpu
+
+
+Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
 
 
 class Tiling(NamedTuple):
@@ -25,7 +30,7 @@ class Tiling(NamedTuple):
     - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
       many steps as the slowest ray among them.
     - `chunk`: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
-    - `devices`: to which beams are dealt out, a mesh of one axis; None where JAX decides.
+    - `devices`: between which beams are sharded, a mesh of one axis; None where JAX decides.
     """
 
     cells: int = 8
@@ -60,6 +65,18 @@ class Tiling(NamedTuple):
         """The sizes for programs that are traced now, on these devices: `GPU` where they are for one, the
         defaults, which were measured on CPUs, elsewhere."""
         return (GPU if on_gpu() else Tiling())._replace(devices=devices)
+
+
+class RenderOptions(eqx.Module):
+    """What is computed, how it is differentiated, and how work is divided.
+
+    - `steps`: of each ray's scan, for `"direct"`.
+    """
+
+    outputs: Outputs = eqx.field(static=True)
+    tiling: Tiling = eqx.field(static=True)
+    adjoint: Adjoint = eqx.field(static=True, default="replay")
+    steps: int | None = eqx.field(static=True, default=None)
 
 
 GPU = Tiling(cells=16, batch=2**12, turns=8, tile=2**14, searched=2**16, chunk=0)

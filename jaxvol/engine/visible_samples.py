@@ -14,7 +14,7 @@ from .._util.vec3 import Scalar, Vec3, along
 from ..compositing.compositing import Composite, Weighting
 from ..lighting.shading import Sample, Shader
 from ..march.march import Cell
-from ..reference import Pipeline, Progress, stopped
+from ..ray import Progress, Scene, stopped
 from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..xla.compaction import Chosen
@@ -30,9 +30,9 @@ class Weights(NamedTuple):
     finished: list[Bool[Array, "cells rays"]]
 
 
-def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weights:
+def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
     """The weights of consecutive cells, from the opacities of their pieces."""
-    compositing = pipeline.compositing
+    compositing = scene.compositing
     assert isinstance(compositing, Weighting)
     composite, finished = Composite(at.composite.opacity), at.finished
     found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
@@ -42,7 +42,7 @@ def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weight
             weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
             composite = composite.add(weight)
             found[i].append((weight, before, composite.opacity, finished))
-        finished |= jax.vmap(partial(stopped, pipeline))(composite)
+        finished |= jax.vmap(partial(stopped, scene))(composite)
     each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
     return Weights(*(list(parts) for parts in zip(*each, strict=True)))
 
@@ -55,7 +55,7 @@ def visible(weights: Weights, chunk: int) -> Chosen:
 def samples_of(
     chosen: Chosen,
     indices: Int[Array, " chunk"],
-    pipeline: Pipeline,
+    scene: Scene,
     ray: Ray,
     cells: list[Cell],
     measured: list[Measured],
@@ -65,15 +65,15 @@ def samples_of(
     entry, direction, pixel = jax.tree.map(
         lambda leaf: leaf.at[indices % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
     )
-    depths = [pipeline.march.sample(cell) for cell in cells]
+    depths = [scene.march.sample(cell) for cell in cells]
     depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), indices)
-    color, extinction = jax.vmap(pipeline.classification.of_cells)(read)
-    transmittance = pipeline.compositing.transmittance(Composite(before))
+    color, extinction = jax.vmap(scene.classification.of_cells)(read)
+    transmittance = scene.compositing.transmittance(Composite(before))
     return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
 
 
 def shaded_colors(
-    pipeline: Pipeline,
+    scene: Scene,
     chunk: int,
     ray: Ray,
     at: Progress,
@@ -82,16 +82,16 @@ def shaded_colors(
     alphas: list[Scalar],
 ) -> list[Vec3]:
     """Shaded colours of a segment's samples; any finite ones for invisible samples."""
-    weights, light = weights_of(pipeline, at, alphas), pipeline.classification.light
+    weights, light = weights_of(scene, at, alphas), scene.classification.light
     assert isinstance(light, Shader)
     none, shown = jnp.zeros_like(alphas[0]), [weight > 0 for weight in weights.weight]
     dark = [(none, none, none)] * len(alphas)
     if light.shading.has_dark_samples:
-        shown, dark = _apart_from_dark(pipeline, light, ray, cells, measured, weights)
+        shown, dark = _apart_from_dark(scene, light, ray, cells, measured, weights)
     chosen = Chosen.of(shown, chunk)
 
     def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        samples = samples_of(chosen, indices, pipeline, ray, cells, measured, weights)
+        samples = samples_of(chosen, indices, scene, ray, cells, measured, weights)
         return chosen.put(colors, indices, light(samples))
 
     start = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *dark)
@@ -99,7 +99,7 @@ def shaded_colors(
 
 
 def _apart_from_dark(
-    pipeline: Pipeline,
+    scene: Scene,
     light: Shader,
     ray: Ray,
     cells: list[Cell],
@@ -111,9 +111,9 @@ def _apart_from_dark(
     least = light.shading.thresholds()[0]
 
     def one(ray: Ray, cell: Cell, measured: Measured, before: Scalar) -> tuple[Vec3, Bool[Array, ""]]:
-        point = along(ray.entry, ray.direction, pipeline.march.sample(cell))
-        color, extinction = pipeline.classification.of_cells(measured)
-        transmittance = pipeline.compositing.transmittance(Composite(before))
+        point = along(ray.entry, ray.direction, scene.march.sample(cell))
+        color, extinction = scene.classification.of_cells(measured)
+        transmittance = scene.compositing.transmittance(Composite(before))
         sample = Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
         return light.shading.dark(light.around, sample), transmittance < least
 

@@ -16,7 +16,7 @@ from .._util.vec3 import Vec3
 from ..scene.volume import Volume
 from ..scene.voxel_fetch import corners
 from ..xla.compaction import Chosen
-from ..xla.xla import gather
+from ..xla.memory import gather
 from .shading import Lighting, Sample, Shader, Shading, Surroundings
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along, scaled
 from ..scene.transfer import Measured
-from ..xla.xla import gather
+from ..xla.memory import gather
 from .lights import ConstantLight, Light, LocatedLight
 from .materials import Material, Optics, shares, smoothstep, step
 from .shading import Sample, Shading, Surroundings

@@ -19,9 +19,9 @@ from .._util.checks import flag, integer, is_flag, number
 from ..march.march import March, Transform
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
+from ..xla.compiling import computed_now
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
-from ..xla.xla import computed_now
 from .baked import BakedLighting, bake, nodes_for
 from .deferred import Deferred
 from .growth import scatterer_templates

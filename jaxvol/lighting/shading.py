@@ -22,9 +22,9 @@ from ..scene.space import Line, Space
 from ..scene.transfer import Classification, Measured, Transfer, classification_of
 from ..scene.volume import Volume, read_as, with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import OneByOne
+from ..xla.memory import in_memory
 from ..xla.sharding import varying
 from ..xla.trees import PyTree
-from ..xla.xla import in_memory
 
 
 T = TypeVar("T")
@@ -89,7 +89,7 @@ class Surroundings(eqx.Module):
     @property
     def classification(self) -> Classification:
         """The transfer function, applied to the volume."""
-        return self.transfer.classification(self.volume) if self.tables is None else self.tables
+        return classification_of(self.transfer, self.volume) if self.tables is None else self.tables
 
     def stored(self, f: Callable[[], T]) -> T:
         """`f()`, computed once for all its uses."""

@@ -12,27 +12,24 @@ At each seam the answers of all transforms are combined, so that they compose.
 | `start` | how many steps past the entry is the first cell? | 0 |
 | `shift` | by what part of a step do samples after the first transparent one move? | 0 |
 | `empty_space` | where is nothing visible? | unknown |
-| `prepared` | what must be known of the scene? | nothing |
-| `stride_error` | how wrong is the image if cells are so many steps long here? | unknown: 1 step |
 | `cut` | which part of its cell does a sample stand for? | all of it |
 | `stop` | is this ray finished? | not before the exit |
+
+How many steps long each cell is, one by default, is decided in `strides.py`.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial, reduce
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import check_answer, described, integer, number, power_of_two
+from .._util.checks import check_answer, described, integer, number
 from .._util.vec3 import Scalar, Vec3
 from ..scene.occupancy import Occupancy
 from ..scene.space import Affine, Ray, Space
-from ..scene.variation import Variation, Windows
 from ..scene.volume import Volume
 from .beams import Box
 
@@ -49,45 +46,6 @@ class Cell(eqx.Module):
     front: Scalar
     width: Scalar
     cut: Bool[Array, ""]
-
-
-RUN = 4
-"""Cells in a row that are equally long. Where strides are not all 1, the cells of a ray come in such runs."""
-
-
-class Run(NamedTuple):
-    """RUN cells of a ray, in a row, each `stride` steps long.
-
-    - `front`: depth at which the first one begins. (What `Transform.shift` adds is not in it.)
-    - `stride`: a power of two, static. `step`: its unit, world length.
-    """
-
-    front: Scalar
-    stride: int
-    step: Scalar
-
-    @property
-    def middle(self) -> Scalar:
-        """Depth of the middle of the run."""
-        return self.front + RUN * self.stride / 2 * self.step
-
-    def within(self, length: Scalar) -> Bool[Array, ""]:
-        """Whether the run ends at this depth or before, up to a thousandth of a step: where rays are so many
-        steps long, rounding must not decide."""
-        return self.front + (RUN * self.stride - 1e-3) * self.step <= length
-
-
-class Strides(NamedTuple):
-    """The cells of a ray from an index on.
-
-    - `begin`: index at which one begins.
-    - `stride`: their length, in steps, up to the end of the run.
-    - `error`: what is predicted of the run, 0 if it was begun before.
-    """
-
-    begin: Int[Array, ""]
-    stride: Int[Array, ""]
-    error: Scalar
 
 
 class View(NamedTuple):
@@ -160,38 +118,6 @@ class Transform(eqx.Module):
         """Where nothing is visible; None if that is unknown. Called once for each image. `view`: of the
         image; None for `render_rays`."""
         return None
-
-    def prepared(self, march: "March", space: Space, windows: Windows, variation: Variation) -> "Transform":
-        """This transform with what `stride_error` needs to know of the scene, found once for each image, and
-        without a gradient: in fields that hold None before, and arrays of integers afterwards.
-
-        `windows`: how the volume's values vary, block by block; `variation`: how much what is
-        composited changes within their ranges."""
-        return self
-
-    @property
-    def longest_stride(self) -> int:
-        """The longest stride that `stride_error` is asked about: a static power of two, at most 64."""
-        return 1
-
-    @property
-    def subdivision(self) -> int:
-        """Into how many parts each step of the march is divided before all else; a static integer."""
-        return 1
-
-    def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
-        """By how much the image is wrong because of these cells, if nothing lies in front of them, as far as
-        can be predicted; and how much is tolerated.
-
-        Both depend on the ray and the run alone. A run is allowed if its error, times the transmittance in
-        front of it, is at most what is tolerated (if several transforms override this, by each), and always
-        if its stride is 1. A run of stride s begins at a multiple of RUN s steps, from `March.phase` steps
-        before the ray's first cell on. Where a run ends, a march takes the longest one that is allowed and
-        begins there (and ends before the exit, unless cells are cut there). Of two runs that meet one holds
-        the other, so that leaps, which only cross what is transparent, do not change which ones are taken.
-        Gradients take strides as given; the image jumps where one changes."""
-        unknown = jnp.full(jnp.shape(run.front), jnp.inf, ray.length.dtype)
-        return unknown, jnp.zeros_like(unknown)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
@@ -274,7 +200,6 @@ class March(eqx.Module):
                 raise ValueError(
                     f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
                 )
-            _check_strides(transform)
         if quadrature not in get_args(Quadrature):
             names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
@@ -293,52 +218,19 @@ class March(eqx.Module):
             _check_kind(transform, "empty_space", index, EmptySpaceIndex | None)
         return next((index for index in indices if index is not None), None)
 
-    def _overriding(self, seam: str) -> list[Transform]:
+    def overriding(self, seam: str) -> list[Transform]:
+        """The transforms that override a seam."""
         return [transform for transform in self.transforms if _overrides(transform, seam)]
 
     @property
     def leaps(self) -> bool:
         """Whether any transform overrides `empty_space`."""
-        return bool(self._overriding("empty_space"))
+        return bool(self.overriding("empty_space"))
 
     @property
     def may_shift(self) -> bool:
         """Whether any transform overrides `shift`."""
-        return bool(self._overriding("shift"))
-
-    @property
-    def looks_ahead(self) -> bool:
-        """Whether any transform must know the scene before it is marched."""
-        return bool(self._overriding("prepared"))
-
-    def prepared(
-        self, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
-    ) -> "March":
-        """The march, whose transforms know of the scene what they need. `windows`: of the volume, where it
-        `looks_ahead`."""
-        if windows is None:
-            return self
-        march, space, windows = jax.lax.stop_gradient((self, space, windows))
-        varies = jax.lax.stop_gradient(variation(windows))
-        known = []
-        for transform, constant in zip(self.transforms, march.transforms, strict=True):
-            if _overrides(transform, "prepared"):
-                prepared = constant.prepared(march, space, windows, varies)
-                _check_kind(transform, "prepared", prepared, type(transform))
-                # its parameters keep their gradients
-                transform = eqx.combine(eqx.filter(transform, eqx.is_inexact_array), prepared)
-            known.append(transform)
-        return eqx.tree_at(lambda march: march.transforms, self, tuple(known))
-
-    @property
-    def strides_vary(self) -> bool:
-        """Whether any transform overrides `stride_error`."""
-        return bool(self._overriding("stride_error"))
-
-    @property
-    def longest_stride(self) -> int:
-        """The longest stride of a cell, in steps."""
-        return min((transform.longest_stride for transform in self._overriding("stride_error")), default=1)
+        return bool(self.overriding("shift"))
 
     def locate(self, volume: Volume) -> Space:
         """The space in which rays meet the volume."""
@@ -366,70 +258,6 @@ class March(eqx.Module):
         # beyond that a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
-    def phase(self, ray: Ray) -> Int[Array, ""] | None:
-        """How many steps before a ray's first cell the first of all runs begins, less than the longest one:
-        at random where `start` or `shift` are. These alone move samples by less than a step, too little to
-        break the wood grain of longer cells, and of the runs themselves. None if 0 for all rays."""
-        if not self._overriding("start") and not self.may_shift:
-            return None
-        part = jax.lax.stop_gradient(self.start(ray) - self.shift(ray))
-        # its lower digits, of which the part of a step is nearly independent; all of it is exact
-        part = 32 * part
-        longest = RUN * self.longest_stride
-        return jnp.floor((part - jnp.floor(part)) * longest).astype(jnp.int32) & (longest - 1)
-
-    def divided(self) -> "March":
-        """This march with its steps as short as its transforms want them."""
-        parts = max((transform.subdivision for transform in self.transforms), default=1)
-        if parts == 1:
-            return self
-        with jax.ensure_compile_time_eval():  # a step that is known stays so inside `jax.jit`
-            step = self.step / parts
-        return eqx.tree_at(lambda march: march.step, self, step)
-
-    def strides(
-        self,
-        ray: Ray,
-        index: Int[Array, ""],
-        stride: Int[Array, ""],
-        target: Int[Array, ""],
-        transmittance: Scalar,
-        phase: Int[Array, ""] | None,
-    ) -> Strides:
-        """The cells of a ray from where the run begins that holds `target`, or from `index` on, to which the
-        ray has come, in a run of this `stride`, if `target` lies in the same run. Up to `target` all is
-        transparent. `phase`: of the ray, which does not change along it."""
-        march, ray, transmittance = jax.lax.stop_gradient((self, ray, transmittance))
-        start, chosen = march.start(ray), None
-        phase = jnp.zeros_like(index) if phase is None else phase
-        since, ahead, length = index + phase, target + phase, RUN * stride
-        end = jnp.where(since & (length - 1) == 0, since, (since | (length - 1)) + 1)
-        # before the ray's first cell there is no run
-        end = jnp.where(index == 0, phase, end)
-        for level in range(self.longest_stride.bit_length()):
-            first = ahead & -(RUN << level)
-            front = (start + (first - phase).astype(start.dtype)) * march.step
-            run = Run(front, 1 << level, march.step)
-            predicted = [_predicted(transform, ray, run) for transform in march._overriding("stride_error")]
-            greatest = reduce(jnp.maximum, [error for error, _ in predicted])
-            # what is unknown is infinite, but does not count where nothing of it is seen
-            error = jnp.where(transmittance > 0, transmittance * greatest, 0)
-            found = Strides(first - phase, jnp.full_like(index, run.stride), error)
-            if chosen is None:
-                # the first of all runs may have begun before the ray's first cell
-                chosen = found._replace(begin=jnp.maximum(found.begin, end - phase))
-                continue
-            fits = first >= end
-            if not self.ends_at_exit:
-                fits &= run.within(ray.length)
-                for left, back in ray.gaps:  # a shift may still move the run, by a step at most
-                    fits &= run.within(left) | (run.front - run.step >= back)
-            for error, tolerated in predicted:
-                fits &= transmittance * error <= tolerated
-            chosen = jax.tree.map(partial(jnp.where, fits), found, chosen)
-        going = Strides(index, stride, jnp.zeros_like(ray.length))
-        return jax.tree.map(partial(jnp.where, ahead < end), going, chosen)
-
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces of a cell, front to back."""
         pieces = (cell,)
@@ -452,7 +280,7 @@ class March(eqx.Module):
     @property
     def joins(self) -> bool:
         """Whether each piece of a cell begins where the one in front of it ends."""
-        return all(transform.joins for transform in self._overriding("cut"))
+        return all(transform.joins for transform in self.overriding("cut"))
 
     @property
     def ends_at_exit(self) -> bool:
@@ -501,20 +329,3 @@ def _cut(transform: Transform, cell: Cell, ray: Ray, volume: Volume) -> tuple[Ce
     for piece in pieces:
         _check_kind(transform, "cut", piece, Cell)
     return pieces
-
-
-def _predicted(transform: Transform, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
-    """A transform's `stride_error`, if it is two numbers like a depth."""
-    answer = transform.stride_error(ray, run)
-    check_answer(transform, "stride_error", answer, (run.front, run.front))
-    return answer
-
-
-def _check_strides(transform: Transform) -> None:
-    name, longest = type(transform).__name__, transform.longest_stride
-    if _overrides(transform, "stride_error") != _overrides(transform, "longest_stride"):
-        raise ValueError(
-            f"transforms: {name} must override both stride_error and longest_stride, or neither."
-        )
-    power_of_two(f"transforms: {name}.longest_stride", longest, 64)
-    integer(f"transforms: {name}.subdivision", transform.subdivision, 1, 64)

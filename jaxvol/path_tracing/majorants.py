@@ -18,7 +18,7 @@ from ..scene.occupancy import BLOCK, Blocks
 from ..scene.space import Affine
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
-from ..xla.xla import gather
+from ..xla.memory import gather
 
 
 Block: TypeAlias = Int[Array, "..."]

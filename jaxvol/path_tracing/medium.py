@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.materials import Material, shares
-from ..scene.transfer import Measured, Transfer
+from ..scene.transfer import Measured, Transfer, classification_of
 from ..scene.volume import Volume
 
 
@@ -28,7 +28,7 @@ class Medium(NamedTuple):
         Where the transfer function shows a material, the extinction is 1/λ instead, and the albedo is
         colour · (1 - opacity). Where materials overlap, the first counts.
         """
-        classification = transfer.classification(volume)
+        classification = classification_of(transfer, volume)
 
         def measure(coordinate: Vec3) -> Measured:
             measured = classification.measure(coordinate)

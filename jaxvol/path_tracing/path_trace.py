@@ -17,17 +17,17 @@ from .._util.checks import Arrayable, all_finite, described, flag, integer, numb
 from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
-from ..arguments import check_arguments
-from ..engine.packing import with_words, words_of
+from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
+from ..ray import check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
+from ..xla.compiling import compiled
 from ..xla.platform import is_traced
-from ..xla.xla import compiled
 from .lanes import PathResults, walk_all
 from .majorants import Majorants
 from .medium import Medium

@@ -17,7 +17,7 @@ from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, selec
 from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
 from ..scene.space import Affine
 from ..scene.volume import Volume
-from ..xla.xla import in_memory
+from ..xla.memory import in_memory
 from .majorants import Majorants
 from .medium import Medium
 from .phase import phase, sample_phase, scattered

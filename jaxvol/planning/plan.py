@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._util.checks import described, flag, integer
-from ..arguments import check_arguments
 from ..compositing.compositing import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
 from ..march.transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
+from ..ray import check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.rendering import Rendering

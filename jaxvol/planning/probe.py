@@ -9,12 +9,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import along
 from ..compositing.compositing import Compositing
-from ..engine.driver import render_scene
-from ..engine.rays import OwnRays
-from ..engine.scene import Scene
+from ..engine.image import render_scene
 from ..lighting.shading import Lighting
 from ..march.march import March
-from ..scene.camera import Camera
+from ..ray import Scene
+from ..scene.camera import Camera, GivenRays
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
 from ..scene.space import Space
@@ -63,7 +62,7 @@ class Probe(NamedTuple):
     - `pixels`: of the whole image.
     """
 
-    source: OwnRays
+    source: GivenRays
     strata: Float[np.ndarray, " patches"]
     likely: Bool[np.ndarray, " patches"]
     inside: Float[np.ndarray, "patches pixels"]
@@ -215,8 +214,8 @@ def _passes(camera: Camera, space: Space, visible: Bool[Array, "bx by bz"]) -> B
 
 
 @jax.jit
-def _rays(camera: Camera, columns: Int[Array, " rays"], rows: Int[Array, " rays"]) -> OwnRays:
+def _rays(camera: Camera, columns: Int[Array, " rays"], rows: Int[Array, " rays"]) -> GivenRays:
     origins, directions = jax.vmap(camera.ray)(columns, rows)
     left, top = camera.first_pixel
     pixels = jnp.stack([columns + left, rows + top], axis=-1)
-    return OwnRays(jnp.stack(origins, axis=-1), jnp.stack(directions, axis=-1), pixels)
+    return GivenRays(jnp.stack(origins, axis=-1), jnp.stack(directions, axis=-1), pixels)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require
 from .._util.vec3 import Scalar, Vec3, along, apart
+from .space import Line
 from .volume import Volume, corners_of
 
 
@@ -221,6 +222,36 @@ class Camera(eqx.Module):
     def _row(self, row: Scalar | int) -> Scalar:
         bottom, top = self.window[2], self.window[3]
         return top - (top - bottom) * (row / self.size[1])
+
+
+class GivenRays(eqx.Module):
+    """Rays given by world origins and unit directions.
+
+    Random numbers along a ray are keyed by its pixel, (column, row); without `pixels` that is
+    (`first` + index in the flattened array, 0)."""
+
+    origins: Float[Array, "*rays 3"]
+    directions: Float[Array, "*rays 3"]
+    pixels: Int[Array, "*rays 2"] | None = None
+    first: Int[Array, ""] | int = 0
+
+    @classmethod
+    def of(cls, lines: Line) -> "GivenRays":
+        """These rays; their pixels are not kept."""
+        return cls(jnp.stack(lines.origin, axis=-1), jnp.stack(lines.direction, axis=-1))
+
+    def pixel(self, index: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
+        """The pixels of the rays at these indices."""
+        if self.pixels is None:
+            index = index.astype(jnp.int32)  # from 64 bits under x64
+            return self.first + index, jnp.zeros_like(index)
+        flat = self.pixels.reshape(-1, 2)
+        return flat[index, 0], flat[index, 1]
+
+    def line(self, index: Int[Array, ""]) -> Line:
+        """The ray at this index of the flattened array."""
+        (x, y, z), (dx, dy, dz) = (rays.reshape(-1, 3)[index] for rays in (self.origins, self.directions))
+        return Line((x, y, z), (dx, dy, dz), self.pixel(index))
 
 
 def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:

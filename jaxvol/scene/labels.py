@@ -20,7 +20,7 @@ from .._util.piecewise_linear import (
 )
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
-from ..xla.xla import gather
+from ..xla.memory import gather
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction
 from .volume import Volume
@@ -33,7 +33,7 @@ class LabelTransferFunction(Transfer):
 
     - `functions`: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
       label that is not seen. A label that is not named, or lies beyond the last, is not seen either. Labels
-      are 0 to 255 here; number others anew, as by `np.unique(labels, return_inverse=True)`.
+      are 0 to 255 here; renumber others, as by `np.unique(labels, return_inverse=True)`.
 
     A function with fewer control points than another is padded with copies of its last point beyond it.
 
@@ -114,19 +114,19 @@ class LabelTransferFunction(Transfer):
         extinction = self.stacked.extinction * factor[:, None]
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 
-    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+    def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """The label at a grid coordinate."""
         return (volume.label(coordinate),)
 
     def classifier(self) -> Classify:
         """Look-up of colour and extinction, by label and value."""
         tables = jax.vmap(TransferFunction.rows)(self._seen)
-        unseen, points = tables.shape[0] - 1, tables.shape[1]
+        hidden, points = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             value, label = measured
-            label = jnp.where((label < 0) | (label > unseen), unseen, label)
+            label = jnp.where((label < 0) | (label > hidden), hidden, label)
             values = gather(self.stacked.values, label)
             row = table_row(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
             return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
@@ -138,12 +138,12 @@ class LabelTransferFunction(Transfer):
         labels=True)` cuts it."""
         stacked = jax.lax.stop_gradient(self.stacked.values)
         tables = jax.vmap(TransferFunction.span_rows)(self._seen)
-        unseen, spans = tables.shape[0] - 1, tables.shape[1]
+        hidden, spans = tables.shape[0] - 1, tables.shape[1]
         rows = tables.reshape(-1, tables.shape[2])
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, label, (front,), (back,) = measured
-            label = jnp.where((label < 0) | (label > unseen), unseen, label)
+            label = jnp.where((label < 0) | (label > hidden), hidden, label)
             values = gather(stacked, label)
             i, j = (points_below(values, end) for end in (front, back))
             a, b = (table_row(rows, label * spans + span) for span in (i, j))

@@ -19,9 +19,9 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 from .._util.axes import XYZ, inverse
 from .._util.vec3 import Vec3
 from ..xla.memo import memoized
+from ..xla.memory import gather
 from ..xla.platform import on_gpu, while_loop
 from ..xla.sharding import varying
-from ..xla.xla import gather
 from .frame import Frame
 from .volume import Volume
 

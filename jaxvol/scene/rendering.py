@@ -42,7 +42,7 @@ class BrickReport(NamedTuple):
 class Details(NamedTuple):
     """Outputs that cost time, each None where it was not asked for. See `Rendering`.
 
-    `selected`: the state of a `Selection` after the march, which `reference.resolve` makes pixels from; None
+    `selected`: the state of a `Selection` after the march, which `ray.resolve` makes pixels from; None
     in an image.
     """
 

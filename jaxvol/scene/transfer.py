@@ -1,8 +1,8 @@
 """Which colour and extinction has this value?
 
-A transfer function answers three questions: `measured`, what it reads from the volume at a place;
-`classifier`, how that becomes colour and extinction; and `majorant`, a bound of its extinction over a block
-of the volume.
+A transfer function answers three questions: what it reads at a place besides the value (`attributes`), how
+that becomes colour and extinction (`classifier`), and how great the extinction can be in a block of the
+volume (`majorant`). Only the second has no default.
 """
 
 from abc import abstractmethod
@@ -28,8 +28,7 @@ from .._util.piecewise_linear import (
 )
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
-from ..xla.row_sums import row_sums
-from ..xla.xla import gather
+from ..xla.memory import gather, row_sums
 from .occupancy import Blocks
 from .variation import Variation, Windows
 from .volume import Volume
@@ -52,27 +51,27 @@ class Classification(NamedTuple):
     """
 
     measure: Callable[[Vec3], Measured]
+    attributes: Callable[[Vec3], Measured]
+    """What is measured besides the value."""
     classify: Classify
     search: Callable[[Measured], Measured] | None = None
-    """Looks up what `classify` needs beside the measured values, once; it is appended to them."""
-    light: Callable[[Any], Vec3] | None = None
-    """From a `lighting.shading.Sample`, or many along one axis, to the shaded colours. None: colours are as
-    classified."""
-    beside: Callable[[Vec3], Measured] = lambda _: ()
-    """What is measured beside the value."""
+    """`Transfer.search`; what it finds is appended to the measured values."""
     integrate: Classify | None = None
     """From what is measured of a cell (`spanned`) to its mean colour and extinction, if the value is linear
     along it. None: a cell is as its sample."""
+    light: Callable[[Any], Vec3] | None = None
+    """From a `lighting.shading.Sample`, or many along one axis, to the shaded colours. None: colours are as
+    classified."""
 
     def at(self, coordinate: Vec3) -> Measured:
         """What `classify` needs at a grid coordinate."""
         return self.searched(self.measure(coordinate))
 
     @staticmethod
-    def spanned(beside: Measured, front: Measured, back: Measured) -> Measured:
-        """What `integrate` needs of a cell: from what is measured at its ends, and beside the value in its
+    def spanned(attributes: Measured, front: Measured, back: Measured) -> Measured:
+        """What `integrate` needs of a cell: from what is measured at its ends, and the attributes in its
         middle."""
-        return ((front[0] + back[0]) / 2, *beside, front, back)
+        return ((front[0] + back[0]) / 2, *attributes, front, back)
 
     @property
     def of_cells(self) -> Classify:
@@ -85,60 +84,27 @@ class Classification(NamedTuple):
 
 
 class Transfer(eqx.Module):
-    """The interface of all transfer functions."""
+    """The interface of all transfer functions. A subclass overrides `classifier`; `attributes` if more than
+    the value counts; and `majorant`, so that rays leap over what is transparent.
 
-    def measured(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """What is read from the volume at a grid coordinate: the value, then what is read `beside`."""
-        return (volume.value(coordinate), *self.beside(volume, coordinate))
-
-    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """What is read beside the value; by default nothing."""
-        return ()
-
-    @property
-    def reads_gradient(self) -> bool:
-        """Whether `beside` reads the volume's gradient, so that it is worth storing slopes, and the ranges of
-        them in blocks (`Blocks.slopes`). By default not."""
-        return False
+    `integrator` and `variation` are for `quadrature="preintegrated"` and `AdaptiveSampling`; `search`,
+    `visible` and `vjp` make programs faster.
+    """
 
     @abstractmethod
     def classifier(self) -> Classify:
         """The function from `Measured` to colour and extinction. Tables that it needs are computed here,
         once, outside the march's loop."""
 
-    def integrator(self) -> Classify | None:
-        """The function from what is measured over a cell (`Measured`) to its colour and extinction: the means
-        over all values between its ends, that of the colour weighted by the extinction. None, the default:
-        unknown, so that `quadrature="preintegrated"` is refused."""
-        return None
+    def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
+        """What is read from the volume at a grid coordinate besides the value; by default nothing."""
+        return ()
 
-    def search(self) -> Callable[[Measured], Measured] | None:
-        """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
-        classifier gets after it. By default there is none. With an `integrator` it depends on the value
-        alone."""
-        return None
-
-    def classification(self, volume: Volume) -> Classification:
-        """The two stages for this volume."""
-        return Classification(
-            partial(self.measured, volume),
-            self.classifier(),
-            self.search(),
-            beside=partial(self.beside, volume),
-        )
-
-    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
-        """Vector–Jacobian product of classifying many samples, in arrays of one shape: the cotangents of the
-        transfer function and of the measured values, from those of colour and extinction. None where there
-        is no derivative. `measured` includes what `search` found."""
-
-        return _classification_vjp(self, lambda transfer: transfer.classifier(), measured, color, extinction)
-
-    def pull_integrated(
-        self, measured: Measured, color: Vec3, extinction: Scalar
-    ) -> tuple["Transfer", Measured]:
-        """The same of classifying cells by `integrator`; `measured` is what was measured over them."""
-        return _classification_vjp(self, lambda transfer: transfer.integrator(), measured, color, extinction)
+    @property
+    def reads_gradient(self) -> bool:
+        """Whether `attributes` reads the volume's gradient, so that it is worth storing slopes, and the
+        ranges of them in blocks (`Blocks.slopes`). By default not."""
+        return False
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
@@ -146,51 +112,63 @@ class Transfer(eqx.Module):
         (`Blocks.unordered`). It carries no gradient. By default infinite: nothing is proven."""
         return jnp.full(blocks.low.shape, jnp.inf)
 
+    def integrator(self) -> Classify | None:
+        """The function from what is measured over a cell (`Measured`) to its colour and extinction: the means
+        over all values between its ends, that of the colour weighted by the extinction. None, the default:
+        unknown, so that `quadrature="preintegrated"` is refused."""
+        return None
+
     def variation(self, windows: Windows) -> Variation:
         """How much extinction and emission change within the range of each window. It carries no gradient. By
         default nothing is known."""
         return Variation.unknown(windows)
 
+    def search(self) -> Callable[[Measured], Measured] | None:
+        """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
+        classifier gets after it. By default there is none. With an `integrator` it depends on the value
+        alone. Overridden together with `vjp`."""
+        return None
+
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Where `majorant` is positive; to be overridden where that takes less time to find out."""
+        """Where `majorant` is positive; overridden where that takes less time to find out."""
         return self.majorant(blocks) > 0
 
+    def vjp(
+        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+    ) -> tuple["Transfer", Measured]:
+        """Vector–Jacobian product of classifying many samples, or many cells that are `integrated`, in arrays
+        of one shape: the cotangents of the transfer function and of what was measured, from those of colour
+        and extinction. None where there is no derivative. `measured` includes what `search` found."""
 
-def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool) -> Classification:
+        def classified(transfer: Any, measured: Measured) -> tuple[Vec3, Scalar]:
+            classify = transfer.integrator() if integrated else transfer.classifier()
+            for _ in range(extinction.ndim):
+                classify = jax.vmap(classify)
+            return classify(measured)
+
+        _, pull = eqx.filter_vjp(classified, self, measured)
+        return pull((color, extinction))
+
+
+def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
     """A transfer function applied to a volume: to its points, and where cells are `integrated`
     (`quadrature="preintegrated"`), also to these.
 
     **Raises:** `ValueError` for that, where the transfer function has no `integrator`."""
-    classification = transfer.classification(volume)
-    if not integrated:
-        return classification
-    integrate = transfer.integrator()
-    if integrate is None:
+    integrate = transfer.integrator() if integrated else None
+    if integrated and integrate is None:
         raise ValueError(
             'quadrature="preintegrated" needs a transfer function with an integral over the value; '
             f'{type(transfer).__name__} has no integrator. Use "midpoint".'
         )
-    return classification._replace(integrate=integrate)
 
+    def attributes(coordinate: Vec3) -> Measured:
+        return transfer.attributes(volume, coordinate)
 
-def _classification_vjp(
-    transfer: Transfer,
-    classify_of: Callable[[Any], Any],
-    measured: Measured,
-    color: Vec3,
-    extinction: Scalar,
-) -> tuple[Any, Measured]:
-    """JAX's vector–Jacobian product of classifying many samples."""
+    def measure(coordinate: Vec3) -> Measured:
+        return (volume.value(coordinate), *attributes(coordinate))
 
-    def classified(given: tuple[Transfer, Measured]) -> tuple[Vec3, Scalar]:
-        transfer, measured = given
-        classify = classify_of(transfer)
-        for _ in range(extinction.ndim):
-            classify = jax.vmap(classify)
-        return classify(measured)
-
-    _, pull = eqx.filter_vjp(classified, (transfer, measured))
-    return pull((color, extinction))[0]
+    return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)
 
 
 class TransferFunction(Transfer):
@@ -263,21 +241,15 @@ class TransferFunction(Transfer):
         return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        if not self._looks_up_rows:
-            return super().majorant(blocks)
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
         bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def variation(self, windows: Windows) -> Variation:
-        if not self._looks_up_rows:
-            return super().variation(windows)
         points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
         return Variation(*variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        if not self._looks_up_rows:
-            return super().visible(blocks)
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
         return positive_between(values, extinction, blocks.low, blocks.high)
 
@@ -309,16 +281,8 @@ class TransferFunction(Transfer):
 
         return chosen if values.shape[0] <= FEW else looked_up
 
-    @property
-    def _looks_up_rows(self) -> bool:
-        """Whether no subclass classifies in another way."""
-        own = (TransferFunction.classifier, TransferFunction.rows)
-        return all(getattr(type(self), method.__name__) is method for method in own)
-
-    def integrator(self) -> Classify | None:
+    def integrator(self) -> Classify:
         """The exact means, but for rounding."""
-        if not self._looks_up_rows:
-            return None
         rows, few = self.span_rows(), self.values.shape[0] <= FEW
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
@@ -330,34 +294,17 @@ class TransferFunction(Transfer):
 
         return integrate
 
-    def pull_integrated(
-        self, measured: Measured, color: Vec3, extinction: Scalar
-    ) -> tuple["Transfer", Measured]:
-        # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
-        _, front, back = measured
-        rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
-        (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
-        means = partial(mean_by_rows, same=i == j)
-        _, pull = jax.vjp(means, a, b, front[0], back[0])
-        of_a, of_b, of_front, of_back = pull((color, extinction))
-        fronts, backs = (
-            row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
-        )
-        (transfer,) = pull_rows(fronts + backs)
-        return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
-
     def span_rows(self) -> Float[Array, "spans 26"]:
         """The table of `piecewise_means.span_rows`."""
         at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
         return span_rows(jax.lax.stop_gradient(self.values), at_points)
 
-    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple["Transfer", Measured]:
-        if not self._looks_up_rows:
-            transfer, (of_value, *found) = super().pull(measured, color, extinction)
-            if found:  # the distance past the point depends on the value
-                of_value = of_value + jnp.where(measured[0] < self.values[0], 0, found[1])
-            return transfer, (of_value,)
+    def vjp(
+        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+    ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
+        if integrated:
+            return self._integrated_vjp(measured, color, extinction)
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
         if self.values.shape[0] <= FEW:
             interval = jnp.maximum(points_below(self.values, value) - 1, 0)
@@ -375,6 +322,21 @@ class TransferFunction(Transfer):
         transfer = eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), none, leaves)
         of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
         return transfer, (jnp.where(value < self.values[0], 0, of_value),)
+
+    def _integrated_vjp(
+        self, measured: Measured, color: Vec3, extinction: Scalar
+    ) -> tuple[Transfer, Measured]:
+        _, front, back = measured
+        rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
+        (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
+        means = partial(mean_by_rows, same=i == j)
+        _, pull = jax.vjp(means, a, b, front[0], back[0])
+        of_a, of_b, of_front, of_back = pull((color, extinction))
+        fronts, backs = (
+            row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
+        )
+        (transfer,) = pull_rows(fronts + backs)
+        return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
 
     def rows(self) -> Float[Array, "points 10"]:
         """A table with one row for each point, so that a value between this point and the next finds all it

@@ -9,20 +9,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.bilinear import (
-    Lines,
     any_between,
     between_lines,
     corner_rows,
     greatest_between,
     interpolate_corners,
-    lines_between,
     slope_between_lines,
 )
 from .._util.checks import Arrayable, described, finite_array, increasing, number, require, unit_interval
-from .._util.piecewise_linear import ROUNDING, table_row
+from .._util.piecewise_linear import ROUNDING, Range, points_around, table_row
 from .._util.vec3 import Scalar, Vec3, length
+from ..xla.memory import row_sums
 from ..xla.platform import is_traced
-from ..xla.row_sums import row_sums
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer, TransferFunction, extinction_of
 from .volume import Volume
@@ -176,7 +174,7 @@ class TransferFunction2D(Transfer):
     def reads_gradient(self) -> bool:
         return True
 
-    def beside(self, volume: Volume, coordinate: Vec3) -> Measured:
+    def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """The magnitude of the gradient at a grid coordinate."""
         return (length(volume.gradient(coordinate)),)
 
@@ -201,7 +199,9 @@ class TransferFunction2D(Transfer):
 
         return classify
 
-    def pull(self, measured: Measured, color: Vec3, extinction: Scalar) -> tuple[Transfer, Measured]:
+    def vjp(
+        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+    ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         value, magnitude, cell, along, across = measured
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
@@ -226,10 +226,10 @@ class TransferFunction2D(Transfer):
         values, magnitudes = self._lines(blocks)
         return any_between(self.extinction > 0, values, magnitudes)
 
-    def _lines(self, blocks: Blocks) -> tuple[Lines, Lines]:
+    def _lines(self, blocks: Blocks) -> tuple[Range, Range]:
         """The values and magnitudes of the table on which blocks depend."""
         values, magnitudes = jax.lax.stop_gradient((self.values, self.magnitudes))
-        return lines_between(values, blocks.low, blocks.high), lines_between(magnitudes, *blocks.magnitudes)
+        return points_around(values, blocks.low, blocks.high), points_around(magnitudes, *blocks.magnitudes)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:

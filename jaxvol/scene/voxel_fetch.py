@@ -14,9 +14,8 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.vec3 import Scalar, Vec3
+from ..xla.memory import gather, without_zeros
 from ..xla.platform import on_gpu
-from ..xla.row_sums import without_zeros
-from ..xla.xla import gather
 
 
 Cube: TypeAlias = list[list[list[Scalar]]]

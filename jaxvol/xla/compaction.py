@@ -53,10 +53,10 @@ class Chosen(NamedTuple):
     def take(self, arrays: list[PyTree], indices: Int[Array, " chunk"]) -> PyTree:
         """The entries at these flat indices."""
 
-        def taken(*leaves: Array) -> Array:
+        def entries(*leaves: Array) -> Array:
             return jnp.concatenate(leaves).reshape(-1).at[indices].get(mode="clip")
 
-        return jax.tree.map(taken, *arrays)
+        return jax.tree.map(entries, *arrays)
 
     def put(self, whole: PyTree, indices: Int[Array, " chunk"], part: PyTree) -> PyTree:
         """Flat arrays with these entries at these indices."""

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from .compiling import computed_now
 from .platform import is_traced
-from .xla import computed_now
 
 
 T = TypeVar("T")

@@ -28,7 +28,7 @@ def strong(tree: PyTree) -> PyTree:
     def plain(leaf: Any) -> Any:
         return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf
 
-    # to make a tree anew takes a tenth of the time until a program begins
+    # rebuilding a tree takes a tenth of the time until a program begins
     weak = any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(tree))
     return jax.tree.map(plain, tree) if weak else tree
 

@@ -18,9 +18,8 @@ from jaxvol.bricks.choice import cheapest, counts, visible
 from jaxvol.bricks.render import _scene_of, bricks_of
 from jaxvol.bricks.split import Margin, TooLittleMemory, check_smallest, fits, nodes_within, split, stored_of
 from jaxvol.bricks.stream import _curved
-from jaxvol.engine.image import RenderOptions
-from jaxvol.engine.parts import set_out
-from jaxvol.engine.tiling import Tiling
+from jaxvol.engine.brick_march import begin_rays
+from jaxvol.engine.tiling import RenderOptions, Tiling
 
 from ..scenes import in_float64, to_float64
 from .scenes import CAMERA, CURVED, FROM_THE_SIDE, PLAIN, SHEETS, TRANSFER, fog
@@ -235,7 +234,7 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
     scene = _scene_of(source_of(fog()), place, SHEETS, FROM_THE_SIDE, CURVED, "over", None)
 
     def cells_of(scene):
-        underway = set_out(scene, RenderOptions("all", Tiling.of_backend(None)))
+        underway = begin_rays(scene, RenderOptions("all", Tiling.of_backend(None)))
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
         turn = Turn(jnp.asarray(0, jnp.int32), empty, empty.at[0].set(True), empty)
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)

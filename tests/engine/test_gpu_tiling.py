@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.engine.driver import render_scene
-from jaxvol.engine.scene import Scene
+from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import GPU, Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
+from jaxvol.ray import Scene
 from jaxvol.xla import platform
 
 from ..round_trips import counted

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.engine.driver import render_scene
-from jaxvol.engine.scene import Scene
+from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import Tiling
+from jaxvol.ray import Scene
+from jaxvol.scene.transfer import Transfer
 
 from ..scenes import anisotropic_noise, around, slow, soft_transfer
 from ..switch import switch
@@ -85,17 +86,18 @@ def test_adjoints_share_one_image(adjoint):
 
 
 def test_one_program_serves_all_cameras_steps_seeds_transfer_functions_and_volumes():
-    class Counting(jv.TransferFunction):
+    class Counting(Transfer):
+        function: jv.TransferFunction
         traces: ClassVar[int] = 0
         """Programs traced with it."""
 
-        def classification(self, volume):
+        def classifier(self):
             Counting.traces += 1
-            return super().classification(volume)
+            return self.function.classifier()
 
     for i in range(4):
         volume = anisotropic_noise(seed=i)
-        transfer = Counting(*jax.tree.leaves(soft_transfer(0.3 + 0.1 * i)))
+        transfer = Counting(soft_transfer(0.3 + 0.1 * i))
         transforms = jv.Jitter(i), jv.SpaceLeaping(), jv.EarlyTermination(0.01 + 0.01 * i)
         camera = around(volume, (6, 5)).zoom(1 + i)
         rendering = jv.render(volume, transfer, camera, jv.March(0.05 + 0.01 * i, transforms), outputs="rgba")

@@ -107,8 +107,8 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "GPU: zeros are added, all to the same place",
-        "xla.row_sums:without_zeros",
+        "xla.memory:without_zeros",
         lambda _: lambda index, rows, end: index,
-        ("xla/test_row_sums.py::test_zeros_are_left_out_and_the_rows_of_one_index_are_dealt_to_copies",),
+        ("xla/test_memory.py::test_zeros_are_left_out_and_the_rows_of_one_index_are_dealt_to_copies",),
     ),
 ]

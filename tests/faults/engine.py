@@ -56,13 +56,13 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "shift: at every transparent cell",
-        "reference:move",
+        "ray:move",
         shifting_again,
         (f"{MARCH}test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty",),
     ),
     Fault(
         "shift: segments are taken as a whole although rays may still shift",
-        "engine.batch:Job.shifts",
+        "engine.wavefront:Job.shifts",
         lambda _: lambda self, at: jnp.zeros_like(at.finished),
         (
             "test_agreement.py::"
@@ -77,13 +77,13 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "stride: what lies in front does not count",
-        "march.march:March.strides",
-        lambda f: lambda self, *to: f(self, *to[:4], jnp.ones_like(to[4]), *to[5:]),
+        "march.strides:Strides.next",
+        lambda f: lambda self, *to, **more: f(self, *to[:4], jnp.ones_like(to[4]), **more),
         ("march/transforms/test_adaptive_sampling.py::test_runs_are_the_same_however_a_ray_comes_to_them",),
     ),
     Fault(
         "adaptive sampling: looked up where a run begins, not in its middle",
-        "march.march:Run.middle",
+        "march.strides:Run.middle",
         lambda _: property(lambda run: run.front),
         (
             "march/transforms/test_adaptive_sampling.py::test_the_error_of_a_run_is_that_of_a_window_that_holds_it",
@@ -117,25 +117,25 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "NaN: a parameter that is NaN gives a finite image",
-        "engine.image:fault_of",
-        lambda _: lambda scene: jnp.zeros((), bool),
+        "ray:Scene.has_fault",
+        lambda _: property(lambda scene: jnp.zeros((), bool)),
         ("march/transforms/test_clip.py::test_nan_in_a_plane_shows",),
     ),
     Fault(
         "leap: a voxel too far",
-        "engine.batch:_leap",
+        "engine.wavefront:_leap",
         lambda f: lambda *given: f(*given) + 4,
         ("march/transforms/test_space_leaping.py::test_no_ray_misses_what_is_seen",),
     ),
     Fault(
         "leap: the second march begins four cells too late",
-        "engine.batch:VisibleRangeRecorder.visit",
+        "engine.wavefront:VisibleRangeRecorder.visit",
         later,
         ("engine/test_gradients.py::test_leaps_show_in_no_image_and_no_gradient",),
     ),
     Fault(
         "vmap: the batch in reverse order",
-        "xla.xla:_batch",
+        "xla.compiling:_batch",
         lambda f: lambda *given: jax.tree.map(lambda leaf: leaf[::-1], f(*given)),
         ("engine/test_gradients.py::test_vmap_is_a_loop_for_image_and_gradient",),
     ),

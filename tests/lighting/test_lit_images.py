@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.engine.driver import render_scene
-from jaxvol.engine.scene import Scene
+from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import (
     ConstantLight,
@@ -21,6 +20,7 @@ from jaxvol.lighting import (
     PointLight,
     ScattererTemplates,
 )
+from jaxvol.ray import Scene
 
 from ..scenes import anisotropic_noise, in_float64, soft_transfer
 from .samples import check_gradient, in_double

@@ -12,8 +12,7 @@ from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
-from jaxvol.engine.acceleration import VolumeAcceleration
-from jaxvol.engine.packing import slopes_of, with_words, words_of
+from jaxvol.engine.acceleration import VolumeAcceleration, slopes_of, with_words, words_of
 from jaxvol.lighting import Deferred, DirectionalLight, HeadLight, Phong, PointLight
 from jaxvol.lighting.shading import shade_sample
 from jaxvol.scene.space import Affine, world_gradient

@@ -10,6 +10,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.march.march import Cell
+from jaxvol.march.strides import StrideControl
 from jaxvol.scene.space import Affine
 
 from ..scenes import around, scaled_phantom, slow, soft_transfer, uniform_transfer
@@ -43,32 +44,22 @@ class Halves(jv.Transform):
         return Cell(cell.front, half, cell.cut), Cell(cell.front + half, half, cell.cut)
 
 
-class Long(jv.Transform):
+class Long(StrideControl):
     """Cells of so many steps in runs that begin at the grid coordinate x = `beyond` or behind it."""
 
     steps: jax.Array = eqx.field(converter=jnp.asarray)  # arrays, so that all values share one program
     beyond: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
 
-    @property
-    def longest_stride(self) -> int:
-        return 4
+    tolerance: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+    longest: int = eqx.field(static=True, default=4)
 
-    def stride_error(self, ray, run):
+    def prepared(self, march, space, windows, variation):
+        return self
+
+    def error(self, ray, run):
         x, _, _ = ray.path(run.front)
         allowed = (x >= self.beyond) & (run.stride <= self.steps)
-        return jnp.where(allowed, 0, jnp.inf).astype(x.dtype), jnp.ones_like(x)
-
-
-class Three(Long):
-    @property
-    def longest_stride(self):
-        return 3
-
-
-class NoParts(jv.Transform):
-    @property
-    def subdivision(self):
-        return 0
+        return jnp.where(allowed, 0, jnp.inf).astype(x.dtype)
 
 
 class Moved(jv.Transform):
@@ -247,14 +238,6 @@ BAD = {
         "transforms must each be given once; got AlphaCorrection 2 times",
     ),
     "a class": (lambda: jv.March(0.1, (jv.AlphaCorrection,)), "transforms must hold jaxvol transforms"),
-    "a stride of three": (
-        lambda: jv.March(0.1, (Three(1),)),
-        "Three.longest_stride must be a power of two; got 3",
-    ),
-    "steps in no parts": (
-        lambda: jv.March(0.1, (NoParts(),)),
-        "NoParts.subdivision must be an integer from 1 to 64; got 0",
-    ),
     "one transform, bare": (lambda: jv.March(0.1, jv.AlphaCorrection()), "transforms must be a tuple"),
     "quadrature": (lambda: jv.March(0.1, quadrature="right"), "quadrature must be"),
     **{

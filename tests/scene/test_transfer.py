@@ -11,6 +11,7 @@ import pytest
 import jaxvol as jv
 from jaxvol._util.piecewise_linear import points_below, positive_between
 from jaxvol.scene.occupancy import Blocks
+from jaxvol.scene.transfer import Transfer
 from jaxvol.scene.variation import Windows
 
 from ..scenes import anisotropic_noise
@@ -40,7 +41,7 @@ TABLES = {
 
 @eqx.filter_jit
 def looked_up(transfer, values):
-    """Colour and extinction; the gradient of a sum of them by JAX; and the same by `pull`, as engines do."""
+    """Colour and extinction; the gradient of a sum of them by JAX; and the same by `vjp`, as engines do."""
 
     def summed(transfer, values):
         (r, g, b), sigma = jax.vmap(transfer)(values)
@@ -49,7 +50,7 @@ def looked_up(transfer, values):
     expected, found = jax.grad(summed, (0, 1), has_aux=True)(transfer, values)
     search, one = transfer.search(), jnp.ones_like(values)
     measured = (values,) if search is None else (values, *jax.vmap(lambda v: search((v,)))(values))
-    return found, expected, transfer.pull(measured, (one, 2 * one, 3 * one), 4 * one)
+    return found, expected, transfer.vjp(measured, (one, 2 * one, 3 * one), 4 * one)
 
 
 @pytest.mark.parametrize("case", TABLES)
@@ -232,23 +233,23 @@ def test_points_that_lie_nearly_evenly_are_counted_exactly():
         np.testing.assert_array_equal(each, np.arange(1, n))
 
 
-class Gained(jv.TransferFunction):
-    """Multiplies its extinction by a leaf of its own."""
+class Gained(Transfer):
+    """A transfer function times a gain of its own: the least that a user may write."""
 
+    function: jv.TransferFunction
     gain: jax.Array
 
-    def __init__(self, *points):
-        super().__init__(*points)
-        self.gain = jnp.asarray(2.0)
-
     def classifier(self):
-        classify = super().classifier()
+        classify = self.function
 
         def gained(measured):
-            color, extinction = classify(measured)
+            color, extinction = classify(measured[0])
             return color, self.gain * extinction
 
         return gained
+
+    def __call__(self, value):
+        return self.classifier()((value,))
 
 
 def test_nothing_is_proven_of_a_classifier_of_ones_own():
@@ -260,15 +261,17 @@ def test_nothing_is_proven_of_a_classifier_of_ones_own():
         points = np.linspace(0, 1, n), np.full((n, 3), 0.5), np.zeros(n)
         for found in known(jv.TransferFunction(*points)):
             assert not np.any(found)
-        shown, bound, changes = known(Gained(*points))
+        gain = jnp.asarray(2.0)
+        shown, bound, changes = known(Gained(jv.TransferFunction(*points), gain))
         assert np.all(shown)
         assert np.all(np.isinf(bound))
         assert np.all(np.isinf(changes))
         values = np.linspace(-0.2, 1.2, 555, dtype=np.float32)
-        _, (expected, slope), (pulled, (of_value, *_)) = looked_up(
-            Gained(*points[:2], np.linspace(1, 3, n)), values
-        )
+        visible = jv.TransferFunction(*points[:2], np.linspace(1, 3, n))
+        _, (expected, slope), (pulled, (of_value,)) = looked_up(Gained(visible, gain), values)
         assert pulled.gain > 1
-        for name in ("gain", "colors", "extinction"):
-            np.testing.assert_allclose(getattr(pulled, name), getattr(expected, name), rtol=1e-4)
+        np.testing.assert_allclose(pulled.gain, expected.gain, rtol=1e-4)
+        for name in ("colors", "extinction"):
+            found, want = (getattr(of.function, name) for of in (pulled, expected))
+            np.testing.assert_allclose(found, want, rtol=1e-4)
         np.testing.assert_allclose(of_value, slope, rtol=1e-4)

@@ -15,6 +15,7 @@ from jaxvol._util.vec3 import apart
 from jaxvol.engine.acceleration import VolumeAcceleration
 from jaxvol.fitting.constraints import Free
 from jaxvol.scene.occupancy import BLOCK, Blocks
+from jaxvol.scene.transfer import classification_of
 
 from ..modes import Rays, check_gradients, numbers, scaled_transfer
 from ..scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64
@@ -38,7 +39,7 @@ def all_of(transfer: jv.TransferFunction2D, places: Any, cotangent: Any) -> Any:
 
     found, pull = jax.vjp(look_up, transfer, places)
     measured = *places, *jax.vmap(lambda *place: transfer.search()(place))(*places)
-    return found, pull(cotangent), transfer.pull(measured, tuple(cotangent[:, :3].T), cotangent[:, 3])
+    return found, pull(cotangent), transfer.vjp(measured, tuple(cotangent[:, :3].T), cotangent[:, 3])
 
 
 def looked_up(transfer: jv.TransferFunction2D, values: Any, magnitudes: Any) -> np.ndarray:
@@ -156,7 +157,7 @@ def patches(kind: str, seed: int = 0) -> jv.Volume:
 @eqx.filter_jit
 def at_places(volume, transfer, places):
     """Magnitude and extinction at grid coordinates."""
-    classification = transfer.classification(volume)
+    classification = classification_of(transfer, volume)
 
     def at(place):
         measured = classification.at(apart(place))
@@ -313,7 +314,7 @@ def test_nothing_that_is_steep_has_no_gradient_by_its_magnitude():
     @jax.jit
     @jax.grad
     def slope(data):
-        measured = transfer.classification(jv.Volume(data)).at(apart(jnp.full(3, 1.3)))
+        measured = classification_of(transfer, jv.Volume(data)).at(apart(jnp.full(3, 1.3)))
         return transfer.classifier()(measured)[1]
 
     np.testing.assert_array_equal(slope(jnp.full((4, 4, 4), 0.5)), 0)

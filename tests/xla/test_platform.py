@@ -9,8 +9,8 @@ import pytest
 
 from jaxvol._util.piecewise_linear import points_below
 from jaxvol.xla import platform
+from jaxvol.xla.memory import in_memory
 from jaxvol.xla.platform import TURNS, on_gpu, while_loop
-from jaxvol.xla.xla import in_memory
 
 from ..round_trips import counted
 

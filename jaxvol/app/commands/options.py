@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ...compositing.modes import MODES
 from ...scene.presets import PRESETS, SHADED
-from ...xla.programs import default_programs
+from ...xla.persistent_cache import default_programs
 from .data import add_data_options
 
 

@@ -14,7 +14,7 @@ from ...march.march import March
 from ...scene.camera import Camera
 from ...scene.transfer import TransferFunction
 from ...scene.volume import Volume
-from ...xla.programs import keep_programs_by_default
+from ...xla.persistent_cache import keep_programs_by_default
 from .start import begin
 
 

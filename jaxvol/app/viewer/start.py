@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from ..._util.checks import described, finite_array
-from ...arguments import check_arguments
 from ...compositing.compositing import Compositing
 from ...compositing.modes import Mode, compositing_of
 from ...compositing.projections import Average
@@ -20,6 +19,7 @@ from ...march.transforms import (
     Jitter,
     SpaceLeaping,
 )
+from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.labels import LabelTransferFunction
 from ...scene.occupancy import BLOCK

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32
 
 from ..._util.checks import number, power_of_two
-from ..._util.vec3 import Scalar, Vec3
+from ..._util.vec3 import Scalar
 from ...scene.occupancy import BLOCK
 from ...scene.space import Ray, Space, node_distance
 from ...scene.variation import MARGIN, Variation, Windows
-from ...xla.xla import gather, in_memory
-from ..march import RUN, March, Run, Transform
+from ...xla.memory import gather, in_memory
+from ..march import March
+from ..strides import RUN, Run, StrideControl
 
 
 SHARE = 1 / 20
@@ -29,7 +30,7 @@ FARTHEST = 8
 """Blocks around its own that a run may touch: it is at most 68 voxels long."""
 
 
-class AdaptiveSampling(Transform):
+class AdaptiveSampling(StrideControl):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
     Where the value bends little between nodes, or the transfer function changes little with it, a long cell
@@ -47,8 +48,8 @@ class AdaptiveSampling(Transform):
     `"left"`; and for `"midpoint"` K (R / ℓ) w² / 24, since it errs where emission bends, or V w / 2 where
     that is less. The front of a cell hides of its back, in colour, at most h = min(C, D w) w / 8. Cells come
     in runs of four that are equally long: as long as T max(e / 20, h / 4) is at most `tolerance`, with the
-    largest e and h of the blocks that may hold a part of the run, and T the transmittance in front of it
-    (`Transform.stride_error`). Without `AlphaCorrection`, only cells of one step reach past the exit.
+    largest e and h of the blocks that may hold a part of the run, and T the transmittance in front of it.
+    Without `AlphaCorrection`, only cells of one step reach past the exit.
 
     **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes, from
     outside and inside (`experiments.adaptive_error`). It does not know how light varies along a cell, nor
@@ -69,8 +70,6 @@ class AdaptiveSampling(Transform):
     - `tolerance`: of the image's RMSE, > 0. It may be traced: images of any tolerance are made by one
       program.
     - `longest`: the most steps of the march that a cell is long, a power of two up to 64.
-    - `finest`: into how many parts the march divides its steps, a power of two; with `longest` at most 64.
-      What other transforms and `max_samples` count in steps are then these parts.
 
     Where `Jitter` or `EmptySpaceJitter` move samples, each ray's runs begin at a random depth, too, since
     otherwise long cells, and runs, would leave a wood grain of their own.
@@ -83,60 +82,45 @@ class AdaptiveSampling(Transform):
     Where it fails, and where not: `experiments/stability.py`, "tolerances finer than the finest cell",
     "adaptive strides under light".
 
-    **Raises:** `ValueError` for another tolerance, `longest` or `finest`.
+    **Raises:** `ValueError` for another tolerance or `longest`.
 
     Source: unpublished.
     """
 
     tolerance: Float[Array, ""]
     longest: int = eqx.field(static=True)
-    finest: int = eqx.field(static=True)
     errors: Int32[Array, "levels bx by bz"] | None
     """By stride and block, the predicted error, `_coded`; None before the scene is known."""
     first: Int[Array, "3"] | None
     """Index of the first block, where only a part of the volume is known."""
 
-    def __init__(self, tolerance: Any, longest: int | Any = 8, finest: int | Any = 1):
+    def __init__(self, tolerance: Any, longest: int | Any = 8):
         self.tolerance = number("tolerance", tolerance, above=0)
         self.longest = power_of_two("longest", longest, 64)
-        self.finest = power_of_two("finest", finest, 64)
-        if self.longest * self.finest > 64:
-            raise ValueError(f"longest * finest must be at most 64; got {longest!r} * {finest!r}.")
         self.errors = self.first = None
-
-    @property
-    def longest_stride(self) -> int:
-        return self.longest * self.finest
-
-    @property
-    def subdivision(self) -> int:
-        return self.finest
 
     def prepared(
         self, march: March, space: Space, windows: Windows, variation: Variation
     ) -> "AdaptiveSampling":
         # In a branch of its own, so that it is rounded alike in every program: an error that nearly equals
         # the tolerance must not make different cells where an image is made in `jax.jit`, or differentiated.
-        predict = partial(_errors, self.longest_stride)
+        predict = partial(_errors, self.longest)
         errors = in_memory(march.step > 0, predict, march, space, windows, variation)
         found = errors, windows.first
         return eqx.tree_at(lambda of: (of.errors, of.first), self, found, is_leaf=lambda leaf: leaf is None)
 
-    def stride_error(self, ray: Ray, run: Run) -> tuple[Scalar, Scalar]:
-        # the windows around the middle hold all of the run
-        code = self._at(ray.path(run.middle), run.stride.bit_length() - 1)
-        return _decoded(code, ray.length.dtype), self.tolerance.astype(ray.length.dtype)
-
-    def _at(self, coordinate: Vec3, level: int) -> Int32[Array, ""]:
-        """The coded error of a stride in the block of a grid coordinate."""
+    def error(self, ray: Ray, run: Run) -> Scalar:
         assert self.errors is not None
         _, nx, ny, nz = self.errors.shape
         begin = (0, 0, 0) if self.first is None else self.first
+        # the window of the block that holds the middle holds all of the run
         i, j, k = (
             jnp.clip(jnp.floor(c / BLOCK).astype(jnp.int32) - first, 0, n - 1)
-            for c, n, first in zip(coordinate, (nx, ny, nz), begin, strict=True)
+            for c, n, first in zip(ray.path(run.middle), (nx, ny, nz), begin, strict=True)
         )
-        return gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
+        level = run.stride.bit_length() - 1
+        code = gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
+        return _decoded(code, ray.length.dtype)
 
 
 def _coded(error: Float[Array, "*blocks"]) -> Int32[Array, "*blocks"]:

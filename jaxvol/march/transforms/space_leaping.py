@@ -21,7 +21,7 @@ from ..._util.checks import integer
 from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
-from ...xla.xla import gather
+from ...xla.memory import gather
 from ..beams import Box, Stretches, stretches
 from ..march import EmptySpaceIndex, Transform, View
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 from experiments import scenes as real_scenes
-from jaxvol.march.march import RUN, Run
+from jaxvol.march.strides import RUN, Run, StrideControl, Strides, predicted, stride_control
 from jaxvol.march.transforms.adaptive_sampling import _coded, _decoded
 from jaxvol.metrics import rmse
 from jaxvol.scene.occupancy import BLOCK
@@ -36,8 +36,8 @@ OVER = jv.Over()
 @eqx.filter_jit
 def errors(volume, transfer, march, mode):
     """By level of stride and block, the predicted error."""
-    prepared = march.prepared(Affine(volume), Windows.of(volume), partial(mode.variation, transfer))
-    return _decoded(prepared.transforms[0].errors, jnp.float32)
+    known = predicted(march, Affine(volume), Windows.of(volume), partial(mode.variation, transfer))
+    return _decoded(stride_control(known).errors, jnp.float32)
 
 
 def strides(volume, transfer, sampling, step=1.0, quadrature="preintegrated", mode: Any = OVER):
@@ -197,10 +197,7 @@ def test_the_error_of_a_run_is_that_of_a_window_that_holds_it(seed, step):
     start = BLOCK * np.arange(16)
     for level in (0, 1):
         run = partial(Run, stride=2**level, step=jnp.float32(step))
-        found, tolerated = jax.jit(jax.vmap(lambda front, run=run: sampling.stride_error(ray, run(front))))(
-            fronts
-        )
-        assert (np.asarray(tolerated) == 1).all()
+        found = jax.jit(jax.vmap(lambda front, run=run: sampling.error(ray, run(front))))(fronts)
         for front, error in zip(np.asarray(fronts), np.asarray(found), strict=True):
             back = front + RUN * 2**level * step
             holds = (start - MARGIN <= front) & (back <= start + BLOCK + MARGIN)
@@ -217,21 +214,22 @@ def test_cells_are_one_step_long_where_nothing_is_known():
 # -- cells of several steps ------------------------------------------------------------------------------
 
 
-class Table(jv.Transform):
+class Table(StrideControl):
     """Allows runs as a table says, by stride and number of the run, where at most half is visible; and
     behind less than that all of them."""
 
     allowed: jax.Array
     phase: jax.Array
+    tolerance: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
+    longest: int = eqx.field(static=True, default=16)
 
-    @property
-    def longest_stride(self):
-        return 16
+    def prepared(self, march, space, windows, variation):
+        return self
 
-    def stride_error(self, ray, run):
+    def error(self, ray, run):
         number = jnp.round((run.front / run.step + self.phase) / (RUN * run.stride)).astype(jnp.int32)
         fits = self.allowed[run.stride.bit_length() - 1, number]
-        return jnp.where(fits, 1.0, 4.0).astype(ray.length.dtype), jnp.ones_like(run.front)
+        return jnp.where(fits, 1.0, 4.0).astype(ray.length.dtype)
 
 
 @cache
@@ -245,7 +243,10 @@ def straight():
 @eqx.filter_jit
 def strides_of(march, ray, first, index, stride, target, transmittance):
     index, stride, target = (i.astype(jnp.int32) for i in (index, stride, target))
-    return march.strides(ray, index, stride, target, transmittance.astype(jnp.float32), first)
+    at, no = Strides(stride, first, jnp.float32(0)), jnp.zeros((), bool)
+    transmittance = transmittance.astype(jnp.float32)
+    found, steps = at.next(march, ray, index, target - index, transmittance, leaves=no, finished=no)
+    return index + steps, found.steps, jnp.sqrt(found.error)
 
 
 @settings(max_examples=20)
@@ -280,17 +281,15 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share, first):
         since = runs[random.integers(0, runs.index((begin, stride)) + 1)]
         before = runs[max(runs.index(since) - 1, 0)][1]
         found = strides(since[0], before, target, 1.0)
-        assert (int(found.begin), int(found.stride)) == (begin, stride)
+        assert (int(found[0]), int(found[1])) == (begin, stride)
         within = since[0] + since[1] * random.integers(1, RUN)
         if within <= target and within < ends[runs.index(since)]:
             found = strides(within, since[1], target, 1.0)
             ahead = within if since == (begin, stride) else begin
-            assert (int(found.begin), int(found.stride)) == (ahead, stride)
-    assert int(strides(0, 1, 0, 0.25).stride) == max(
-        2**k for k in range(5) if first % (RUN << k) == 0 or k == 0
-    )
+            assert (int(found[0]), int(found[1])) == (ahead, stride)
+    assert int(strides(0, 1, 0, 0.25)[1]) == max(2**k for k in range(5) if first % (RUN << k) == 0 or k == 0)
     for index, _ in runs:  # what became allowed behind something does not reach before it
-        assert int(strides(index, 1, index, 0.25).begin) == index
+        assert int(strides(index, 1, index, 0.25)[0]) == index
 
 
 # -- what the image becomes ------------------------------------------------------------------------------
@@ -383,15 +382,9 @@ def test_samples_that_run_out_end_the_estimate():
 
 
 @pytest.mark.slow
-def test_finest_divides_the_steps_of_the_march_and_without_it_there_is_no_estimate():
-    """Steps four times as long, divided by four, and cells of as many parts are the same march."""
+def test_without_adaptive_sampling_there_is_no_estimate():
     scene = *smooth(), smooth_camera(False)
     rest = jv.AlphaCorrection(), jv.SpaceLeaping()
-    fine = jv.March(0.02, (*rest, jv.AdaptiveSampling(0.03, 8)), "midpoint")
-    divided = jv.March(0.08, (*rest, jv.AdaptiveSampling(0.03, 2, finest=4)), "midpoint")
-    found, expected = (jv.render(*scene, march) for march in (divided, fine))
-    np.testing.assert_allclose(found.rgba, expected.rgba, atol=1e-6)
-    np.testing.assert_array_equal(found.samples, expected.samples)
     with pytest.raises(AttributeError, match="error is not part of this rendering: give the march Adaptive"):
         _ = jv.render(*scene, jv.March(0.02, rest)).error
 
@@ -494,8 +487,6 @@ def test_fans_are_rendered_within_the_tolerance_by_fewer_samples():
     [
         *(((given,), "tolerance must ") for given in (0.0, -1.0, np.nan, "much", [0.1, 0.2])),
         *(((0.01, given), "longest must be") for given in (0, 3, 128, 2.0, True)),
-        ((0.01, 8, 3), "finest must be"),
-        ((0.01, 32, 4), r"longest \* finest must be at most 64; got 32 \* 4"),
     ],
     ids=repr,
 )

@@ -25,10 +25,10 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     before the first image, in a script or a notebook: it turns on JAX's persistent compilation cache for this
     process. The command `jaxvol` does so by itself, and so do `view` and the page of `jaxvol view`, unless
     JAX has a folder already. The programs are those of this machine, this version of jaxvol and of JAX;
-    others are compiled beside them. To be rid of them, delete the folder.
+    others are added. To be rid of them, delete the folder.
 
     **Arguments:** `folder`: made if it does not exist. By default the folder that
-    `JAX_COMPILATION_CACHE_DIR` names, or else `jaxvol/xla/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
+    `JAX_COMPILATION_CACHE_DIR` names, or else `jaxvol/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
 
     **Returns:** the folder.
 

@@ -1,14 +1,19 @@
-"""Adds rows up by an index that each has: the transpose of looking rows up in a table.
+"""How are values fetched from arrays, kept in memory, and added up again?
 
 On a GPU, rows of one index are added by atomic operations, one after the other. (On an H200, 1.5 ms for a
 million rows of one index.) So zeros, which most samples of a march that has ended give, are left out there,
 and a table that many samples share is summed in copies.
 """
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .platform import on_gpu
+from .sharding import varying
 
 
 COPIES, ROWS = 128, 2**15
@@ -35,3 +40,30 @@ def without_zeros(
 ) -> Int[Array, " rows"]:
     """The indices of rows, but `end`, which is none, where nothing is to be added."""
     return jnp.where(jnp.any(rows != 0, axis=-1), index, end)
+
+
+def gather(array: Array, index: Array) -> Array:
+    """`array[index]` along the first axis, for indices known to be in range: no check is compiled."""
+    return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
+    """`f(*arguments)`, computed once and stored in memory.
+
+    XLA recomputes what it fuses for each use, fetches too, but the results of a branch lie in memory. `live`
+    must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN.
+
+    On a GPU, a branch would wait for the host; but there XLA fuses nothing across an `optimization_barrier`,
+    which on CPU it removes before it fuses."""
+    if on_gpu():
+        return jax.lax.optimization_barrier(f(*arguments))
+    f = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
+
+    def never(*arguments: Any) -> Any:
+        def filled(leaf: Any) -> Array:
+            fill = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
+            return jnp.full(leaf.shape, fill, leaf.dtype)
+
+        return varying(jax.tree.map(filled, jax.eval_shape(f, *arguments)), live, arguments)
+
+    return jax.lax.cond(live, f, never, *arguments)

@@ -9,7 +9,7 @@ import pytest
 
 from jaxvol.scene.voxel_fetch import scatter_add
 from jaxvol.xla import platform
-from jaxvol.xla.row_sums import COPIES, ROWS, row_sums, without_zeros
+from jaxvol.xla.memory import COPIES, ROWS, row_sums, without_zeros
 
 
 @pytest.mark.parametrize(

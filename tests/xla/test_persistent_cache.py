@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from jaxvol.xla.programs import default_programs, keep_programs, keep_programs_by_default
+from jaxvol.xla.persistent_cache import default_programs, keep_programs, keep_programs_by_default
 
 
 SCRIPT = """

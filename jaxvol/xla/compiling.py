@@ -1,4 +1,4 @@
-"""What XLA must be told to compile fast programs, and rules for transformations of whole programs."""
+"""Compiles functions to programs, with rules by which JAX batches and differentiates these as a whole."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,12 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
-from .platform import is_traced, on_gpu
-from .sharding import varying
+from .differentiation import transformations
+from .platform import is_traced
 from .trees import PyTree
 
 
@@ -37,14 +35,14 @@ def compiled(function: Callable[..., Any], *, has_jvp: bool = False) -> Callable
     they are also differentiated, or a `jax.jit` lies between, operations are batched.
     """
     options: Any = {"compiler_options": OPTIONS}
-    inner, alone = eqx.filter_jit(function), eqx.filter_jit(function, **options)
-    in_turn = _in_turn(function, inner)
+    nested, outermost = eqx.filter_jit(function), eqx.filter_jit(function, **options)
+    in_turn = _in_turn(function, nested)
 
     def run(*args: Any) -> Any:
         # inside a larger program or a transformation, compiler options are not allowed
         if not is_traced(args, _probe()):
-            return alone(*args)
-        return inner(*args) if has_jvp and not _only_vmapped(args) else in_turn(*args)
+            return outermost(*args)
+        return nested(*args) if has_jvp and not _only_vmapped(args) else in_turn(*args)
 
     return run
 
@@ -70,28 +68,12 @@ def _only_vmapped(args: PyTree) -> bool:
     return kinds == {"BatchTracer"}
 
 
-def transformations(leaf: Any) -> list[str]:
-    """Names of JAX's tracers around an array, the innermost first. Names, since JAX does not export their
-    classes. Transformations outside of a `jax.jit` cannot be seen."""
-    names = []
-    while is_traced(leaf):
-        names.append(type(leaf).__name__)
-        leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
-    return names
-
-
-def forward_mode(kinds: list[list[str]]) -> bool:
-    """Whether `transformations` of the leaves of a tree are forward mode (`jax.jvp`, `jax.jacfwd`), or of
-    second order. A `custom_vjp` has no rule for these: JAX's own error names neither argument nor remedy."""
-    return any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds)
-
-
 def _is_array(leaf: Any) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.generic)
 
 
-def _in_turn(function: Callable[..., Any], inner: Callable[..., Any]) -> Callable[..., Any]:
-    """`inner`, which is `function` under jit, with a batching rule: a loop over the batch."""
+def _in_turn(function: Callable[..., Any], nested: Callable[..., Any]) -> Callable[..., Any]:
+    """`nested`, which is `function` under jit, with a batching rule: a loop over the batch."""
 
     def run(*args: Any) -> Any:
         arrays, rest = eqx.partition(args, _is_array)
@@ -99,7 +81,7 @@ def _in_turn(function: Callable[..., Any], inner: Callable[..., Any]) -> Callabl
 
         @jax.custom_batching.custom_vmap
         def one(*leaves: Array) -> Any:
-            return inner(*eqx.combine(jax.tree.unflatten(tree, leaves), rest))
+            return nested(*eqx.combine(jax.tree.unflatten(tree, leaves), rest))
 
         @one.def_vmap
         def _(size: int, batched: Any, *leaves: Array) -> Any:
@@ -153,57 +135,3 @@ def _vjp_of(function: Callable[..., Any], perturbed: PyTree, args: tuple[Any, ..
     moving, fixed = eqx.partition(args, perturbed)
     _, pull = jax.vjp(lambda moving: function(*eqx.combine(moving, fixed)), moving)
     return pull(cotangent)[0]
-
-
-def forward_only(tree: PyTree, message: str) -> PyTree:
-    """The tree, unchanged. Under reverse mode it raises `ValueError` with this message."""
-
-    @jax.custom_jvp
-    def same(leaf: Array) -> Array:
-        return leaf
-
-    @same.defjvp
-    def _(primal: tuple[Array], tangent: tuple[Array]) -> tuple[Array, Array]:
-        return primal[0], _TANGENT.bind(*tangent, message=message)
-
-    return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
-
-
-def _refuse(cotangent: Any, tangent: Any, *, message: str) -> Any:
-    raise ValueError(message)
-
-
-# The identity, whose transpose is an error. (`jax.custom_derivatives.linear_call` cannot be batched.)
-_TANGENT = Primitive("forward_only")
-_TANGENT.def_impl(lambda tangent, *, message: tangent)
-_TANGENT.def_abstract_eval(lambda tangent, *, message: tangent)
-mlir.register_lowering(_TANGENT, lambda context, tangent, *, message: [tangent])
-batching.defvectorized(_TANGENT)
-ad.deflinear2(_TANGENT, _refuse)
-
-
-def gather(array: Array, index: Array) -> Array:
-    """`array[index]` along the first axis, for indices known to be in range: no check is compiled."""
-    return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, computed once and stored in memory.
-
-    XLA recomputes what it fuses for each use, fetches too, but the results of a branch lie in memory. `live`
-    must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN.
-
-    On a GPU, a branch would wait for the host; but there XLA fuses nothing across an `optimization_barrier`,
-    which on CPU it removes before it fuses."""
-    if on_gpu():
-        return jax.lax.optimization_barrier(f(*arguments))
-    f = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
-
-    def never(*arguments: Any) -> Any:
-        def filled(leaf: Any) -> Array:
-            fill = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
-            return jnp.full(leaf.shape, fill, leaf.dtype)
-
-        return varying(jax.tree.map(filled, jax.eval_shape(f, *arguments)), live, arguments)
-
-    return jax.lax.cond(live, f, never, *arguments)

@@ -1,0 +1,249 @@
+"""Marches an image through one brick of a volume after the other, and pulls it back in a second march.
+
+A volume that does not fit into memory is marched brick by brick. Of each ray, it is kept where it has come
+to; in each brick it marches those of its cells that lie there (`CellRange`), from where the brick before left
+off. What is computed from voxels, the packed copy, ranges of blocks and windows, is computed for each brick.
+"""
+
+from dataclasses import replace
+from functools import partial, reduce
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from ..march.march import March
+from ..ray import Progress, Scene, begin, end, front, stopped
+from ..scene.rendering import Rendering
+from ..scene.space import Ray
+from ..xla.trees import PyTree
+from .acceleration import NO_ACCELERATION, VolumeAcceleration, empty_space_of
+from .devices import on_devices
+from .gradients import ImageVjp, Sums
+from .rays import RayTiles, vmap_rays
+from .replay import Cotangents
+from .resolve import resolve_pixels
+from .tiling import RenderOptions
+from .wavefront import Beams, CellRange, march_rays, with_fields
+
+
+class RayStates(eqx.Module):
+    """The rays of an image, and where they have come to, (tiles, groups, rays in a group)."""
+
+    rays: Ray
+    at: Progress
+
+
+@on_devices("sharded")
+def begin_rays(scene: Scene, options: RenderOptions) -> RayStates:
+    """All rays at their entries. Of the volume, no voxel is read."""
+    tiles, fault = RayTiles.of(scene.source, options.tiling), scene.has_fault
+    prepared = scene._replace(lighting=None).prepared()
+
+    def one(each: tuple[Int[Array, ""]]) -> RayStates:
+        rays = tiles.rays(scene.source, prepared.space, each[0], fault)
+        at = vmap_rays(lambda ray: begin(prepared, ray, options.outputs))(rays)
+        return RayStates(rays, with_fields(at, finished=rays.length <= 0))
+
+    return tiles.map(one)
+
+
+@on_devices("sharded", sharded=("states", "ranges"))
+def march_brick(
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    states: RayStates,
+    ranges: CellRange,
+    restart: bool = False,
+    exact: bool = False,
+) -> RayStates:
+    """Marches each ray through `ranges`. `scene`: with a brick of the volume, which holds what rays meet
+    there, and in a segment more.
+
+    `restart`: ignore where rays have come to, unless they are opaque. `exact`: rays take no cell behind their
+    range."""
+    tiles = RayTiles.of(scene.source, options.tiling)
+    index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
+    prepared = acceleration.prepared(scene)
+
+    def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
+        number, states, range_ = each
+        rays, at = states.rays, states.at
+        beams = Beams.of(tiles, scene.source, rays, number, range_)
+        start = at
+        if restart:
+            over = opaque(prepared, at) | (range_.until <= range_.first)
+            start = with_fields(at, index=range_.first, finished=over)
+        after, _ = march_rays(
+            prepared, index, beams, options.tiling, options.outputs, resumed=start, exact=restart or exact
+        )
+        # where it was restarted, a ray may go back
+        over = opaque(prepared, after) if restart else at.finished | ended(prepared, rays, after)
+        return RayStates(rays, with_fields(after, finished=over))
+
+    return tiles.map(one, states, ranges)
+
+
+def ended(scene: Scene, rays: Ray, at: Progress) -> Bool[Array, "groups rays"]:
+    """Which rays need no other cell, wherever it lies."""
+    past = vmap_rays(lambda ray, at: front(scene.march, at) >= ray.length)(rays, at)
+    return past | opaque(scene, at)
+
+
+def opaque(scene: Scene, at: Progress) -> Bool[Array, "groups rays"]:
+    """Which rays are stopped by what lies in front."""
+    return vmap_rays(partial(stopped, scene))(at.composite)
+
+
+@on_devices("replicated", sharded=("before", "after"))
+def resolve_brick(
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    march: March,
+    before: Progress,
+    after: RayStates,
+    pixels: Array | None,
+) -> Array:
+    """Pixels of a mode that chooses a sample: `pixels`, computed again from this brick where it holds another
+    sample than the one chosen `before`. `march`: of the rays."""
+    tiles = RayTiles.of(scene.source, options.tiling)
+    rendering = _assembled(scene._replace(march=march), tiles, after)
+    changed = jnp.zeros(after.rays.length.shape, bool)
+    for old, new in zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True):
+        changed |= old != new
+    changed = tiles.assemble(changed)
+    rgba = rendering.rgba * changed[..., None].astype(rendering.rgba.dtype)
+    found = rgba, rendering.depth, rendering.details.selected
+    resolved = resolve_pixels(scene, options, acceleration, found)
+    return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)
+
+
+def _assembled(scene: Scene, tiles: RayTiles, states: RayStates) -> Rendering:
+    prepared = scene._replace(lighting=None).prepared()
+    renderings = jax.vmap(vmap_rays(partial(end, prepared)))(states.rays, states.at)
+    return jax.tree.map(tiles.assemble, renderings)
+
+
+def join_segments(scene: Scene, parts: RayStates) -> RayStates:
+    """Combines independently marched segments of rays, front to back, along the first axis, to rays that have
+    passed all bricks. What is behind does not show where a ray was stopped in front."""
+    prepared = scene._replace(lighting=None).prepared()
+
+    def join(front: Progress, back: Progress) -> Progress:
+        both = replace(
+            front,
+            index=jnp.maximum(front.index, back.index),
+            composite=scene.compositing.joined(front.composite, back.composite),
+            finished=front.finished & back.finished,
+        )
+        if front.stats is not None and back.stats is not None:
+            samples = front.stats.samples + back.stats.samples
+            aligned = front.stats.aligned | back.stats.aligned
+            both = replace(both, stats=replace(front.stats, samples=samples, aligned=aligned))
+        stops = stopped(prepared, front.composite)
+        return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
+
+    at = _passed(scene.march, parts.at)
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(at.finished.shape[0])]
+    return RayStates(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(jax.vmap(vmap_rays(join)), each))
+
+
+@on_devices("replicated", sharded=("states",))
+def finish_image(scene: Scene, options: RenderOptions, states: RayStates) -> Rendering:
+    """The image of rays that have passed all bricks."""
+    states = RayStates(states.rays, _passed(scene.march, states.at))
+    return _assembled(scene, RayTiles.of(scene.source, options.tiling), states)
+
+
+def _passed(march: March, at: Progress) -> Progress:
+    """Finishes rays, behind whose last brick nothing lies, unless they ran out of samples."""
+    return with_fields(at, finished=at.finished | (at.index < march.most_samples))
+
+
+# ---- the VJP, by a second march in the same order ----
+
+
+class ReplayState(eqx.Module):
+    """The second march of an image, underway, of (tiles, groups, rays in a group).
+
+    - `given`: cotangents of the rays.
+    - `carry`: what the samples so far are worth. `of_rays`: what they gave the rays.
+    """
+
+    states: RayStates
+    given: Cotangents
+    carry: Array
+    of_rays: PyTree
+
+
+@on_devices("both")
+def begin_vjp(
+    scene: Scene, perturbed: Any, options: RenderOptions, rendering: Rendering, cotangent: Rendering
+) -> tuple[Sums, ReplayState]:
+    """All rays at their entries, with the cotangents of their pixels. Of the volume, no voxel is read."""
+    image = ImageVjp.of(scene, perturbed, options, NO_ACCELERATION)
+    sums = image.zeros(perturbed)
+
+    def one(each: tuple[Int[Array, ""], Rendering, Rendering]) -> ReplayState:
+        number, rendering, cotangent = each
+        rays, _ = image.rays(number)
+        at = vmap_rays(lambda ray: begin(image.prepared, ray, None))(rays)
+        given = Cotangents.of(rays, rendering, cotangent)
+        replay = image.replay(rays, given, sums.total)
+        states = RayStates(rays, with_fields(at, finished=rays.length <= 0))
+        return ReplayState(states, given, replay.carry, replay.sums)
+
+    return sums, image.tiles.map(one, *jax.tree.map(image.tiles.disassemble, (rendering, cotangent)))
+
+
+@on_devices("both", sharded=("replayed", "ranges"))
+def vjp_of_brick(
+    scene: Scene,
+    perturbed: Any,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+    sums: Sums,
+    replayed: ReplayState,
+    ranges: CellRange,
+) -> tuple[Sums, ReplayState]:
+    """The second march through `ranges`, as `march_brick`."""
+    image = ImageVjp.of(scene, perturbed, options, acceleration)
+
+    def one(sums: Sums, each: tuple[Int[Array, ""], ReplayState, CellRange]) -> tuple[Sums, ReplayState]:
+        number, state, range_ = each
+        rays, at = state.states.rays, state.states.at
+        replay = image.replay(rays, state.given, sums.total)
+        replay.carry, replay.sums = state.carry, state.of_rays
+        after, (carry, of_rays, total) = image.march(rays, number, range_, replay, resumed=at)
+        over = at.finished | ended(image.prepared, rays, after)
+        states = RayStates(rays, with_fields(after, finished=over))
+        return sums._replace(total=total), ReplayState(states, state.given, carry, of_rays)
+
+    return image.tiles.scan(one, sums, replayed, ranges)
+
+
+@on_devices("replicated", sharded=("replayed",))
+def finish_vjp(
+    scene: Scene,
+    perturbed: Any,
+    options: RenderOptions,
+    sums: Sums,
+    replayed: ReplayState,
+    rendering: Rendering,
+    cotangent: Rendering,
+) -> Any:
+    """The cotangents of a scene's parts, from a march through all bricks of its volume."""
+    image = ImageVjp.of(scene, perturbed, options, NO_ACCELERATION)
+
+    def one(sums: Sums, each: Any) -> tuple[Sums, None]:
+        number, of_rays, rendering, cotangent = each
+        _, pull = image.rays(number)
+        return image.of_rays(sums, pull, of_rays, rendering, cotangent), None
+
+    parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
+    sums, _ = image.tiles.scan(one, sums, replayed.of_rays, *parts)
+    return image.cotangents(sums)

@@ -1,0 +1,212 @@
+"""How many steps long is each cell of a ray? One, unless a `StrideControl` is among the march's transforms.
+
+Cells then come in runs: RUN in a row that are equally long. A run of stride s begins at a multiple of RUN s
+steps, counted from `Strides.phase` steps before the ray's first cell. Of two runs that overlap, one holds the
+other, so that a leap, which only crosses what is transparent, does not change which runs are taken.
+
+Both engines use it by three calls, as a solver of differential equations uses its step-size controller:
+`predicted` prepares the march once for each image, `begin` makes a ray's state, and `Strides.next` decides
+where a run ends. Gradients take strides as given; the image jumps where one changes.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._util.checks import check_answer
+from .._util.vec3 import Scalar
+from ..scene.space import Ray, Space
+from ..scene.variation import Variation, Windows
+from .march import March, Transform
+
+
+RUN = 4
+"""Cells in a row that are equally long."""
+
+
+class Run(NamedTuple):
+    """RUN cells of a ray, in a row, each `stride` steps long.
+
+    - `front`: depth at which the first one begins. (What `Transform.shift` adds is not in it.)
+    - `stride`: a power of two, static. `step`: its unit, world length.
+    """
+
+    front: Scalar
+    stride: int
+    step: Scalar
+
+    @property
+    def middle(self) -> Scalar:
+        """Depth of the middle of the run."""
+        return self.front + RUN * self.stride / 2 * self.step
+
+    def ends_before(self, depth: Scalar) -> Bool[Array, ""]:
+        """Whether the run ends at this depth or before, up to a thousandth of a step: where rays are so many
+        steps long, rounding must not decide."""
+        return self.front + (RUN * self.stride - 1e-3) * self.step <= depth
+
+
+class StrideControl(Transform):
+    """A transform that says how long cells may be: a run is allowed if its error, times the transmittance in
+    front of it, is at most `tolerance`, and always if its stride is 1. Rays take the longest allowed runs.
+
+    `longest`: the longest stride, a power of two up to 64.
+    """
+
+    tolerance: eqx.AbstractVar[Float[Array, ""]]
+    longest: eqx.AbstractVar[int]
+
+    @abstractmethod
+    def prepared(self, march: March, space: Space, windows: Windows, variation: Variation) -> "StrideControl":
+        """With what `error` needs to know of the scene, found once for each image, in arrays of integers,
+        which have no gradient.
+
+        `windows`: how the volume's values vary, block by block; `variation`: how much what is composited
+        changes within their ranges."""
+
+    @abstractmethod
+    def error(self, ray: Ray, run: Run) -> Scalar:
+        """By how much the image is wrong because of these cells, if nothing lies in front of them, as far as
+        can be predicted. It depends on the ray and the run alone."""
+
+
+class Strides(eqx.Module):
+    """How long the cells of a ray are.
+
+    - `steps`: length of each cell of the current run, in steps.
+    - `phase`: steps from where the first of all runs begins to the ray's first cell; None if 0 for all rays.
+    - `error`: sum of the squared errors that are predicted of all runs so far; None where nobody asks for it.
+    """
+
+    steps: Int[Array, ""]
+    phase: Int[Array, ""] | None
+    error: Scalar | None
+
+    def next(
+        self,
+        march: March,
+        ray: Ray,
+        index: Int[Array, ""],
+        ahead: Int[Array, ""] | int,
+        transmittance: Scalar,
+        *,
+        leaves: Bool[Array, ""],
+        finished: Bool[Array, ""],
+    ) -> tuple["Strides", Int[Array, ""]]:
+        """The strides of the run that holds the step `ahead` of `index`, up to which all is transparent; and
+        the steps from `index` to where that run begins, 0 if it is the current one.
+
+        `leaves`: whether the ray has left the volume there. `finished`: whether it takes no more cells."""
+        control = stride_control(march)
+        assert control is not None
+        march, control, ray, transmittance = jax.lax.stop_gradient((march, control, ray, transmittance))
+        # indices are counted from where the first of all runs begins
+        phase = jnp.zeros_like(index) if self.phase is None else self.phase
+        here, target, length = index + phase, index + ahead + phase, RUN * self.steps
+        end = jnp.where(here & (length - 1) == 0, here, (here | (length - 1)) + 1)
+        # before the ray's first cell there is no run
+        end = jnp.where(index == 0, phase, end)
+        start = march.start(ray)
+
+        def run_at(level: int) -> tuple[Int[Array, ""], Run, Scalar]:
+            first = target & -(RUN << level)
+            run = Run((start + (first - phase).astype(start.dtype)) * march.step, 1 << level, march.step)
+            error = control.error(ray, run)
+            check_answer(control, "error", error, run.front)
+            # what is unknown is infinite, but does not count where nothing of it is seen
+            return first, run, jnp.where(transmittance > 0, transmittance * error, 0)
+
+        first, _, error = run_at(0)
+        # the first of all runs may have begun before the ray's first cell
+        chosen = jnp.maximum(first, end), jnp.ones_like(index), error
+        for level in range(1, control.longest.bit_length()):
+            first, run, error = run_at(level)
+            fits = (first >= end) & (error <= control.tolerance.astype(error.dtype))
+            if not march.ends_at_exit:
+                fits &= run.ends_before(ray.length)
+                for near, far in ray.gaps:  # a shift may still move the run, by a step at most
+                    fits &= run.ends_before(near) | (run.front - run.step >= far)
+            chosen = jax.tree.map(
+                partial(jnp.where, fits), (first, jnp.full_like(index, run.stride), error), chosen
+            )
+        going = target < end
+        begin, steps, error = jax.tree.map(
+            partial(jnp.where, going), (here, self.steps, jnp.zeros_like(error)), chosen
+        )
+        begin, steps = jnp.where(leaves, target, begin), jnp.where(leaves, 1, steps)
+        known = jnp.where(leaves | finished, 0, error)
+        total = None if self.error is None else self.error + known**2
+        return Strides(steps, self.phase, total), begin - here
+
+    def ends_within(self, cells: int) -> bool:
+        """Whether a run may end before so many cells of it are taken."""
+        return self.phase is not None or RUN % cells > 0
+
+    def cells_left(self, index: Int[Array, "*rays"], most: Int[Array, "*rays"]) -> Int[Array, "*rays"]:
+        """Number of cells up to the end of the run that begin less than `most` steps from here."""
+        run, phase = RUN * self.steps, 0 if self.phase is None else self.phase
+        steps = jnp.minimum(most, run - ((index + phase) & (run - 1)))
+        return jax.lax.div(steps + self.steps - 1, self.steps)
+
+
+def steps_of(strides: Strides | None) -> Int[Array, "*rays"] | int:
+    """Length of the next cell, in steps."""
+    return 1 if strides is None else strides.steps
+
+
+def begin(march: March, ray: Ray, *, estimate: bool) -> Strides | None:
+    """The strides of a ray at its entry; None where all cells are one step long. `estimate`: whether the
+    error is summed."""
+    control = stride_control(march)
+    if control is None:
+        return None
+    one = jnp.ones(ray.length.shape, jnp.int32)
+    return Strides(one, _phase(march, ray, control), jnp.zeros_like(ray.length) if estimate else None)
+
+
+def predicted(
+    march: March, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
+) -> March:
+    """The march, whose `StrideControl` knows the scene. `windows`: of the volume; None without one."""
+    control = stride_control(march)
+    if control is None:
+        return march
+    assert windows is not None
+    constant: Any = jax.lax.stop_gradient((march, space, windows, variation(windows)))
+    known = control.prepared(*constant)
+    transforms = tuple(known if each is control else each for each in march.transforms)
+    return eqx.tree_at(lambda march: march.transforms, march, transforms)
+
+
+def stride_control(march: March) -> StrideControl | None:
+    """The transform that chooses strides, if there is one.
+
+    **Raises:** `ValueError` if there are several."""
+    found = [transform for transform in march.transforms if isinstance(transform, StrideControl)]
+    if len(found) > 1:
+        raise ValueError(f"transforms must have one StrideControl at most; got {len(found)}.")
+    return found[0] if found else None
+
+
+def longest_run(march: March) -> int:
+    """The most steps of a run."""
+    control = stride_control(march)
+    return RUN if control is None else RUN * control.longest
+
+
+def _phase(march: March, ray: Ray, control: StrideControl) -> Int[Array, ""] | None:
+    """At random where `start` or `shift` are. These move samples by less than a step, too little to break the
+    wood grain of longer cells, and of the runs themselves."""
+    if not march.overriding("start") and not march.may_shift:
+        return None
+    part = jax.lax.stop_gradient(march.start(ray) - march.shift(ray))
+    # its lower digits, of which the part of a step is nearly independent; all of it is exact
+    part = 32 * part
+    run = RUN * control.longest
+    return jnp.floor((part - jnp.floor(part)) * run).astype(jnp.int32) & (run - 1)

@@ -1,0 +1,372 @@
+"""One ray, cell by cell: the steps that the reference and the fast engine share.
+
+`begin` a ray; cut each cell into `pieces`, `measure` each at its sample, find its `opacity`, and `add` it to
+the pixel; `stop` the ray, or `move` on; then `end` it. A cell of extinction σ and width w has the opacity
+α = 1 - exp(-σ w); `compositing` says how cells become a pixel. A fault in here shows in both engines: the
+independent check is `tests/oracle.py`.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ._util.checks import all_finite, check_answer, described
+from ._util.vec3 import Scalar, Vec3
+from .compositing.compositing import Compositing, Fragment, Outputs, Over, Weighting
+from .compositing.selection import RaySampler, Selection
+from .lighting.shading import Lighting, lit_classification
+from .march import strides
+from .march.march import Cell, March
+from .march.strides import Strides, steps_of
+from .scene.camera import Camera
+from .scene.labels import LabelTransferFunction
+from .scene.rendering import Details, Rendering
+from .scene.space import Line, Ray, Space, enter, world_gradient
+from .scene.transfer import Classification, Measured, Transfer, TransferFunction
+from .scene.transfer2d import TransferFunction2D
+from .scene.variation import Windows
+from .scene.volume import Volume, without_voxels
+from .xla.memory import in_memory
+from .xla.trees import PyTree
+
+
+class Scene(NamedTuple):
+    """All that an image depends on: what `render` is given, and what is `prepared` from that.
+
+    - `source`: where rays come from, a `Camera` or `GivenRays`; None where there is a single ray.
+    - `space`: in which rays meet the volume. `classification`: how samples are measured, classified and
+      shaded.
+    """
+
+    volume: Volume
+    transfer: Transfer
+    source: Any
+    march: March
+    compositing: Compositing[Any] = Over()
+    lighting: Lighting | None = None
+    space: Space = cast(Space, None)
+    classification: Classification = cast(Classification, None)
+
+    def prepared(self, windows: Windows | None = None) -> "Scene":
+        """The scene with what is computed once for each image. `windows`: of the volume, where a transform
+        chooses strides."""
+        space, march = self.march.locate(self.volume), self.march
+        lit = lit_classification(
+            self.volume, self.transfer, space, self.lighting, integrated=march.integrates
+        )
+        if windows is not None:
+            variation = partial(self.compositing.variation, self.transfer)
+            march = strides.predicted(march, space, windows, variation)
+        return self._replace(march=march, space=space, classification=lit)
+
+    @property
+    def has_fault(self) -> Bool[Array, ""]:
+        """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
+        Comparisons with NaN are false and would make it invisible, so that a fit that diverged would look
+        converged. Rays and voxels are checked ray by ray."""
+        parts = without_voxels(self.volume), self.march, self.transfer, self.compositing, self.lighting
+        return ~(all_finite(parts) & (self.march.step > 0))
+
+    @property
+    def resolves(self) -> bool:
+        """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
+        return self.compositing.resolves or (self.lighting is not None and self.lighting.shades_pixels)
+
+    @property
+    def marched(self) -> "Scene":
+        """The scene as its rays are marched: if it `resolves`, without light, and by the march and the
+        transfer function of its mode."""
+        if not self.resolves:
+            return self
+        transfer, march = self.compositing.marched(self.transfer, self.march, self.volume)
+        return self._replace(transfer=transfer, march=march, lighting=None)
+
+
+EXPECTED: dict[str, tuple[type, str, str]] = {
+    "volume": (
+        Volume,
+        "a jaxvol Volume",
+        "Pass jv.Volume(data, spacing=...) for an array, jv.load(path) for a file, or jv.phantom(name).",
+    ),
+    "transfer": (
+        Transfer,
+        "a transfer function",
+        "Pass jv.preset(name), jv.colormap(cmap, clim) or jv.TransferFunction.from_points(points).",
+    ),
+    "camera": (
+        Camera,
+        "a jaxvol Camera",
+        "Pass jv.Camera.looking_at(volume) or jv.Camera(position, focal_point).",
+    ),
+    "march": (
+        March,
+        "a jaxvol March",
+        'Pass jv.March(step) or jv.March(step, transforms), or "auto" to jv.render.',
+    ),
+    "lighting": (
+        Lighting,
+        "None or a Lighting",
+        "Pass jv.lighting.Phong(lights) or jv.lighting.ScattererTemplates(materials, lights).",
+    ),
+}
+"""For each argument name: its type, a description, and how to make one."""
+
+FINAL: dict[type, str] = {
+    Volume: "jaxvol.Field instead, and pass it as Volume(..., field=...)",
+    TransferFunction: "jaxvol.scene.transfer.Transfer instead",
+    TransferFunction2D: "jaxvol.scene.transfer.Transfer instead",
+    LabelTransferFunction: "jaxvol.scene.transfer.Transfer instead",
+}
+"""Classes whose subclasses would not be asked by the fast engine, and what to subclass."""
+
+
+def check_arguments(call: str, **arguments: Any) -> None:
+    """Check that arguments are of the types that their names say.
+
+    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`,
+    quoted when arguments are swapped.
+
+    **Raises:** `ValueError` naming the first such argument, what came, and what to pass.
+    """
+    for name, value in arguments.items():
+        kind, expected, remedy = EXPECTED[name]
+        for final, other in FINAL.items():
+            if isinstance(value, final) and type(value) is not final:
+                raise ValueError(
+                    f"{name} must be a jaxvol {final.__name__} itself; got its subclass "
+                    f"{type(value).__name__}, whose methods the fast engine would not call. Subclass {other}."
+                )
+        if isinstance(value, kind) or (name == "lighting" and value is None):
+            continue
+        for other, (kind, _, _) in EXPECTED.items():
+            if isinstance(value, kind):
+                remedy = f"That is the {other}: the order is {call}."
+        raise ValueError(f"{name} must be {expected}; got {described(value)}. {remedy}")
+
+
+class Progress(eqx.Module):
+    """How far a ray has come.
+
+    The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
+    ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
+    the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
+    first transparent cell, and is 0 from then on. What is not asked for, or not needed, is None: `strides`
+    where all cells are one step long.
+    """
+
+    index: Int[Array, ""]
+    offset: Scalar
+    composite: PyTree
+    stats: "SampleStats | None"
+    finished: Bool[Array, ""]
+    shift: Scalar | None
+    strides: Strides | None = None
+
+
+class SampleStats(eqx.Module):
+    """What `Rendering.samples` and `Rendering.aligned` report."""
+
+    samples: Int[Array, ""]
+    aligned: Bool[Array, ""]
+
+
+def begin(scene: Scene, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+    """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
+    march, compositing = scene.march, scene.compositing
+    zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
+    count = jnp.zeros(ray.length.shape, jnp.int32)
+    return Progress(
+        index=count,
+        offset=march.start(ray),
+        composite=compositing.begin(zero, outputs),
+        stats=SampleStats(count, no) if outputs == "all" else None,
+        finished=no,
+        shift=march.shift(ray) if march.may_shift else None,
+        strides=strides.begin(march, ray, estimate=outputs == "all"),
+    )
+
+
+def with_stride(
+    scene: Scene, ray: Ray, at: Progress, ahead: Int[Array, ""] | int = 0
+) -> tuple[Progress, Int[Array, ""] | int]:
+    """The ray, with the stride of the run that holds the step `ahead`, up to which all is transparent; and
+    the steps to where the next cell begins."""
+    if at.strides is None:
+        return at, ahead
+    march, transmittance = scene.march, scene.compositing.transmittance(at.composite)
+    leaves = (ahead > 0) & (front(march, at, ahead) >= ray.length)
+    finished = at.finished | (ray.length <= 0) | (at.index >= march.most_samples)
+    chosen, ahead = at.strides.next(
+        march, ray, at.index, ahead, transmittance, leaves=leaves, finished=finished
+    )
+    return replace(at, strides=chosen), ahead
+
+
+def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
+    """The pieces of the ray's next cell, or the one so many cells behind it in its run."""
+    march, steps = scene.march, steps_of(at.strides)
+    width = jnp.asarray(steps, march.step.dtype) * march.step
+    begin = front(march, at, number * steps)
+    return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, scene.volume)
+
+
+def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
+    """The measured values at a piece's sample, or over the piece where it is integrated, and what the
+    transfer function's search finds for them. `recorded`: for the engine's `Recording`, which cannot record
+    fetches inside branches."""
+    march, classification = scene.march, scene.classification
+    if not march.integrates:
+        return classification.at(ray.path(march.sample(piece)))
+
+    def measured(depth: Scalar) -> Measured:
+        return classification.measure(ray.path(depth))[:1]
+
+    # In branches of their own, which XLA does not fuse: where a kernel interpolates both values, one of them
+    # may come out as that of the next node (jaxlib 0.10 on CPU with FMA; seen by
+    # `test_render_agrees_with_the_reference`).
+    ends = march.ends(piece, ray)
+    front, back = (measured(s) if recorded else in_memory(march.step > 0, measured, s) for s in ends)
+    attributes = classification.attributes(ray.path(march.sample(piece)))
+    return classification.spanned(attributes, *(classification.searched(end) for end in (front, back)))
+
+
+def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
+    """Opacity of a piece; 0 past the exit, and in gaps."""
+    _, extinction = scene.classification.of_cells(measured)
+    inside = ray.contains(scene.march.sample(piece))
+    optical_depth = jnp.where(inside, extinction, 0) * piece.width
+    # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
+    t = jnp.tanh(optical_depth / 2)
+    return 2 * t / (1 + t)
+
+
+def is_sample(march: March, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
+    """Whether a piece counts as a sample. `divided`: transforms divide cells, so that pieces may have
+    width 0."""
+    before_exit = march.sample(piece) < ray.length
+    # not in general: it would take 15 % of a frame whose last cells are cut
+    return before_exit & (piece.width > 0) if divided else before_exit
+
+
+def add(
+    scene: Scene,
+    ray: Ray,
+    at: Progress,
+    piece: Cell,
+    measured: Measured,
+    color: Vec3 | None,
+    alpha: Scalar,
+    *,
+    divided: bool,
+) -> Progress:
+    """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: of `Fragment`.
+    `divided`: of `is_sample`."""
+    march, compositing = scene.march, scene.compositing
+    depth, counts = march.sample(piece), ~at.finished & is_sample(march, ray, piece, divided=divided)
+    alpha = jnp.where(at.finished, 0, alpha)
+    fragment = Fragment(alpha, depth, piece, measured, color, counts & ray.contains(depth))
+    stats = at.stats
+    if stats is not None:
+        shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
+        samples = stats.samples + counts.astype(stats.samples.dtype)
+        stats = replace(stats, samples=samples, aligned=stats.aligned | (piece.cut & shows))
+    composite = compositing.add(at.composite, fragment)
+    check_answer(compositing, "add", composite, at.composite)
+    return replace(at, composite=composite, stats=stats)
+
+
+def stop(scene: Scene, at: Progress) -> Progress:
+    """Finishes a ray that needs no other cell."""
+    return replace(at, finished=at.finished | stopped(scene, at.composite))
+
+
+def stopped(scene: Scene, composite: Any) -> Bool[Array, ""]:
+    """Whether a ray in this state of compositing needs no other cell."""
+    march, compositing = scene.march, scene.compositing
+    stops, finished = march.stop(compositing.transmittance(composite)), compositing.finished(composite)
+    check_answer(compositing, "finished", finished, stops)
+    return stops | finished
+
+
+def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
+    """Moves on by this many steps. `transparent`: whether the last cell, or all of them, are, so that the ray
+    shifts; None where no shift is ahead. The ray is finished if the next cell begins past the exit."""
+    at = replace(at, index=at.index + steps)
+    if at.shift is not None and transparent is not None:
+        shift = jnp.where(transparent, at.shift, 0)
+        at = replace(at, offset=at.offset + shift, shift=jnp.where(transparent, 0, at.shift))
+    return replace(at, finished=at.finished | (front(march, at) >= ray.length))
+
+
+def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
+    """Depth at which the next cell begins, or the one so many steps ahead of it."""
+    return (at.offset + (at.index + ahead).astype(at.offset.dtype)) * march.step
+
+
+def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
+    """The rendering of a ray, with the outputs that it was begun with. Modes that resolve leave the pixel to
+    `resolve`."""
+    valid, details = ~jnp.isnan(ray.t_in), Details()
+    rgba, depth = scene.compositing.end(at.composite)
+    # a product, since the derivative of a `where` would be 0
+    rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
+    if depth is not None:
+        details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
+    if at.stats is not None:
+        details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
+    if at.strides is not None and at.strides.error is not None:
+        details = details._replace(error=jnp.where(valid, jnp.sqrt(at.strides.error), jnp.nan))
+    if isinstance(scene.compositing, Selection):
+        details = details._replace(selected=at.composite)
+    return Rendering(rgba, ~at.finished, details)
+
+
+class Pixel(NamedTuple):
+    """What is computed after the march: premultiplied colour and opacity, the distance from the ray's origin,
+    infinite where nothing is visible, and a unit normal, if the mode has one."""
+
+    rgba: Float[Array, "4"]
+    depth: Scalar
+    normal: Float[Array, "3"] | None = None
+
+
+def resolve(scene: Scene, line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Pixel:
+    """The pixel of a ray that is not transparent, from what its march found: by the compositing mode, or else
+    by the lighting."""
+    compositing = scene.compositing
+    if isinstance(compositing, Selection):
+        return _selected(compositing, scene, line, rgba, selected)
+    if compositing.resolves:
+        assert isinstance(compositing, Weighting)
+        found = compositing.resolved(scene.classification, rgba)
+        check_answer(compositing, "resolved", found, rgba)
+        return Pixel(found, depth)
+    assert scene.lighting is not None
+    pixel = scene.lighting.shade_pixel(scene.classification, scene.space, line, rgba, depth)
+    return Pixel(pixel, depth)
+
+
+def _selected(
+    compositing: Selection[Any], scene: Scene, line: Line, rgba: Float[Array, "4"], state: PyTree
+) -> Pixel:
+    ray, march = enter(scene.space, *line), scene.march
+    # 1, with a derivative: the selected depths are numbers of steps, and so grow with the step
+    scale = march.step / jax.lax.stop_gradient(march.step)
+    gradient = partial(world_gradient, scene.volume, scene.space)
+    sampler = RaySampler(ray, scene.classification, scale, gradient)
+    found = compositing.pixel(sampler, jax.lax.stop_gradient(state))
+    check_answer(compositing, "pixel", found, (rgba, rgba[3]))
+    pixel, depth = found
+    normal = compositing.normal(sampler, depth)
+    if normal is not None:
+        check_answer(compositing, "normal", normal, rgba[:3])
+    valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
+    # a product with infinity would have the derivative NaN
+    seen = ~jnp.isinf(depth)
+    depth = jnp.where(seen, ray.t_in + jnp.where(seen, depth, 0) * scale, jnp.inf)
+    return Pixel(pixel * valid, depth, None if normal is None else normal * valid)

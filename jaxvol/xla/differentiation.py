@@ -1,0 +1,55 @@
+"""Which of JAX's transformations does an array undergo, and which modes of differentiation are refused?"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from .platform import is_traced
+from .trees import PyTree
+
+
+def transformations(leaf: Any) -> list[str]:
+    """Names of JAX's tracers around an array, the innermost first. Names, since JAX does not export their
+    classes. Transformations outside of a `jax.jit` cannot be seen."""
+    names = []
+    while is_traced(leaf):
+        names.append(type(leaf).__name__)
+        leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
+    return names
+
+
+def forward_mode(kinds: list[list[str]]) -> bool:
+    """Whether `transformations` of the leaves of a tree are forward mode (`jax.jvp`, `jax.jacfwd`), or of
+    second order. A `custom_vjp` has no rule for these: JAX's own error names neither argument nor remedy."""
+    return any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds)
+
+
+def forward_only(tree: PyTree, message: str) -> PyTree:
+    """The tree, unchanged. Under reverse mode it raises `ValueError` with this message."""
+
+    @jax.custom_jvp
+    def same(leaf: Array) -> Array:
+        return leaf
+
+    @same.defjvp
+    def _(primal: tuple[Array], tangent: tuple[Array]) -> tuple[Array, Array]:
+        return primal[0], _TANGENT.bind(*tangent, message=message)
+
+    return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def _refuse(cotangent: Any, tangent: Any, *, message: str) -> Any:
+    raise ValueError(message)
+
+
+# The identity, whose transpose is an error. (`jax.custom_derivatives.linear_call` cannot be batched.)
+_TANGENT = Primitive("forward_only")
+_TANGENT.def_impl(lambda tangent, *, message: tangent)
+_TANGENT.def_abstract_eval(lambda tangent, *, message: tangent)
+mlir.register_lowering(_TANGENT, lambda context, tangent, *, message: [tangent])
+batching.defvectorized(_TANGENT)
+ad.deflinear2(_TANGENT, _refuse)
