@@ -4,8 +4,8 @@
     jv.datasets.info("engine")
     volume = jv.datasets.load("engine")
 
-Files in the folder `$JAXVOL_DATA` are used in place. The list is that of klacansky.com/open-scivis-datasets, of
-the commit that `open_scivis.json` names.
+Files in the folder `$JAXVOL_DATA` are used in place. The list is that of klacansky.com/open-scivis-datasets,
+of the commit that `open_scivis.json` names.
 """
 
 import difflib
@@ -134,8 +134,8 @@ def fetch(
       `<mirror>/engine/engine_256x256x128_uint8.raw`.
     - `progress`: show a progress bar of what is downloaded.
 
-    **Returns:** the path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of one
-    that was there before, only the size is checked, and not the content.
+    **Returns:** the path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of
+    one that was there before, only the size is checked.
 
     **Raises:** `ValueError` for a name that is not in the list, a file of another size, or a download with
     another SHA-512; `OSError` where the server cannot be reached, has no such file, or does not send all of

@@ -22,7 +22,7 @@ from ..._util.files import Header, decoding
 from ..._util.npy import read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
-from .dicom import dicom_files, is_dicom, read_dicom, read_dicom_folder, series_files
+from .dicom import dicom_files, is_dicom, read_dicom, series_files
 from .kretz import read_kretz, refuse_kretz
 from .medical import nrrd_data, read_medical
 from .metaimage import metaimage_data, read_metaimage
@@ -123,7 +123,7 @@ def _reader(path: Path) -> Reader:
             f"path: {path} has an unknown ending; expected a file ending in {', '.join(sorted(READERS))}."
         )
     if dicom_files(path):
-        return read_dicom_folder
+        return read_dicom
     if tiff_files(path):
         return read_tiff_folder
     raise ValueError(
