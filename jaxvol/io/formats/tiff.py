@@ -124,8 +124,8 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             if several or len(kinds) > 1 or len(shape) not in (2, 3) or first.samplesperpixel != 1:
                 raise ValueError(
                     f"path: {path} must hold one stack of images of one size, type and value per pixel; got "
-                    f"{len(file.series)} stacks, the first of shape {file.series[0].shape} ({axes}), and pages "
-                    f"of {len(kinds)} kinds. Save one stack alone."
+                    f"{len(file.series)} stacks, the first of shape {file.series[0].shape} ({axes}), and "
+                    f"pages of {len(kinds)} kinds. Save one stack alone."
                 )
             if not 0 < math.prod(shape) <= MOST_VOXELS or first.dtype is None:
                 raise ValueError(
