@@ -85,7 +85,8 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
             expected = struct.calcsize(kind)
             if length != expected:
                 raise ValueError(
-                    f"path: {path}: item {_name(tag)} must have {expected} bytes ({kind[1:]}); it has {length}."
+                    f"path: {path}: item {_name(tag)} must have {expected} bytes ({kind[1:]}); it has "
+                    f"{length}."
                 )
             stream.seek(offset)
             return struct.unpack(kind, stream.read(length))
@@ -162,8 +163,8 @@ def _check_shape(path: Path, shape: tuple[int, ...], held: int) -> None:
     if held != expected:
         less = "less, as in a compressed file" if held < expected else "more"
         raise ValueError(
-            f"path: {path}: item {_name(VOXELS)} must hold {sizes} = {expected} bytes, as its header (β, σ, γ) "
-            f"says; it holds {held}, which is {less}."
+            f"path: {path}: item {_name(VOXELS)} must hold {sizes} = {expected} bytes, as its header (β, σ, "
+            f"γ) says; it holds {held}, which is {less}."
         )
 
 
@@ -176,8 +177,8 @@ def _ends(path: Path, tag: Tag, angles: np.ndarray) -> tuple[float, float]:
     if not (step > 0 and away <= UNEVEN):
         raise ValueError(
             f"path: {path}: item {_name(tag)} must be evenly spaced angles that increase; got {len(angles)} "
-            f"from {first} to {last}, up to {away:.3g} steps away from even ones (at most {UNEVEN}). Resample "
-            "the volume at even angles first."
+            f"from {first} to {last}, up to {away:.3g} steps away from even ones (at most {UNEVEN}). "
+            "Resample the volume at even angles first."
         )
     return first, last
 
