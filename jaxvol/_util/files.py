@@ -99,6 +99,17 @@ def reason(fault: BaseException) -> str:
     return shown.rstrip(".") or type(fault).__name__
 
 
+def numbers_in(text: str, count: int, what: str, separator: str | None = None) -> np.ndarray:
+    """`count` finite numbers in a text. **Raises** `ValueError`, which begins with `what`, for anything else."""
+    try:
+        numbers = np.array(text.split(separator), float)
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.size != count or not np.isfinite(numbers).all():
+        raise ValueError(f"{what} must be {count} numbers; got {text[:80]!r}.")
+    return numbers
+
+
 def as_array(
     content: bytes | bytearray, shape: Sequence[int], dtype: np.dtype, order: Literal["C", "F"]
 ) -> np.ndarray:

@@ -1,6 +1,6 @@
-"""Which Cartesian volume shows what a swept probe acquired? Scan conversion, as scanners and viewers do it.
+"""Resamples what a swept probe acquired onto a Cartesian grid, which other programs read.
 
-Rendering under a `ToroidalMap` needs none. Other programs do: they read voxels along three axes.
+Rendering under a `ToroidalMap` needs no such conversion.
 """
 
 import math

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, Header, decoding
+from ..._util.files import MOST_VOXELS, Header, decoding, numbers_in
 from .medical import simple_itk
 from .orientation import orthonormal, toward_axes
 
@@ -139,8 +139,10 @@ def _slice(path: Path) -> Slice:
     n_bytes, pixels = path.stat().st_size, width * height * (int(bits) // 8 if bits.isdigit() else 1)
     if n_bytes * (1 if syntax in PLAIN else MOST_COMPRESSED) < pixels:
         raise ValueError(f"path: {path} is cut short: it has {n_bytes} bytes, and its pixels {pixels}.")
-    position, axes = _numbers(path, reader, "0020|0032", 3), _numbers(path, reader, "0020|0037", 6)
-    down, across = _numbers(path, reader, "0028|0030", 2)  # between rows, then between columns
+    position, axes, (down, across) = (  # spacing between rows, then between columns
+        numbers_in(_text(reader, tag), count, f"path: {path} must say where it lies: element ({tag})", "\\")
+        for tag, count in (("0020|0032", 3), ("0020|0037", 6), ("0028|0030", 2))
+    )
     if min(down, across) <= 0:
         raise ValueError(f"path: {path}: the spacing of its pixels must be positive; got {down}, {across}.")
     series, description = _text(reader, "0020|000e"), _text(reader, "0008|103e")
@@ -223,20 +225,6 @@ def _reader(path: Path) -> Any:
 
 def _text(reader: Any, tag: str) -> str:
     return reader.GetMetaData(tag).strip() if reader.HasMetaDataKey(tag) else ""
-
-
-def _numbers(path: Path, reader: Any, tag: str, count: int) -> np.ndarray:
-    text = _text(reader, tag)
-    try:
-        numbers = np.array(text.split("\\"), float)
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.shape != (count,) or not np.all(np.isfinite(numbers)):
-        raise ValueError(
-            f"path: {path} must say where it lies: element ({tag.replace('|', ',')}) must be {count} "
-            f"numbers; got {text[:80]!r}."
-        )
-    return numbers
 
 
 def _meta(path: Path, element: bytes) -> str | None:

@@ -1,16 +1,8 @@
 """Reads Kretz ultrasound files (`.vol`, of GE Voluson scanners): voxels as acquired, and where they lie.
 
 A file is 16 bytes of magic and then items: group (u16), element (u16), length (u32), and `length` bytes, all
-little-endian. The format is not published; what is read here is what `vtkSlicerKretzFileReaderLogic`
-(SlicerHeart) and plooney/kretz read, who found it out from files:
-
-| item | holds |
-|---|---|
-| C000:1, C000:2, C000:3 | u16: numbers of samples along a beam (γ), of beams (σ), of planes (β) |
-| C100:1 | f64: distance between the samples of a beam, in metres |
-| C200:1, C200:2 | f64: b and a of the toroidal map, in samples of a beam |
-| C300:1, C300:2 | f64 tables: β of every plane and σ of every beam, in radians; π/2 is the middle |
-| D000:1 | u8: the voxels, γ fastest, then σ, then β |
+little-endian. The format is not published; the items that are read (`MEANING`) are those of
+`vtkSlicerKretzFileReaderLogic` (SlicerHeart) and plooney/kretz, who found them out from files.
 
 `ToroidalMap` has the readers' place for every voxel but for a shift along z by a and, against SlicerHeart's
 RAS axes, the sign of y.
@@ -47,15 +39,15 @@ BETAS, SIGMAS = ((0xC300, element) for element in (1, 2))
 VOXELS = (0xD000, 1)
 
 MEANING = {
-    GAMMA: "the number of samples along a beam",
-    SIGMA: "the number of beams",
-    BETA: "the number of planes",
-    RESOLUTION: "the distance between samples",
-    OFFSET_B: "the distance from the apex to the first sample",
-    OFFSET_A: "the distance from the motor axis to the apex",
-    BETAS: "the angles of the planes",
-    SIGMAS: "the angles of the beams",
-    VOXELS: "the voxels",
+    GAMMA: "the number of samples along a beam",  # u16
+    SIGMA: "the number of beams",  # u16
+    BETA: "the number of planes",  # u16
+    RESOLUTION: "the distance between samples",  # f64, in metres
+    OFFSET_B: "the distance from the apex to the first sample",  # f64, in samples
+    OFFSET_A: "the distance from the motor axis to the apex",  # f64, in samples
+    BETAS: "the angles of the planes",  # f64 for each, in radians; π/2 is the middle
+    SIGMAS: "the angles of the beams",  # likewise
+    VOXELS: "the voxels",  # u8, γ fastest, then σ, then β
 }
 
 
@@ -138,19 +130,17 @@ def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[Tag, tuple[int, i
 
 def _require_all(path: Path, items: dict[Tag, tuple[int, int]]) -> None:
     missing = [tag for tag in MEANING if tag not in items]
+    hint = ""
     if missing == [VOXELS]:
         data = [f"{_hex(tag)} ({length} bytes)" for tag, (_, length) in items.items() if tag[0] >> 12 == 0xD]
-        raise ValueError(
-            f"path: {path} has no item {_name(VOXELS)}: it is a compressed file, or one of several frames. "
-            f"Items of data that it has: {', '.join(data) or 'none'}. Save it as one uncompressed volume."
+        hint = (
+            " It is a compressed file, or one of several frames; items of data that it has: "
+            f"{', '.join(data) or 'none'}. Save it as one uncompressed volume."
         )
-    if set(missing) == {BETAS, SIGMAS}:
-        raise ValueError(
-            f"path: {path} has no angles (items {_hex(BETAS)}, {_hex(SIGMAS)}): it is a Cartesian volume, "
-            "which is not supported. Export it as acquired."
-        )
+    elif missing == [BETAS, SIGMAS]:
+        hint = " It is a Cartesian volume, which is not supported. Export it as acquired."
     if missing:
-        raise ValueError(f"path: {path} has no item {', no item '.join(map(_name, missing))}.")
+        raise ValueError(f"path: {path} has no item {', no item '.join(map(_name, missing))}.{hint}")
 
 
 def _check_shape(path: Path, shape: tuple[int, ...], held: int) -> None:

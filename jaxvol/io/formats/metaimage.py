@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size
+from ..._util.files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, numbers_in
 from .medical import text_header
 from .orientation import orthonormal, toward_axes
 
@@ -85,13 +85,7 @@ def _numbers(path: Path, fields: dict[str, str], keys: tuple[str, ...], default:
     key = next((key for key in keys if key in fields), None)
     if key is None:
         return default
-    try:
-        found = np.array(fields[key].split(), float)
-    except ValueError:
-        found = np.empty(0)
-    if found.size != default.size or not np.isfinite(found).all():
-        raise ValueError(f"path: {path}: {key} must be {default.size} numbers; got {fields[key][:80]!r}.")
-    return found.reshape(default.shape)
+    return numbers_in(fields[key], default.size, f"path: {path}: {key}").reshape(default.shape)
 
 
 def _content(path: Path, fields: dict[str, str], begin: int, expected: int) -> bytes:

@@ -72,15 +72,13 @@ def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
         images, _ = _images(file)
         if len(images) != 1:
             raise ValueError(f"path: {file} must hold one image, as a slice of {folder}; got {len(images)}.")
-        (image,) = images
-        if slices and (image.shape, image.dtype) != (slices[0].shape, slices[0].dtype):
+        slices.append(images[0])
+        first, last = (f"{each.shape} of {each.dtype}" for each in (slices[0], slices[-1]))
+        if first != last or len(slices) * images.size > MOST_VOXELS:
             raise ValueError(
-                f"path: the slices in {folder} must have the same size and type; {files[0].name} has "
-                f"{slices[0].shape} of {slices[0].dtype}, and {file.name} {image.shape} of {image.dtype}."
+                f"path: the slices in {folder} must have the same size and type, and fewer than 2**31 voxels; "
+                f"{files[0].name} has {first}, and {file.name} {last}."
             )
-        slices.append(image)
-        if len(slices) * image.size > MOST_VOXELS:
-            raise ValueError(f"path: {folder} must have fewer than 2**31 voxels.")
     return {"data": np.stack(slices).transpose(2, 1, 0)}
 
 
