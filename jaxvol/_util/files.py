@@ -100,7 +100,7 @@ def reason(fault: BaseException) -> str:
 
 
 def numbers_in(text: str, count: int, what: str, separator: str | None = None) -> np.ndarray:
-    """`count` finite numbers in a text. **Raises** `ValueError`, which begins with `what`, for anything else."""
+    """`count` finite numbers in a text. **Raises** `ValueError`, which begins with `what`, for other text."""
     try:
         numbers = np.array(text.split(separator), float)
     except ValueError:

@@ -76,8 +76,8 @@ def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
         first, last = (f"{each.shape} of {each.dtype}" for each in (slices[0], slices[-1]))
         if first != last or len(slices) * images.size > MOST_VOXELS:
             raise ValueError(
-                f"path: the slices in {folder} must have the same size and type, and fewer than 2**31 voxels; "
-                f"{files[0].name} has {first}, and {file.name} {last}."
+                f"path: the slices in {folder} must have the same size and type, and fewer than 2**31 "
+                f"voxels; {files[0].name} has {first}, and {file.name} {last}."
             )
     return {"data": np.stack(slices).transpose(2, 1, 0)}
 

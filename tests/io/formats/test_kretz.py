@@ -115,7 +115,7 @@ BAD = {
     "too many voxels": (changed(VOXELS, bytes(121)), "= 120 bytes.*holds 121, which is more"),
     "Cartesian": (
         without(PLANES, BEAMS),
-        r"no item C300:1 \(the angles of the planes\), no item C300:2.*Cartesian",
+        r"no item C300:1 .*, no item C300:2 .*Cartesian",
     ),
     "an item twice": (kretz(more=[((0xC000, 1), b"\x06\x00")]), "holds item C000:1 .* twice"),
     "zero size": (changed((0xC000, 3), bytes(2)), r"C000:3 \(the number of planes\) must be at least 2"),
