@@ -176,25 +176,6 @@ def boundary_noise(image: Any, region: Any) -> float:
     return float(np.mean(np.sum(rough[inside] ** 2, axis=-1)) / 36)
 
 
-def low_frequency_energy(error: Any, below: float = 1 / 16) -> float:
-    """Energy of an error under `below` cycles per pixel, with its mean removed and a Hann window applied.
-
-    Mean square per pixel, summed over channels. The default is the lowest eighth of what an image can hold.
-
-    **Arguments:** `error`: as for `wood_grain_energy`. `below`: in cycles per pixel.
-
-    **Returns:** the energy, in squared units of the error.
-
-    **Raises:** `ValueError` for NaN or infinity, and input that is not an image.
-    """
-    error = _image("error", error)
-    height, width, _ = error.shape
-    window = _hann(height, width)
-    spectrum = np.fft.fft2(_windowed(error, window), axes=(0, 1))
-    radius = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None, :])
-    return float(np.sum(np.abs(spectrum[radius < below]) ** 2) / (height * width * np.sum(window**2)))
-
-
 def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float:
     height, width, _ = error.shape
     window = _hann(height, width)
