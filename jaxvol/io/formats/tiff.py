@@ -115,9 +115,9 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             _check_last(path, file)
             pages = [page.aspage() for page in file.pages]
             first, kinds = pages[0], {(page.shape, page.dtype) for page in pages}
-            shape, axes = (len(pages), *first.shape), file.series[0].axes
-            if len(pages) == 1:  # which may hold a whole stack, by ImageJ
-                shape = file.series[0].shape
+            axes, whole = file.series[0].axes, file.is_imagej or len(pages) == 1
+            # ImageJ may hold a stack in its only page
+            shape = file.series[0].shape if whole else (len(pages), *first.shape)
             several = file.is_ome and (len(file.series) > 1 or set(axes) & set("CT"))
             if several or len(kinds) > 1 or len(shape) not in (2, 3) or first.samplesperpixel != 1:
                 raise ValueError(
@@ -136,7 +136,7 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
                     f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces voxels of "
                     f"{expected}."
                 )
-            images = file.asarray() if len(pages) == 1 else np.stack([page.asarray() for page in pages])
+            images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
             return images.reshape(-1, *shape[-2:]), _spacing(file)
     except MemoryError:
         raise

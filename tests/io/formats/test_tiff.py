@@ -44,8 +44,10 @@ def test_imagej_and_ome_tell_spacing(tmp_path):
     tifffile.imwrite(tmp_path / "a.ome.tif", DATA.T, metadata={"axes": "ZYX", **sizes, **units})
     check((0.25, 0.5, 2.5))
     tifffile.imwrite(tmp_path / "a.ome.tif", np.stack([DATA.T] * 2), metadata={"axes": "CZYX"})
-    with pytest.raises(ValueError, match=r"must hold one stack of images .*\(2, 5, 6, 7\) \(CZYX\)"):
-        jv.load(tmp_path / "a.ome.tif")
+    tifffile.imwrite(tmp_path / "a.tif", np.stack([DATA.T] * 2, 1), imagej=True, metadata={"axes": "ZCYX"})
+    for name, found in (("a.ome.tif", r"\(2, 5, 6, 7\) \(CZYX\)"), ("a.tif", r"\(5, 2, 6, 7\) \(ZCYX\)")):
+        with pytest.raises(ValueError, match=rf"must hold one stack of images .*{found}"):
+            jv.load(tmp_path / name)
 
 
 def write_folder(folder, numbers=(8, 9, 10, 11, 12)):
