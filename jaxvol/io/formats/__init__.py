@@ -166,18 +166,18 @@ def files_of(path: Path) -> list[Path]:
 
 def says_where_it_lies(path: Path) -> bool:
     """Whether a file says where in the world its volume lies, and how its axes are turned."""
-    return "origin" in _place_told(path, Header(None, None))
+    return "origin" in _place_told(path)
 
 
-def says_its_spacing(path: Path, header: Header) -> bool:
+def says_its_spacing(path: Path) -> bool:
     """Whether a file of voxels, or the header beside it, says how far they lie apart."""
-    return "spacing" in _place_told(path, header)
+    return "spacing" in _place_told(path)
 
 
-def _place_told(path: Path, header: Header) -> Collection[str]:
+def _place_told(path: Path) -> Collection[str]:
     """Which of spacing and origin a file tells, without reading its voxels."""
     name = path.name.lower()
-    if name.endswith(RAW):  # where one tells its origin, its axes are not the world's all the same
+    if name.endswith(RAW):  # an origin there says nothing of the axes
         return raw_json_header(path).keys() - {"origin"}
     if name.endswith(".npz"):
         return npz_names(path)
