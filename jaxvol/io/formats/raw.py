@@ -33,8 +33,7 @@ def read_raw(path: Path, header: Header) -> dict[str, Any]:
             content = read_all(path, stream, expected)
     else:
         check_size(path, size, expected)
-        with path.open("rb") as stream:
-            content = read_all(path, stream, expected)
+        content = path.read_bytes()
     return {"data": as_array(content, shape, dtype, "F"), **fields}
 
 
