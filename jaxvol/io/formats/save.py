@@ -93,8 +93,9 @@ def _write_npz(volume: Volume, path: Path) -> None:
     if volume.data.dtype == "bfloat16":
         raise ValueError("volume has voxels of bfloat16, which .npz cannot hold; convert them to float32.")
     names = ("data", "spacing", "origin", "direction", "labels")
-    arrays = {name: getattr(volume, name) for name in names if getattr(volume, name) is not None}
-    np.savez_compressed(path, **{name: np.asarray(array) for name, array in arrays.items()})
+    arrays = {name: np.asarray(getattr(volume, name)) for name in names if getattr(volume, name) is not None}
+    with path.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
+        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _write_medical(volume: Volume, path: Path) -> None:
