@@ -8,7 +8,7 @@ in cycles per pixel. This is NumPy, not JAX, since it analyses finished images.
 from typing import Any, TypeAlias, cast
 
 import numpy as np
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64
 
 
 Image: TypeAlias = Float64[np.ndarray, "height width channels"]
@@ -169,45 +169,24 @@ def boundary_noise(image: Any, region: Any) -> float:
             f"got {region.dtype} of shape {region.shape}."
         )
     _at_least("image", image, 3)
-    inside, rough = region, image
-    for axis in (0, 1):
-        inside = np.logical_and.reduce(_neighbours(inside, axis))
-        before, here, after = _neighbours(rough, axis)
-        rough = before - 2 * here + after
+    inside = np.lib.stride_tricks.sliding_window_view(region, (3, 3)).all(axis=(2, 3))
+    rough = np.diff(np.diff(image, 2, axis=0), 2, axis=1)
     if not inside.any():
         raise ValueError("region must hold a pixel with all its 3 x 3 neighbours; got none.")
     return float(np.mean(np.sum(rough[inside] ** 2, axis=-1)) / 36)
 
 
-def low_frequency_energy(error: Any, below: float = 1 / 16) -> float:
-    """Energy of an error under `below` cycles per pixel, with its mean removed and a Hann window applied.
-
-    Mean square per pixel, summed over channels. The default is the lowest eighth of what an image can hold.
-
-    **Arguments:** `error`: as for `wood_grain_energy`. `below`: in cycles per pixel.
-
-    **Returns:** the energy, in squared units of the error.
-
-    **Raises:** `ValueError` for NaN or infinity, and input that is not an image.
-    """
-    error = _image("error", error)
-    height, width, _ = error.shape
-    window = np.outer(_hann(height), _hann(width))
-    spectrum = np.fft.fft2(_windowed(error, window), axes=(0, 1))
-    radius = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None, :])
-    return float(np.sum(np.abs(spectrum[radius < below]) ** 2) / (height * width * np.sum(window**2)))
-
-
 def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float:
     height, width, _ = error.shape
-    window = np.outer(_hann(height), _hann(width))
+    window = _hann(height, width)
     windowed = _windowed(error, window) / window.sum()
     earlier: list[Float64[np.ndarray, 2]] = [np.zeros(2)]
     energy = 0.0
     for harmonic in range(1, harmonics + 1):
         wave = harmonic * np.array(frequency)
         others = [*earlier, -wave]
-        if any(np.all(np.abs(_folded(wave - other)) < 2 / np.array([width, height])) for other in others):
+        apart = [np.abs(wave - other - np.round(wave - other)) for other in others]  # of their aliases
+        if any(np.all(each < 2 / np.array([width, height])) for each in apart):
             if harmonic == 1:
                 raise ValueError(
                     f"frequency must be two bins (2/width, 2/height) away from 0 and from its mirror image; "
@@ -222,13 +201,8 @@ def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float
     return float(energy)
 
 
-def _folded(frequency: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "2"]:
-    """The alias of a frequency in [-1/2, 1/2]."""
-    return frequency - np.round(frequency)
-
-
 def _peaks(error: Plane) -> float:
-    window = np.outer(_hann(BLOCK), _hann(BLOCK))
+    window = _hann(BLOCK, BLOCK)
     cycles = np.fft.fftfreq(BLOCK, 1 / BLOCK)
     y, x = np.meshgrid(cycles, cycles, indexing="ij")
     # one of each mirrored pair, without the two lines at Nyquist, which are their own mirror images
@@ -252,21 +226,15 @@ def _share_of_largest(m: int, n: int) -> float:
     return float(tails[:m].sum() / n)
 
 
-def _hann(n: int) -> Float64[np.ndarray, " n"]:
-    return np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2
+def _hann(height: int, width: int) -> Plane:
+    y, x = (np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (height, width))
+    return np.outer(y, x)
 
 
 def _windowed(error: Image, window: Plane) -> Image:
     """The error minus its windowed mean, times the window."""
     mean = np.tensordot(window, error, axes=2) / window.sum()
     return (error - mean) * window[..., None]
-
-
-def _neighbours(array: Shaped[np.ndarray, "..."], axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The previous, current and next pixel along an axis, for all pixels with both neighbours."""
-    n = array.shape[axis]
-    before, here, after = (np.take(array, np.arange(i, n - 2 + i), axis) for i in range(3))
-    return before, here, after
 
 
 def _pair(image: Any, reference: Any) -> tuple[Image, Image]:

@@ -8,7 +8,6 @@ import pytest
 from jaxvol.metrics import (
     boundary_noise,
     comb_frequency,
-    low_frequency_energy,
     psnr,
     rmse,
     ssim,
@@ -159,7 +158,7 @@ def test_channels_add_up_and_an_image_of_any_size_is_covered_to_its_edges():
     assert wood_grain_energy(image) > 0
 
 
-# -- noise on a face, and of low frequency --------------------------------------------------------------
+# -- noise on a face --------------------------------------------------------------
 
 
 LEFT = X < 0.4 * W
@@ -182,14 +181,6 @@ def test_boundary_noise_does_not_see_shading():
     assert boundary_noise(sphere, LEFT) < 1e-15
 
 
-def test_low_frequency_energy_divides_waves_and_noise_at_its_limit():
-    assert low_frequency_energy(wave(0.03, 0.02) + 3) == pytest.approx(0.5, rel=1e-3)
-    assert low_frequency_energy(wave(0.06, 0.06)) < 1e-3
-    # π (1/16)² of the unit square of frequencies
-    measured = [low_frequency_energy(noise(seed)) for seed in range(20)]
-    assert np.mean(measured) == pytest.approx(np.pi / 256, rel=0.1)
-
-
 # -- invalid arguments ----------------------------------------------------------------------------------
 
 
@@ -207,7 +198,7 @@ BAD = [
     (lambda: wood_grain_energy(BROKEN), "error must be finite"),
     (lambda: wood_grain_energy(X, (0.1, 0.0), harmonics=0), "harmonics must be at least 1"),
     (lambda: wood_grain_energy(X, (0.1, np.nan)), "frequency must be two finite numbers"),
-    (lambda: low_frequency_energy(np.ones((2, H, W, 3))), "error must have shape"),
+    (lambda: wood_grain_energy(np.ones((2, H, W, 3))), "error must have shape"),
     (lambda: comb_frequency(0, (1, 0), 1), "step must be a positive"),
     (lambda: comb_frequency(1, (1, 0), -1), "pixel_size must be a positive"),
     (lambda: comb_frequency(1, (np.inf, 0), 1), "depth_slope must be two finite numbers"),

@@ -94,40 +94,37 @@ def all_finite(tree: Any) -> Array:
 def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | None, ...]) -> Array:
     """`value` as an array of JAX's default float type and of this shape (None: any length; a leading `...`:
     any axes)."""
-    shape_text = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
+    expected = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
     try:
         if isinstance(value, jax.Array):
             given = value
         else:  # a sequence may hold traced numbers
             given = jnp.asarray(value) if is_traced(value) else _numbers(value)
-        if given is None or jnp.issubdtype(given.dtype, jnp.complexfloating):
+        if jnp.issubdtype(given.dtype, jnp.complexfloating):
             raise TypeError
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             cast = given.astype(jnp.result_type(float)) if isinstance(given, np.ndarray) else given
         with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
             array = jnp.asarray(cast, dtype=float)
     except (TypeError, ValueError) as fault:
-        what = f"numbers of shape {shape_text}" if shape else "a number"
+        what = f"numbers of shape {expected}" if shape else "a number"
         raise ValueError(f"{name} must be {what}; got {shortened(value)}.") from fault
-    expected = tuple(n for n in shape if n is not ...)
-    trailing = array.shape[len(array.shape) - len(expected) :] if ... in shape else array.shape
-    if len(trailing) != len(expected) or any(
-        w not in (None, n) for w, n in zip(expected, trailing, strict=True)
-    ):
-        raise ValueError(f"{name} must have shape {shape_text}; got shape {array.shape}.")
+    lengths = [n for n in shape if n is not ...]
+    found = array.shape[array.ndim - len(lengths) :] if ... in shape else array.shape
+    if len(found) != len(lengths) or any(n not in (None, m) for n, m in zip(lengths, found, strict=True)):
+        raise ValueError(f"{name} must have shape {expected}; got shape {array.shape}.")
     if isinstance(given, np.ndarray) and not np.all(finite(cast)):
         beyond = f" in {array.dtype}" if np.all(finite(given)) else ""
         raise ValueError(f"{name} must be finite{beyond}; got {given}.")
     return require(array, finite, f"{name} must be finite; got {{got}}.")
 
 
-def _numbers(value: Arrayable) -> np.ndarray | None:
-    """`value` as a NumPy array of real numbers, or None if it is not one."""
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):
-        return None
-    return array if array.dtype.kind in "biufV" else None  # V: JAX's own 8- and 16-bit floats
+def _numbers(value: Arrayable) -> np.ndarray:
+    """`value` as a NumPy array of real numbers. **Raises** `TypeError` or `ValueError` if it is none."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufV":  # V: JAX's own 8- and 16-bit floats
+        raise TypeError
+    return array
 
 
 def number(
@@ -165,12 +162,10 @@ def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) ->
 def integer(name: str, value: Any, least: int, most: int | None = None, *, otherwise: str = "") -> int:
     """`value` as an integer from `least` to `most`, inclusive; `otherwise`: an alternative that the message
     names."""
-    try:
-        if is_flag(value):
-            raise TypeError
-        whole = operator.index(value)
-    except TypeError:
-        whole = None
+    whole = None
+    if not is_flag(value):
+        with contextlib.suppress(TypeError):
+            whole = operator.index(value)
     if whole is None or whole < least or (most is not None and whole > most):
         expected = f"of at least {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f"{name} must be an integer {expected}{otherwise}; got {described(value)}.")
@@ -198,18 +193,17 @@ def power_of_two(name: str, value: Any, most: int) -> int:
 
 
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
-    """Check that the file `path` can be written, before a long computation. Its folder is made when it is
-    written (`whole_file`).
+    """Check that the file `path` can be written, before a long computation. `whole_file` makes its folder.
 
     **Raises:** `ValueError` if it cannot be written."""
     path = Path(path)
     try:
         if path.is_dir():
             raise IsADirectoryError("it is a folder")
-        there = next(folder for folder in path.absolute().parents if folder.exists())
-        if not there.is_dir():
-            raise NotADirectoryError(f"{there} is not a folder")
-        with tempfile.TemporaryFile(dir=there):
+        nearest = next(folder for folder in path.absolute().parents if folder.exists())
+        if not nearest.is_dir():
+            raise NotADirectoryError(f"{nearest} is not a folder")
+        with tempfile.TemporaryFile(dir=nearest):
             pass
         if path.exists():
             path.open("ab").close()

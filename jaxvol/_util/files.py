@@ -1,8 +1,5 @@
-"""Checks the sizes of files against their headers.
-
-Sizes are checked before memory is allocated or, if only decompressing tells, while the file is read, never
-further than one byte past the expected size.
-"""
+"""Checks the sizes of files against their headers: before memory is allocated or, if only decompressing
+tells, while a file is read, never further than one byte past the expected size."""
 
 import re
 import zipfile
@@ -57,14 +54,6 @@ def file_size(path: Path) -> int:
     return size
 
 
-def gzip_size(path: Path) -> int:
-    """Size modulo 2**32 that a gzip file says its content has; nothing is decompressed."""
-    with path.open("rb") as stream:
-        size = stream.seek(0, 2)
-        stream.seek(max(size - 4, 0))
-        return int.from_bytes(stream.read(4), "little")
-
-
 def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
     """All bytes of a stream, which must be `expected`; at most one more is read."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing
@@ -103,12 +92,22 @@ def decoding(path: Path) -> Iterator[None]:
 
 
 def reason(fault: BaseException) -> str:
-    """What an error says at its end, in one line. ITK's begin with where in its own source they were raised,
-    and its libraries tell each of their functions on the way."""
+    """The last line of an error, without the place in ITK's source with which its errors begin."""
     lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
     told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", lines[-1]) if lines else ""
     shown = "".join(letter if letter.isprintable() else "?" for letter in told[:LONGEST_REASON])
     return shown.rstrip(".") or type(fault).__name__
+
+
+def numbers_in(text: str, count: int, what: str, separator: str | None = None) -> np.ndarray:
+    """`count` finite numbers in a text. **Raises** `ValueError`, which begins with `what`, for other text."""
+    try:
+        numbers = np.array(text.split(separator), float)
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.size != count or not np.isfinite(numbers).all():
+        raise ValueError(f"{what} must be {count} numbers; got {text[:80]!r}.")
+    return numbers
 
 
 def as_array(

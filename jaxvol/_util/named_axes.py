@@ -1,4 +1,4 @@
-"""Arrays with named axes and coordinates, as xarray has them: which axis is x, and where do nodes lie?"""
+"""Reads arrays with named axes and coordinates, as xarray has them."""
 
 from typing import Any
 

@@ -51,16 +51,14 @@ def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""
     drawing them must not show in the frame time. Source: pcg3d of Jarzynski and Olano,
     "Hash Functions for GPU Rendering", JCGT 9(3), 2020.
     """
-    a, b, c = (key.astype(jnp.uint32) * np.uint32(1664525) + np.uint32(1013904223) for key in (x, y, seed))
-    a, b, c = _mix(a, b, c)
-    a, b, c = (word ^ (word >> np.uint32(16)) for word in (a, b, c))
-    a, b, c = _mix(a, b, c)
-
-    def unit(word: UInt32[Array, ""]) -> Float[Array, ""]:
-        # float32 holds 24 bits exactly, which rules out rounding up to 1
-        return (word >> np.uint32(8)).astype(dtype) * (2.0**-24)
-
-    return unit(a), unit(b), unit(c)
+    a, b, c = (_scrambled(key.astype(jnp.uint32)) for key in (x, y, seed))
+    for last in (False, True):
+        a = a + b * c
+        b = b + c * a
+        c = c + a * b
+        if not last:
+            a, b, c = (word ^ (word >> np.uint32(16)) for word in (a, b, c))
+    return _unit(a, dtype), _unit(b, dtype), _unit(c, dtype)
 
 
 def hashed_uniforms_4(
@@ -70,26 +68,24 @@ def hashed_uniforms_4(
 
     Source: pcg4d of Jarzynski and Olano, as above.
     """
-    a, b, c, d = (key * np.uint32(1664525) + np.uint32(1013904223) for key in (a, b, c, d))
-    a, b, c, d = _mix_4(a, b, c, d)
-    a, b, c, d = (word ^ (word >> np.uint32(16)) for word in (a, b, c, d))
-    a, b, c, d = ((word >> np.uint32(8)).astype(jnp.float32) * (2.0**-24) for word in _mix_4(a, b, c, d))
-    return a, b, c, d
+    a, b, c, d = map(_scrambled, (a, b, c, d))
+    for last in (False, True):
+        a = a + b * d
+        b = b + c * a
+        c = c + a * b
+        d = d + b * c
+        if not last:
+            a, b, c, d = (word ^ (word >> np.uint32(16)) for word in (a, b, c, d))
+    return _unit(a, jnp.float32), _unit(b, jnp.float32), _unit(c, jnp.float32), _unit(d, jnp.float32)
 
 
-def _mix(a: Word, b: Word, c: Word) -> tuple[Word, Word, Word]:
-    a = a + b * c
-    b = b + c * a
-    c = c + a * b
-    return a, b, c
+def _scrambled(word: Word) -> Word:
+    return word * np.uint32(1664525) + np.uint32(1013904223)
 
 
-def _mix_4(a: Word, b: Word, c: Word, d: Word) -> tuple[Word, Word, Word, Word]:
-    a = a + b * d
-    b = b + c * a
-    c = c + a * b
-    d = d + b * c
-    return a, b, c, d
+def _unit(word: Word, dtype: Any) -> Float[Array, "..."]:
+    # float32 holds 24 bits exactly, which rules out rounding up to 1
+    return (word >> np.uint32(8)).astype(dtype) * (2.0**-24)
 
 
 @cache

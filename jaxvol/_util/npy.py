@@ -2,8 +2,7 @@
 
 import math
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,39 +26,35 @@ def read_npy(path: Path, header: Header) -> dict[str, Any]:
 def read_npz(path: Path, header: Header) -> dict[str, Any]:
     """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
     header.refuse(path)
-    with _opened(path) as (names, read):
-        if "data" in names:
-            return {name: read(name) for name in VOLUME if name in names}
-        if len(names) == 1:
-            return {"data": read(names[0])}
-        raise ValueError(
-            f"path: {path} must hold an array called data, or one array; got {sorted(names)}. "
-            "Save it with np.savez(path, data=...)."
-        )
+    names = npz_names(path)
+    if "data" in names:
+        return read_arrays(path, [name for name in VOLUME if name in names])
+    if len(names) == 1:
+        return {"data": read_arrays(path, names)[names[0]]}
+    raise ValueError(
+        f"path: {path} must hold an array called data, or one array; got {sorted(names)}. "
+        "Save it with np.savez(path, data=...)."
+    )
 
 
-def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The arrays of these names from an `.npz` file. **Raises** `ValueError` if one is missing."""
-    with _opened(path) as (there, read):
-        if missing := set(names) - set(there):
-            raise ValueError(
-                f"path: {path} must hold arrays {', '.join(names)}; {sorted(missing)} is missing."
-            )
-        return {name: read(name) for name in names}
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[list[str], Callable[[str], np.ndarray]]]:
-    """Names of the arrays in an `.npz` file, and the function that reads one of them."""
+def npz_names(path: Path) -> list[str]:
+    """Names of the arrays in an `.npz` file."""
     file_size(path)
     with decoding(path), zipfile.ZipFile(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
+def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The arrays of these names from an `.npz` file. **Raises** `ValueError` if one is missing."""
+    if missing := set(names) - set(npz_names(path)):
+        raise ValueError(f"path: {path} must hold arrays {', '.join(names)}; {sorted(missing)} is missing.")
+    arrays = {}
+    with decoding(path), zipfile.ZipFile(path) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-
-        def read(name: str) -> np.ndarray:
+        for name in names:
             with archive.open(members[name]) as stream:
-                return _npy_array(path, stream, members[name].file_size)
-
-        yield list(members), read
+                arrays[name] = _npy_array(path, stream, members[name].file_size)
+    return arrays
 
 
 def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:

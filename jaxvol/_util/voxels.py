@@ -54,8 +54,7 @@ def on_device(array: Array | np.ndarray) -> Array:
     """As an array of JAX, which does not change with the NumPy array that it was made of."""
     if isinstance(array, jax.Array):
         return array
-    # Told the type, JAX may share the memory: on a CPU, if it lies at a multiple of 64 bytes. Without, it
-    # copies by a program for each shape.
+    # with a type, JAX may share the memory; without, it compiles a copy for each shape
     return jnp.asarray(array.copy(), array.dtype)
 
 

@@ -1,91 +1,68 @@
-"""How does a file appear whole or not at all? It is written beside its place, and moved there in one
-operation."""
+"""Writes files that appear whole or not at all: beside their place, then moved there in one operation."""
 
-import itertools
 import os
 import shutil
 import tempfile
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
-_UNDERWAY: dict[Path, list[Path]] = {}
-"""Files and folders that are not whole, and the folders made for each, the innermost first."""
-_MOVING = threading.Lock()
-_NUMBERS = itertools.count()
+_UNFINISHED: dict[Path, list[Path]] = {}
+"""Temporary folders, and the folders that were made to hold each, innermost first."""
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path beside `path`, of the same ending, to write a file to; its folder is made. At the end of the
-    context the file takes the place of `path`; after an error it is removed, with the folders that were made
-    for it, and `path` is as it was. A link stays one: what it points to is replaced. Into what is no regular
-    file, such as a pipe or `/dev/null`, the content is written at the end."""
-    ending, path = path.suffix, path.resolve()
-    with _beside(path, ending) as part:
-        yield part
-        with _MOVING:
-            if _is_special(path):
-                with part.open("rb") as content, path.open("wb") as target:
-                    shutil.copyfileobj(content, target)
-            else:
-                os.replace(part, path)
+    """A path of the same name, in a temporary folder of its own, to write a file to.
+
+    When the context ends, the file replaces `path`, whose folder is made; after an error nothing has changed.
+    What a link points to is replaced; a pipe or a device is written to.
+    """
+    name, path = path.name, path.resolve()
+    special = path.exists() and not (path.is_file() or path.is_dir())
+    with _temporary_folder(Path(tempfile.gettempdir()) if special else path.parent) as folder:
+        yield folder / name
+        if special:
+            with (folder / name).open("rb") as content, path.open("wb") as target:
+                shutil.copyfileobj(content, target)
+        else:
+            os.replace(folder / name, path)
 
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """An empty folder beside `path` to write files to. At the end of the context they take their places in
-    `path`, which may hold others; after an error all are removed."""
+    """An empty temporary folder to write files to. When the context ends they are moved into `path`, beside
+    the files that are there; after an error nothing has changed."""
     path = path.resolve()
-    with _beside(path, "") as part:
-        part.mkdir()
-        yield part
-        with _MOVING:
-            for file in sorted(part.rglob("*")):
-                there = path / file.relative_to(part)
-                if file.is_dir():
-                    there.mkdir(parents=True, exist_ok=True)
-                else:
-                    there.parent.mkdir(parents=True, exist_ok=True)  # path itself, at least
-                    os.replace(file, there)
+    with _temporary_folder(path.parent) as folder:
+        yield folder
+        for file in sorted(file for file in folder.rglob("*") if not file.is_dir()):
+            target = path / file.relative_to(folder)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, target)
 
 
 @contextmanager
-def _beside(path: Path, ending: str) -> Iterator[Path]:
-    # not by tempfile, whose files nobody else may read; several processes may write the same file
-    folder = Path(tempfile.gettempdir()) if _is_special(path) else path.parent
-    part = folder / f".{path.stem}.{os.getpid()}-{next(_NUMBERS)}.part{ending}"
-    missing = list(itertools.takewhile(lambda above: not above.exists(), path.parents))
-    _UNDERWAY[part] = missing
+def _temporary_folder(parent: Path) -> Iterator[Path]:
+    made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+    parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=".jaxvol-", dir=parent))
+    _UNFINISHED[folder] = made
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
+        yield folder
     finally:
-        _remove(part, missing)
-        del _UNDERWAY[part]
-
-
-def _is_special(path: Path) -> bool:
-    return path.exists() and not (path.is_file() or path.is_dir())
+        _remove(folder)
 
 
 def remove_unfinished() -> None:
-    """Remove all that is not whole yet. For a process that ends at once: nothing takes its place
-    afterwards."""
-    _MOVING.acquire()  # and never released
-    for part, made in list(_UNDERWAY.items()):
-        _remove(part, made)
+    """Remove all temporary folders, for a process that ends at once, whatever its threads still write."""
+    for folder in list(_UNFINISHED):
+        _remove(folder)
 
 
-def _remove(part: Path, made: list[Path]) -> None:
-    if part.is_dir():
-        shutil.rmtree(part, ignore_errors=True)
-    else:
-        part.unlink(missing_ok=True)
-    for folder in made:
-        try:
-            folder.rmdir()
-        except OSError:  # it holds what was written, or was not made
-            break
+def _remove(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    with suppress(OSError):  # it holds what was written
+        for made in _UNFINISHED.pop(folder, []):
+            made.rmdir()

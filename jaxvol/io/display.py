@@ -1,4 +1,4 @@
-"""How is linear colour shown, and saved as an image file? The sRGB curve, and the file formats."""
+"""Saves linear images as files, and shows them side by side."""
 
 import math
 import os
@@ -50,29 +50,19 @@ def save_image(
             f"path must be a str or a path; got {described(path)}."
             + (" That is the image: the path comes first, as in save_png(path, image)." if swapped else "")
         )
-    try:
-        image = np.asarray(linear, np.float32)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(
-            f"linear must be an array of numbers; got {described(linear)}. For a Rendering, pass "
-            "rendering.image() or rendering.rgba."
-        ) from fault
+    image = _numbers("linear", linear, "rendering.image() or rendering.rgba")
     channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else None
-    held = CHANNELS.get(Path(path).suffix.lower(), (0, 3, 4))
-    shapes = [SHAPES[count] for count in sorted(held, key=(3, 4, 0).index)]
-    if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in held):
-        where = f" for a {Path(path).suffix.lower()}" if len(held) < len(SHAPES) else ""
-        hint = (
-            " One channel is written as .tif or .npy; repeat it for a grey picture of three."
-            if channels == 0
-            else ""
-        )
-        raise ValueError(f"image{where} must have shape {' or '.join(shapes)}; got {image.shape}.{hint}")
+    ending = Path(path).suffix.lower()
+    allowed = CHANNELS.get(ending, (3, 4, 0))
+    if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in allowed):
+        shapes = " or ".join(SHAPES[count] for count in allowed)
+        hint = " One channel is written as .tif or .npy; repeat it for a grey picture of three."
+        hint = hint if channels == 0 else ""
+        raise ValueError(f"image for a {ending} must have shape {shapes}; got {image.shape}.{hint}")
     path = image_file("path", path, channels)
     bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
     if bad.any():
         raise ValueError(f"image must not be NaN or infinite; {bad.sum()} of its {image.size} values are.")
-    ending = path.suffix.lower()
     with whole_file(path) as part:
         if ending == ".npy":
             np.save(part, image)
@@ -143,34 +133,36 @@ def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -
 
 
 def _displayed(name: Any, image: Any) -> Float[np.ndarray, "height width *channels"]:
-    try:
-        linear = np.asarray(image, np.float32)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(
-            f"images[{name!r}] must be an array of numbers; got {described(image)}. For a Rendering, pass "
-            "rendering.image()."
-        ) from fault
+    what = f"images[{name!r}]"
+    linear = _numbers(what, image, "rendering.image()")
     if 0 in linear.shape or (linear.ndim != 2 and linear.shape[2:] != (3,)):
-        raise ValueError(
-            f"images[{name!r}] must have shape (height, width, 3) or (height, width); got {linear.shape}."
-        )
+        raise ValueError(f"{what} must have shape (height, width, 3) or (height, width); got {linear.shape}.")
     if np.isnan(linear).any():
-        raise ValueError(f"images[{name!r}] must not be NaN; {np.isnan(linear).sum()} of its values are.")
+        raise ValueError(f"{what} must not be NaN; {np.isnan(linear).sum()} of its values are.")
     return np.asarray(to_srgb(linear))
 
 
-SHAPES = {0: "(height, width)", 3: "(height, width, 3)", 4: "(height, width, 4)"}
-"""Of images, by their number of channels."""
+def _numbers(name: str, image: Any, instead: str) -> Float[np.ndarray, "..."]:
+    try:
+        return np.asarray(image, np.float32)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(
+            f"{name} must be an array of numbers; got {described(image)}. For a Rendering, pass {instead}."
+        ) from fault
+
+
+SHAPES = {3: "(height, width, 3)", 4: "(height, width, 4)", 0: "(height, width)"}
+"""Of images, by their number of channels; 0 means no channel axis."""
 
 CHANNELS: dict[str, tuple[int, ...]] = {
     ".png": (3, 4),
     ".jpg": (3,),
     ".jpeg": (3,),
-    ".tif": (0, 3, 4),
-    ".tiff": (0, 3, 4),
-    ".npy": (0, 3, 4),
+    ".tif": (3, 4, 0),
+    ".tiff": (3, 4, 0),
+    ".npy": (3, 4, 0),
 }
-"""Numbers of channels that each format can hold; 0 means no channel axis."""
+"""Numbers of channels that each format can hold."""
 
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:

@@ -1,8 +1,9 @@
-"""Which Cartesian volume shows what a swept probe acquired? Scan conversion, as scanners and viewers do it.
+"""Resamples what a swept probe acquired onto a Cartesian grid, which other programs read.
 
-Rendering under a `ToroidalMap` needs none. Other programs do: they read voxels along three axes.
+Rendering under a `ToroidalMap` needs no such conversion.
 """
 
+import contextlib
 import math
 from typing import Any
 
@@ -76,9 +77,9 @@ def scan_convert(
     fill = _fill(fill_value, kind)
     steps = _spacing(volume, probe, spacing)
     nodes, first = _grid(probe, steps, shape, origin)
+    itemsize = kind.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)
     require_room(
-        math.prod(nodes) * (kind.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)),
-        f"a grid of {' x '.join(map(str, nodes))} nodes (spacing, shape)",
+        math.prod(nodes) * itemsize, f"a grid of {' x '.join(map(str, nodes))} nodes (spacing, shape)"
     )
     data, labels = _resampled(volume, probe, first, steps, nodes, kind, fill)
     return Volume(data, steps, first, labels)
@@ -127,13 +128,10 @@ def _voxel_type(volume: Volume, dtype: Any) -> np.dtype:
     if dtype is None:
         return volume.data.dtype
     known = (*DTYPES, *(["float64"] if jax.config.jax_enable_x64 else []))  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        kind = jnp.dtype(dtype)
-    except TypeError:
-        kind = None
-    if kind is None or kind.name not in known:
-        raise ValueError(f"dtype must be one of {', '.join(known)}; got {described(dtype)}.")
-    return kind
+    with contextlib.suppress(TypeError):
+        if (kind := jnp.dtype(dtype)).name in known:
+            return kind
+    raise ValueError(f"dtype must be one of {', '.join(known)}; got {described(dtype)}.")
 
 
 def _fill(value: Any, kind: np.dtype) -> float:
@@ -141,12 +139,9 @@ def _fill(value: Any, kind: np.dtype) -> float:
         number = float(value)
     except (TypeError, ValueError) as fault:
         raise ValueError(f"fill_value must be a number; got {described(value)}.") from fault
-    if kind.kind in "ui":
-        limits = np.iinfo(kind)
-        held = limits.min <= number <= limits.max and number == round(number)
-    else:
-        held = abs(number) <= float(jnp.finfo(kind).max)
-    if not held:
+    limits = np.iinfo(kind) if kind.kind in "ui" else jnp.finfo(kind)
+    whole = kind.kind not in "ui" or number.is_integer()
+    if not (whole and float(limits.min) <= number <= float(limits.max)):
         raise ValueError(
             f"fill_value must be a value of the voxels' type, {kind.name}; got {value!r}. "
             'Give dtype="float32" to have others.'

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import Header
 from ...io.formats import says_its_spacing
 from ...scene.volume import Volume
 from .data import add_data_options, volume_of
@@ -32,8 +31,7 @@ def add_info(commands: Any, shared: argparse.ArgumentParser) -> None:
 
 def _info(options: argparse.Namespace) -> None:
     volume = volume_of(options)
-    header = Header(options.shape, options.dtype)
-    assumed = options.spacing is None and not says_its_spacing(options.file, header)
+    assumed = options.spacing is None and not says_its_spacing(options.file)
     print(described_volume(volume, assumed=assumed))
 
 

@@ -1,21 +1,116 @@
-"""Public volumes by name: the Open SciVis Datasets, fetched once, checked, and kept.
+"""Public volumes by name: the Open SciVis Datasets, downloaded once by pooch, checked, and cached.
 
     jv.datasets.names()
     jv.datasets.info("engine")
     volume = jv.datasets.load("engine")
 
-Files that lie in the folder `$JAXVOL_DATA` are taken from there.
+Files in the folder `$JAXVOL_DATA` are used in place. The list is that of klacansky.com/open-scivis-datasets,
+of the commit that `open_scivis.json` names.
 """
 
+import difflib
+import json
+import math
 import os
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from ..._util.files import MOST_VOXELS, check_size, gzip_size
+import numpy as np
+
+from ..._util.checks import described
+from ..._util.files import MOST_VOXELS, check_size
 from ...scene.volume import Volume
 from ..formats import load as load_file
-from .catalogue import Dataset as Dataset, info as info, names as names
-from .download import PART, downloader
+
+
+OPEN_SCIVIS = "http://klacansky.com/open-scivis-datasets"
+
+TIMEOUT = 30
+"""Seconds without an answer, or without a byte, after which a server counts as gone."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What is known of a dataset without fetching it.
+
+    - `name`: what `fetch` and `load` call it. `title`: as published.
+    - `shape`, `dtype`: number of voxels along x, y, z, and their type, little-endian.
+    - `spacing`: between neighbouring voxels, in the units of its authors.
+    - `sha512`: of the raw file, in hexadecimal digits.
+    - `acknowledgement`: to cite where the data are shown.
+    """
+
+    name: str
+    title: str
+    category: str
+    shape: tuple[int, int, int]
+    dtype: str
+    spacing: tuple[float, float, float]
+    sha512: str
+    description: str
+    acknowledgement: str
+
+    @property
+    def file(self) -> str:
+        """Name of the raw file, x fastest."""
+        return f"{self.name}_{'x'.join(map(str, self.shape))}_{self.dtype}.raw"
+
+    @property
+    def url(self) -> str:
+        """Where it is published."""
+        return f"{OPEN_SCIVIS}/{self.name}/{self.file}"
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the raw file."""
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+
+@cache
+def registry() -> dict[str, Dataset]:
+    """All datasets, by name."""
+    fields = json.loads(Path(__file__).with_name("open_scivis.json").read_text(encoding="utf-8"))["datasets"]
+    return {
+        name: Dataset(
+            name,
+            title=each["name"],
+            category=each["category"],
+            shape=tuple(each["size"]),
+            dtype=each["type"],
+            spacing=tuple(each["spacing"]),
+            sha512=each["sha512sum"],
+            description=each["description"],
+            acknowledgement=each["acknowledgement"],
+        )
+        for name, each in fields.items()
+    }
+
+
+def names() -> list[str]:
+    """Names of all datasets.
+
+    **Returns:** the names, sorted."""
+    return sorted(registry())
+
+
+def info(name: str | Any) -> Dataset:
+    """What is known of a dataset; nothing is fetched.
+
+    **Arguments:** `name`: one of `names()`, or the title that it was published under; case is ignored.
+
+    **Returns:** its entry in the published list.
+
+    **Raises:** `ValueError` for a name that is not in the list.
+    """
+    wanted = name.strip().lower() if isinstance(name, str) else None
+    for dataset in registry().values():
+        if wanted in (dataset.name, dataset.title.lower()):
+            return dataset
+    near = difflib.get_close_matches(str(name), names(), 1)
+    hint = f" Did you mean {near[0]}?" if near else ""
+    raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.{hint}")
 
 
 def fetch(
@@ -29,22 +124,22 @@ def fetch(
 
     It is looked for in the folder that the environment variable `JAXVOL_DATA` names, as `.raw` or as
     `.raw.gz`, then in the cache. If it is in neither, it is downloaded (`pip install jaxvol[datasets]`), and
-    kept if its SHA-512 is the published one. A download that was interrupted goes on where it ended.
+    kept if its SHA-512 is the published one.
 
     **Arguments:**
 
     - `name`: one of `names()`; case is ignored. `info(name).nbytes` tells how much will be fetched.
-    - `folder`: the cache; by default `jaxvol/io/datasets` in the user's (`$XDG_CACHE_HOME`).
+    - `folder`: the cache; by default `jaxvol/datasets` in the user's (`$XDG_CACHE_HOME`).
     - `mirror`: address of a server that has the files in place of klacansky.com, as
       `<mirror>/engine/engine_256x256x128_uint8.raw`.
     - `progress`: show a progress bar of what is downloaded.
 
-    **Returns:** the path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of a
-    file in `$JAXVOL_DATA`, only the size is checked, and not its content.
+    **Returns:** the path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of
+    one that was there before, only the size is checked.
 
     **Raises:** `ValueError` for a name that is not in the list, a file of another size, or a download with
     another SHA-512; `OSError` where the server cannot be reached, has no such file, or does not send all of
-    it, and for a disk that is too full; `ImportError` if a download needs pooch, and it is missing.
+    it; `ImportError` if a download needs pooch, and it is missing.
     """
     dataset = info(name)
     if (own := _in_data_folder(dataset)) is not None:
@@ -54,31 +149,25 @@ def fetch(
     except ImportError as fault:
         raise ImportError(f"fetching {dataset.name} needs pooch: pip install jaxvol[datasets]") from fault
     target = (Path(pooch.os_cache("jaxvol")) / "datasets" if folder is None else Path(folder)) / dataset.file
-    if target.is_file():
-        # by its size alone: it was compared when it came, and a file of many GB takes minutes to hash
+    if target.is_file():  # pooch would hash it each time, which takes minutes for many GB
         check_size(target, target.stat().st_size, dataset.nbytes)
         return target
     url = dataset.url if mirror is None else f"{mirror.rstrip('/')}/{dataset.name}/{dataset.file}"
     pooch.get_logger().setLevel("WARNING")
+    downloader = pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT)
     try:
-        return Path(
-            pooch.retrieve(
-                url,
-                known_hash=f"sha512:{dataset.sha512}",
-                fname=target.name,
-                path=target.parent,
-                downloader=downloader(dataset, target, progress),  # pyright: ignore[reportArgumentType]
-            )
-        )
-    except ValueError as fault:
-        if "hash" not in str(fault):
-            raise
-        raise ValueError(
-            f"{url} has another SHA-512 than {dataset.name} is published with: it was changed, either there "
-            "or on the way. It was not kept."
+        pooch.retrieve(url, f"sha512:{dataset.sha512}", target.name, target.parent, downloader=downloader)
+    except OSError as fault:  # those of requests are among them
+        raise OSError(
+            f"{url} cannot be fetched: {fault}. Without a connection: put {dataset.file} "
+            f"({dataset.nbytes / 1e6:.1f} MB) or {dataset.file}.gz into a folder, and set the environment "
+            "variable JAXVOL_DATA to that."
         ) from fault
-    except OSError as fault:  # requests' own errors are among these
-        _explain(dataset, url, target, fault)
+    except ValueError as fault:
+        raise ValueError(
+            f"{url} has another SHA-512 than {dataset.name} is published with. It was not kept."
+        ) from fault
+    return target
 
 
 def load(
@@ -98,7 +187,7 @@ def load(
     given to `render_bricks`.
     """
     dataset = info(name)
-    voxels = dataset.shape[0] * dataset.shape[1] * dataset.shape[2]
+    voxels = math.prod(dataset.shape)
     if voxels > MOST_VOXELS:
         raise ValueError(
             f"{dataset.name} has {voxels} voxels, and a Volume fewer than 2**31. Use jv.render_bricks with "
@@ -109,40 +198,12 @@ def load(
 
 
 def _in_data_folder(dataset: Dataset) -> Path | None:
-    """The dataset's file in `$JAXVOL_DATA`, if it is there."""
+    """The dataset's file in `$JAXVOL_DATA`, if it is there. Of a packed one, `load` checks the size."""
     folder = os.environ.get("JAXVOL_DATA")
     for ending in ("", ".gz") if folder else ():
         path = Path(str(folder)) / (dataset.file + ending)
         if path.is_file():
-            if ending:
-                check_size(path, gzip_size(path), dataset.nbytes % 2**32)
-            else:
+            if not ending:
                 check_size(path, path.stat().st_size, dataset.nbytes)
             return path
     return None
-
-
-def _explain(dataset: Dataset, url: str, target: Path, fault: OSError) -> NoReturn:
-    import requests
-
-    if not isinstance(fault, requests.RequestException):
-        raise fault
-    answer = fault.response
-    if answer is not None:
-        what = f"{url}: the server answered {answer.status_code} {answer.reason}."
-    else:
-        what = f"{url} cannot be fetched: {_innermost(fault)}."
-    part = target.with_name(target.name + PART)
-    came = part.stat().st_size if part.exists() else 0
-    so_far = f" The {came} bytes that came are kept, and a second try goes on." if came else ""
-    raise OSError(
-        f"{what}{so_far} Without a connection: put {dataset.file} ({dataset.nbytes / 1e6:.1f} MB) or "
-        f"{dataset.file}.gz into a folder, and set the environment variable JAXVOL_DATA to that."
-    ) from fault
-
-
-def _innermost(fault: BaseException) -> str:
-    """What the chain of errors around a failed connection began with, in a few words."""
-    while fault.__context__ is not None:
-        fault = fault.__context__
-    return getattr(fault, "strerror", None) or str(fault) or type(fault).__name__

@@ -1,32 +1,27 @@
 """Loads volumes from files, with a reader chosen by the ending of the file's name, and saves them.
 
-A registry maps endings to readers, and `register` adds to it. A reader returns the arguments of `Volume`
-that the file holds; the caller's own arguments to `load` override them.
-
-`load_ultrasound` reads files of ultrasound as acquired, which hold a probe beside the voxels.
-
-Files are data: nothing is unpickled, and the content of a file is checked against its header before
+A reader returns the arguments of `Volume` that the file holds; the caller's own arguments to `load` override
+them. Files are data: nothing is unpickled, and the content of a file is checked against its header before
 memory is allocated for it.
 """
 
 import os
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..._util.checks import Arrayable, described
-from ..._util.files import Header, decoding
-from ..._util.npy import read_npy, read_npz
+from ..._util.files import Header
+from ..._util.npy import npz_names, read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
-from .dicom import dicom_files, is_dicom, read_dicom, read_dicom_folder, series_files
+from .dicom import dicom_files, is_dicom, read_dicom, series_files
 from .kretz import read_kretz, refuse_kretz
 from .medical import nrrd_data, read_medical
 from .metaimage import metaimage_data, read_metaimage
-from .raw import raw_header, raw_json, read_raw
+from .raw import ENDINGS as RAW, raw_json, raw_json_header, read_raw
 from .save import save as save
 from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files, tiff_spacing
 
@@ -34,8 +29,7 @@ from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files, tiff
 Reader: TypeAlias = Callable[[Path, Header], dict[str, Any]]
 
 READERS: dict[str, Reader] = {
-    ".raw": read_raw,
-    ".raw.gz": read_raw,
+    **dict.fromkeys(RAW, read_raw),
     ".npy": read_npy,
     ".npz": read_npz,
     **dict.fromkeys((".nii", ".nii.gz", ".nrrd", ".nhdr"), read_medical),
@@ -113,49 +107,42 @@ def load(
 
 def _reader(path: Path) -> Reader:
     """The reader for a file, by the ending of its name, or for a folder, by what is in it."""
-    ending = max((e for e in READERS if path.name.lower().endswith(e)), key=len, default=None)
-    if ending is not None:
-        return READERS[ending]
-    if path.is_file() and is_dicom(path):  # on discs their names often have no ending
-        return read_dicom
-    if not path.is_dir():
-        raise ValueError(
-            f"path: {path} has an unknown ending; expected a file ending in {', '.join(sorted(READERS))}."
-        )
-    if dicom_files(path):
-        return read_dicom_folder
-    if tiff_files(path):
+    endings = [ending for ending in READERS if path.name.lower().endswith(ending)]
+    if endings:
+        return READERS[max(endings, key=len)]
+    if (path.is_dir() and dicom_files(path)) or (path.is_file() and is_dicom(path)):
+        return read_dicom  # on discs their names often have no ending
+    if path.is_dir() and tiff_files(path):
         return read_tiff_folder
+    fault = "is a directory without DICOM and TIFF files" if path.is_dir() else "has an unknown ending"
     raise ValueError(
-        f"path: {path} is a directory without DICOM and TIFF files; expected such a folder, or a file "
-        f"ending in {', '.join(sorted(READERS))}."
+        f"path: {path} {fault}; expected a folder of these, or a file ending in {', '.join(sorted(READERS))}."
     )
 
 
 def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
     other = load(labels)
+    # a hundredth of a voxel, at the far end of some hundred
+    slack = {"origin": 0.01 * float(volume.spacing.min()), "shape": 0}
     for name in ("shape", "spacing", "origin", "direction"):
-        own, there = (
+        own, found = (
             np.eye(3) if value is None else np.asarray(value)
             for value in (getattr(volume, name), getattr(other, name))
         )
-        # a hundredth of a voxel, at the far end of some hundred
-        slack = 0.01 * float(volume.spacing.min()) if name == "origin" else 1e-4
-        if not np.allclose(own, there, rtol=1e-4 if name == "spacing" else 0, atol=slack):
+        relative = 1e-4 if name == "spacing" else 0
+        if not np.allclose(own, found, rtol=relative, atol=slack.get(name, 1e-4)):
             raise ValueError(
                 f"labels: {labels} must have the {name} of the volume, {own.tolist()}; it has "
-                f"{there.tolist()}."
+                f"{found.tolist()}."
             )
-    whole = np.asarray(other.data)
-    if whole.dtype.kind == "f":
-        if not np.array_equal(whole, np.rint(whole)):
-            raise ValueError(f"labels: {labels} must hold integers; got {whole.dtype} with fractions.")
+    values = np.asarray(other.data)
+    if values.dtype.kind == "f":
+        if not np.array_equal(values, np.rint(values)):
+            raise ValueError(f"labels: {labels} must hold integers; got {values.dtype} with fractions.")
         with np.errstate(invalid="ignore"):  # `Volume` checks the range
-            whole = whole.astype(np.int64)
-    return Volume(
-        *(volume.data, volume.spacing, volume.origin, whole), direction=volume.direction, field=volume.field
-    )
+            values = values.astype(np.int64)
+    return Volume(volume.data, volume.spacing, volume.origin, values, direction=volume.direction)
 
 
 def files_of(path: Path) -> list[Path]:
@@ -168,7 +155,7 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_file():  # a device may have no end
         return []
     name = path.name.lower()
-    if name.endswith((".raw", ".raw.gz")):
+    if name.endswith(RAW):
         beside = raw_json(path)
         return [path] if beside is None else [path, beside]
     if name.endswith((".mhd", ".nrrd", ".nhdr")):
@@ -179,29 +166,26 @@ def files_of(path: Path) -> list[Path]:
 
 def says_where_it_lies(path: Path) -> bool:
     """Whether a file says where in the world its volume lies, and how its axes are turned."""
-    name = path.name.lower()
-    if name.endswith(".npz"):
-        return "origin" in _npz_names(path)
-    if path.is_dir():
-        return bool(dicom_files(path)) or not tiff_files(path)
-    return not name.endswith((".raw", ".raw.gz", ".npy", *TIFF))
+    return "origin" in _place_told(path)
 
 
-def says_its_spacing(path: Path, header: Header) -> bool:
+def says_its_spacing(path: Path) -> bool:
     """Whether a file of voxels, or the header beside it, says how far they lie apart."""
+    return "spacing" in _place_told(path)
+
+
+def _place_told(path: Path) -> Collection[str]:
+    """Which of spacing and origin a file tells, without reading its voxels."""
     name = path.name.lower()
-    if name.endswith((".raw", ".raw.gz")):
-        return "spacing" in raw_header(path, header, 31)[2]
+    if name.endswith(RAW):  # an origin there says nothing of the axes
+        return raw_json_header(path).keys() - {"origin"}
     if name.endswith(".npz"):
-        return "spacing" in _npz_names(path)
+        return npz_names(path)
     if name.endswith(TIFF):
-        return bool(tiff_spacing(path))
-    return not name.endswith(".npy") and (not path.is_dir() or says_where_it_lies(path))
-
-
-def _npz_names(path: Path) -> list[str]:
-    with decoding(path), zipfile.ZipFile(path) as archive:
-        return [name.removesuffix(".npy") for name in archive.namelist()]
+        return tiff_spacing(path)
+    if name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)):
+        return ()
+    return ("spacing", "origin")
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:

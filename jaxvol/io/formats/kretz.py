@@ -1,16 +1,8 @@
 """Reads Kretz ultrasound files (`.vol`, of GE Voluson scanners): voxels as acquired, and where they lie.
 
 A file is 16 bytes of magic and then items: group (u16), element (u16), length (u32), and `length` bytes, all
-little-endian. The format is not published; what is read here is what `vtkSlicerKretzFileReaderLogic`
-(SlicerHeart) and plooney/kretz read, who found it out from files:
-
-| item | holds |
-|---|---|
-| C000:1, C000:2, C000:3 | u16: numbers of samples along a beam (γ), of beams (σ), of planes (β) |
-| C100:1 | f64: distance between the samples of a beam, in metres |
-| C200:1, C200:2 | f64: b and a of the toroidal map, in samples of a beam |
-| C300:1, C300:2 | f64 tables: β of every plane and σ of every beam, in radians; π/2 is the middle |
-| D000:1 | u8: the voxels, γ fastest, then σ, then β |
+little-endian. The format is not published; the items that are read (`MEANING`) are those of
+`vtkSlicerKretzFileReaderLogic` (SlicerHeart) and plooney/kretz, who found them out from files.
 
 `ToroidalMap` has the readers' place for every voxel but for a shift along z by a and, against SlicerHeart's
 RAS axes, the sign of y.
@@ -19,7 +11,7 @@ RAS axes, the sign of y.
 import math
 import struct
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 from jaxtyping import UInt8
@@ -47,23 +39,16 @@ BETAS, SIGMAS = ((0xC300, element) for element in (1, 2))
 VOXELS = (0xD000, 1)
 
 MEANING = {
-    GAMMA: "the number of samples along a beam",
-    SIGMA: "the number of beams",
-    BETA: "the number of planes",
-    RESOLUTION: "the distance between samples",
-    OFFSET_B: "the distance from the apex to the first sample",
-    OFFSET_A: "the distance from the motor axis to the apex",
-    BETAS: "the angles of the planes",
-    SIGMAS: "the angles of the beams",
-    VOXELS: "the voxels",
+    GAMMA: "the number of samples along a beam",  # u16
+    SIGMA: "the number of beams",  # u16
+    BETA: "the number of planes",  # u16
+    RESOLUTION: "the distance between samples",  # f64, in metres
+    OFFSET_B: "the distance from the apex to the first sample",  # f64, in samples
+    OFFSET_A: "the distance from the motor axis to the apex",  # f64, in samples
+    BETAS: "the angles of the planes",  # f64 for each, in radians; π/2 is the middle
+    SIGMAS: "the angles of the beams",  # likewise
+    VOXELS: "the voxels",  # u8, γ fastest, then σ, then β
 }
-
-
-class Item(NamedTuple):
-    """Where the content of an item lies in the file, in bytes."""
-
-    offset: int
-    length: int
 
 
 def refuse_kretz(path: Path, header: Header) -> NoReturn:
@@ -83,139 +68,136 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
     """
     n_bytes = file_size(path)
     with path.open("rb") as stream:
-        magic = stream.read(len(MAGIC))
-        if magic != MAGIC:
-            raise ValueError(
-                f"path: {path} is not a Kretz file: it must begin with {MAGIC!r}; got {magic!r}. "
-                "Other programs write files of other kinds that end in .vol."
-            )
-        items, others = _items(path, stream, n_bytes)
-        _require_all(path, items, others)
-        shape = tuple(_size(path, stream, items, tag) for tag in (BETA, SIGMA, GAMMA))
-        _check_voxels(path, shape, items[VOXELS])
-        beta = _angles(path, stream, items, BETAS, shape[0])
-        sigma = _angles(path, stream, items, SIGMAS, shape[1])
-        resolution, first, apex = (
-            _read(path, stream, items, tag, "<d")[0] for tag in (RESOLUTION, OFFSET_B, OFFSET_A)
-        )
-        if not 0 < resolution < math.inf:
-            raise ValueError(
-                f"path: {path}: item {_name(RESOLUTION)} must be a positive length in metres; "
-                f"got {resolution}."
-            )
-        step = 1000 * resolution
-        try:
-            probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (shape[2] - 1) * step))
-        except ValueError as fault:
-            raise ValueError(f"path: {path} describes no probe: {fault}") from fault
-        nearest = float(probe.nearest_to_axis)
-        if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
-            raise ValueError(
-                f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the "
-                f"motor axis (b = {first * step:.4g} mm, a = {apex * step:.4g} mm), where no sample is shown."
-            )
-        stream.seek(items[VOXELS].offset)
+        items = _items(path, stream, n_bytes)
+        _require_all(path, items)
+
+        def read(tag: Tag, kind: str) -> tuple[Any, ...]:
+            """The numbers in an item, in a format of `struct`."""
+            offset, length = items[tag]
+            expected = struct.calcsize(kind)
+            if length != expected:
+                raise ValueError(
+                    f"path: {path}: item {_name(tag)} must have {expected} bytes ({kind[1:]}); it has "
+                    f"{length}."
+                )
+            stream.seek(offset)
+            return struct.unpack(kind, stream.read(length))
+
+        shape = tuple(read(tag, "<H")[0] for tag in (BETA, SIGMA, GAMMA))
+        _check_shape(path, shape, items[VOXELS][1])
+        beta = _ends(path, BETAS, np.array(read(BETAS, f"<{shape[0]}d")))
+        sigma = _ends(path, SIGMAS, np.array(read(SIGMAS, f"<{shape[1]}d")))
+        resolution, first, apex = (read(tag, "<d")[0] for tag in (RESOLUTION, OFFSET_B, OFFSET_A))
+        probe = _probe(path, 1000 * resolution, first, apex, beta, sigma, shape[2])
+        stream.seek(items[VOXELS][0])
         content = stream.read(math.prod(shape))
     return as_array(content, shape, np.dtype("u1"), "C"), probe
 
 
-def _items(path: Path, stream: BinaryIO, n_bytes: int) -> tuple[dict[Tag, Item], dict[Tag, int]]:
-    """The items that `MEANING` lists, and the lengths of the others. Only headers are read."""
-    found: dict[Tag, Item] = {}
-    others: dict[Tag, int] = {}
-    at = stream.tell()
+def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[Tag, tuple[int, int]]:
+    """Where the content of each item begins, and its length, in bytes. Only headers are read."""
+    magic = stream.read(len(MAGIC))
+    if magic != MAGIC:
+        raise ValueError(
+            f"path: {path} is not a Kretz file: it must begin with {MAGIC!r}; got {magic!r}. "
+            "Other programs write files of other kinds that end in .vol."
+        )
+    found: dict[Tag, tuple[int, int]] = {}
+    end = stream.tell()
     for _ in range(MOST_ITEMS):
-        stream.seek(at)
+        stream.seek(end)
         head = stream.read(ITEM.size)
-        if len(head) < ITEM.size and not any(head):  # the end, or padding
-            return found, others
         if len(head) < ITEM.size:
-            raise ValueError(
-                f"path: {path} is cut short: it ends after {len(head)} of the {ITEM.size} bytes of an "
-                "item's header."
-            )
+            if any(head):  # else the end, or padding
+                raise ValueError(
+                    f"path: {path} is cut short: it ends after {len(head)} of the {ITEM.size} bytes of an "
+                    "item's header."
+                )
+            return found
         group, element, length = ITEM.unpack(head)
-        tag, at = (group, element), at + ITEM.size + length
-        if at > n_bytes:
+        tag, begin = (group, element), end + ITEM.size
+        end = begin + length
+        if end > n_bytes:
             raise ValueError(
-                f"path: {path} is cut short: item {_name(tag)} is to end at byte {at}, and the file "
+                f"path: {path} is cut short: item {_name(tag)} is to end at byte {end}, and the file "
                 f"has {n_bytes}."
             )
-        if tag in found:
-            raise ValueError(f"path: {path} holds item {_name(tag)} twice; expected it once.")
-        if tag in MEANING:
-            found[tag] = Item(at - length, length)
-        else:
-            others[tag] = length
+        if tag in MEANING and tag in found:
+            raise ValueError(f"path: {path} holds item {_name(tag)} twice.")
+        found[tag] = begin, length
     raise ValueError(f"path: {path} holds {MOST_ITEMS} items or more; expected some hundreds. It is corrupt.")
 
 
-def _require_all(path: Path, items: dict[Tag, Item], others: dict[Tag, int]) -> None:
+def _require_all(path: Path, items: dict[Tag, tuple[int, int]]) -> None:
     missing = [tag for tag in MEANING if tag not in items]
+    hint = ""
     if missing == [VOXELS]:
-        data = [f"{_hex(tag)} ({length} bytes)" for tag, length in others.items() if tag[0] >> 12 == 0xD]
-        raise ValueError(
-            f"path: {path} has no item {_name(VOXELS)}: it is a compressed file, or one of several frames. "
-            f"Items of data that it has: {', '.join(data) or 'none'}. Save it as one uncompressed volume."
+        data = [f"{_hex(tag)} ({length} bytes)" for tag, (_, length) in items.items() if tag[0] >> 12 == 0xD]
+        hint = (
+            " It is a compressed file, or one of several frames; items of data that it has: "
+            f"{', '.join(data) or 'none'}. Save it as one uncompressed volume."
         )
-    if set(missing) == {BETAS, SIGMAS}:
-        raise ValueError(
-            f"path: {path} has no angles (items {_hex(BETAS)}, {_hex(SIGMAS)}): it is a Cartesian volume, "
-            "which is not supported. Export it as acquired."
-        )
+    elif missing == [BETAS, SIGMAS]:
+        hint = " It is a Cartesian volume, which is not supported. Export it as acquired."
     if missing:
-        raise ValueError(f"path: {path} has no item {', no item '.join(map(_name, missing))}.")
+        raise ValueError(f"path: {path} has no item {', no item '.join(map(_name, missing))}.{hint}")
 
 
-def _size(path: Path, stream: BinaryIO, items: dict[Tag, Item], tag: Tag) -> int:
-    (number,) = _read(path, stream, items, tag, "<H")
-    if number < 2:
-        raise ValueError(f"path: {path}: item {_name(tag)} must be at least 2; got {number}.")
-    return number
-
-
-def _check_voxels(path: Path, shape: tuple[int, ...], voxels: Item) -> None:
-    expected = math.prod(shape)
+def _check_shape(path: Path, shape: tuple[int, ...], held: int) -> None:
+    for number, tag in zip(shape, (BETA, SIGMA, GAMMA), strict=True):
+        if number < 2:
+            raise ValueError(f"path: {path}: item {_name(tag)} must be at least 2; got {number}.")
+    expected, sizes = math.prod(shape), " x ".join(map(str, shape))
     if expected > MOST_VOXELS:
+        raise ValueError(f"path: {path} must have fewer than 2**31 voxels; its header says {sizes}.")
+    if held != expected:
+        less = "less, as in a compressed file" if held < expected else "more"
         raise ValueError(
-            f"path: {path} must have fewer than 2**31 voxels; its header says {' x '.join(map(str, shape))}."
-        )
-    if voxels.length != expected:
-        less = "less, as in a compressed file" if voxels.length < expected else "more"
-        raise ValueError(
-            f"path: {path}: item {_name(VOXELS)} must hold {' x '.join(map(str, shape))} = {expected} bytes, "
-            f"as its header (β, σ, γ) says; it holds {voxels.length}, which is {less}."
+            f"path: {path}: item {_name(VOXELS)} must hold {sizes} = {expected} bytes, as its header (β, σ, "
+            f"γ) says; it holds {held}, which is {less}."
         )
 
 
-def _angles(
-    path: Path, stream: BinaryIO, items: dict[Tag, Item], tag: Tag, number: int
-) -> tuple[float, float]:
-    """The first and the last of a table of angles."""
-    table = np.array(_read(path, stream, items, tag, f"<{number}d"))
-    first, last = float(table[0]), float(table[-1])
+def _ends(path: Path, tag: Tag, angles: np.ndarray) -> tuple[float, float]:
+    """The first and the last of evenly spaced angles."""
+    first, last = float(angles[0]), float(angles[-1])
     with np.errstate(all="ignore"):  # NaN and infinity are refused below
-        step = (last - first) / (number - 1)
-        away = np.abs(table - np.linspace(first, last, number)).max() / step
+        step = (last - first) / (len(angles) - 1)
+        away = np.abs(angles - np.linspace(first, last, len(angles))).max() / step
     if not (step > 0 and away <= UNEVEN):
         raise ValueError(
-            f"path: {path}: item {_name(tag)} must be evenly spaced angles that increase; got {number} from "
-            f"{first} to {last}, up to {away:.3g} steps away from even ones (at most {UNEVEN}). Resample the "
-            "volume at even angles first."
+            f"path: {path}: item {_name(tag)} must be evenly spaced angles that increase; got {len(angles)} "
+            f"from {first} to {last}, up to {away:.3g} steps away from even ones (at most {UNEVEN}). "
+            "Resample the volume at even angles first."
         )
     return first, last
 
 
-def _read(path: Path, stream: BinaryIO, items: dict[Tag, Item], tag: Tag, kind: str) -> tuple[Any, ...]:
-    """The numbers in an item, in a format of `struct`."""
-    offset, length = items[tag]
-    expected = struct.calcsize(kind)
-    if length != expected:
+def _probe(
+    path: Path,
+    step: float,
+    first: float,
+    apex: float,
+    beta: tuple[float, float],
+    sigma: tuple[float, float],
+    samples: int,
+) -> ToroidalMap:
+    """The map of a probe whose samples are `step` mm apart; `first` and `apex` are in steps."""
+    if not 0 < step < math.inf:
         raise ValueError(
-            f"path: {path}: item {_name(tag)} must have {expected} bytes ({kind[1:]}); it has {length}."
+            f"path: {path}: item {_name(RESOLUTION)} must be a positive length in metres; got {step / 1000}."
         )
-    stream.seek(offset)
-    return struct.unpack(kind, stream.read(length))
+    try:
+        probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (samples - 1) * step))
+    except ValueError as fault:
+        raise ValueError(f"path: {path} describes no probe: {fault}") from fault
+    nearest = float(probe.nearest_to_axis)
+    if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
+        raise ValueError(
+            f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the "
+            f"motor axis (b = {first * step:.4g} mm, a = {apex * step:.4g} mm), where no sample is shown."
+        )
+    return probe
 
 
 def _hex(tag: Tag) -> str:

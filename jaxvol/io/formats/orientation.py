@@ -1,7 +1,6 @@
-"""How are voxels brought along the axes of the world, as far as exchanging and reversing axes does it?"""
+"""Brings voxels along the axes of the world, as far as exchanging and reversing axes does it."""
 
 import itertools
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,8 @@ a squared length from 1: files hold directions of a few decimal places."""
 
 
 def orthonormal(what: str, direction: Any) -> np.ndarray:
-    """The directions of axes (rows, columns) of a file, rounded there: the nearest that have length 1 and are
-    orthogonal to each other. A third column is made where there are two.
+    """The orthonormal directions (columns) nearest to those of a file, which are rounded there. A third
+    column is made where there are two.
 
     **Raises:** `ValueError`, which begins with `what`, if they are farther from that than by rounding."""
     columns = np.asarray(direction, float)
@@ -33,9 +32,7 @@ def orthonormal(what: str, direction: Any) -> np.ndarray:
     return left @ right
 
 
-def toward_axes(
-    data: np.ndarray, spacing: Sequence[float], origin: Sequence[float], direction: Any
-) -> dict[str, Any]:
+def toward_axes(data: np.ndarray, spacing: Any, origin: Any, direction: Any) -> dict[str, Any]:
     """Arguments of `Volume` for `data[i, j, k]` whose axes point along the columns of `direction`.
 
     Axes are exchanged and reversed so that x, y and z of the result increase along the world's as nearly as
@@ -43,21 +40,16 @@ def toward_axes(
     """
     matrix = np.reshape(np.asarray(direction, float), (3, 3))
     # the axis of the data that is nearest to each axis of the world, all three at once
-    order = max(
-        itertools.permutations(range(3)), key=lambda p: sum(abs(matrix[i, axis]) for i, axis in enumerate(p))
-    )
-    corner, steps = np.array(origin, float), np.array(spacing, float)
-    signs = [1 if matrix[i, axis] >= 0 else -1 for i, axis in enumerate(order)]
-    for axis, sign in zip(order, signs, strict=True):
-        if sign < 0:
-            corner += matrix[:, axis] * steps[axis] * (data.shape[axis] - 1)
-    turned = np.transpose(data, order)[tuple(slice(None, None, sign) for sign in signs)]
-    left = matrix[:, list(order)] * signs
+    order = max(map(list, itertools.permutations(range(3))), key=lambda p: np.abs(matrix[range(3), p]).sum())
+    matrix, steps = matrix[:, order], np.asarray(spacing, float)[order]
+    signs = np.where(np.diag(matrix) >= 0, 1, -1)
+    turned = np.transpose(data, order)
+    last = np.where(signs < 0, np.array(turned.shape) - 1, 0)
     arguments: dict[str, Any] = {
-        "data": np.ascontiguousarray(turned),
-        "spacing": steps[list(order)],
-        "origin": corner,
+        "data": np.ascontiguousarray(turned[tuple(slice(None, None, sign) for sign in signs)]),
+        "spacing": steps,
+        "origin": np.asarray(origin, float) + matrix @ (steps * last),
     }
-    if not np.allclose(left, np.eye(3), rtol=0, atol=ALONG_AXES):
-        arguments["direction"] = left
+    if not np.allclose(matrix * signs, np.eye(3), rtol=0, atol=ALONG_AXES):
+        arguments["direction"] = matrix * signs
     return arguments

@@ -16,6 +16,7 @@ import numpy as np
 from ..._util.files import Header, as_array, check_size, decoding, file_size, read_all
 
 
+ENDINGS = (".raw", ".raw.gz")
 JSON_KEYS = {"size": "shape", "type": "dtype", "spacing": "spacing", "origin": "origin"}
 SCIVIS_NAME = re.compile(r"_([0-9]+)x([0-9]+)x([0-9]+)_([^_.]+)\.raw(\.gz)?$", re.IGNORECASE)
 RAW_DTYPE = re.compile(r"(u?int8|u?int16|float16|float32|float64)(le|be)?", re.IGNORECASE)
@@ -32,8 +33,7 @@ def read_raw(path: Path, header: Header) -> dict[str, Any]:
             content = read_all(path, stream, expected)
     else:
         check_size(path, size, expected)
-        with path.open("rb") as stream:
-            content = read_all(path, stream, expected)
+        content = path.read_bytes()
     return {"data": as_array(content, shape, dtype, "F"), **fields}
 
 
@@ -43,7 +43,7 @@ def raw_header(
     """Shape (nx, ny, nz) with less than 2**`bits` voxels, stored type, and spacing and origin where they are
     known, of a raw file: as given by the caller, else by a JSON file beside it, else by its name."""
     given = {name: value for name, value in header._asdict().items() if value is not None}
-    fields = _name_header(path) | _json_header(path) | given
+    fields = _name_header(path) | raw_json_header(path) | given
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
             f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
@@ -65,7 +65,8 @@ def raw_json(path: Path) -> Path | None:
     return next((file for file in candidates if file.is_file()), None)
 
 
-def _json_header(path: Path) -> dict[str, Any]:
+def raw_json_header(path: Path) -> dict[str, Any]:
+    """What the JSON file beside a raw file says, under the names of `load`'s arguments."""
     beside = raw_json(path)
     if beside is None:
         return {}

@@ -1,8 +1,6 @@
 """Writes volumes to files that `load` reads again as they were."""
 
 import os
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,11 @@ from ..._util.files import reason
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume
 from ...xla.platform import is_traced
+from .medical import simple_itk
 from .metaimage import metaimage_data
+
+
+ENDINGS = (".mha", ".mhd", ".nii", ".nii.gz", ".npz", ".nrrd")
 
 
 def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
@@ -46,11 +48,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
-        swapped = isinstance(path, Volume)
-        raise ValueError(
-            f"volume must be a Volume; got {described(volume)}."
-            + (" The volume comes first, as in save(volume, path)." if swapped else "")
-        )
+        hint = " The volume comes first, as in save(volume, path)." if isinstance(path, Volume) else ""
+        raise ValueError(f"volume must be a Volume; got {described(volume)}.{hint}")
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
     if is_traced(volume):
@@ -59,18 +58,20 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
         raise ValueError(
             "volume must have voxels; got one with a field. Save an array of the field's values."
         )
-    path = Path(path)
-    ending = max((e for e in WRITERS if path.name.lower().endswith(e)), key=len, default=None)
-    if ending is None:
-        raise ValueError(f"path must end in {', '.join(sorted(WRITERS))}; got {path}.")
-    write = WRITERS[ending]
-    output_file("path", path)
-    if ending == ".mhd":
+    path = output_file("path", path)
+    name = path.name.lower()
+    if not name.endswith(ENDINGS):
+        raise ValueError(f"path must end in {', '.join(ENDINGS)}; got {path}.")
+    if name.endswith(".mhd"):
         _check_beside(path)
-    with whole_file(path) as part, tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        write(volume, Path(folder) / path.name)
-        for file in Path(folder).iterdir():  # the header takes its place last: it names the other file of two
-            os.replace(file, part if file.name == path.name else path.parent / file.name)
+    with whole_file(path) as part:
+        if name.endswith(".npz"):
+            _write_npz(volume, part)
+        else:
+            _write_medical(volume, part)
+        for file in part.parent.iterdir():
+            if file != part:  # the voxels of an .mhd
+                os.replace(file, path.with_name(file.name))
     return path
 
 
@@ -89,22 +90,16 @@ def _check_beside(path: Path) -> None:
 
 
 def _write_npz(volume: Volume, path: Path) -> None:
-    arrays = {"data": volume.data, "spacing": volume.spacing, "origin": volume.origin}
-    if volume.direction is not None:
-        arrays["direction"] = volume.direction
-    if volume.labels is not None:
-        arrays["labels"] = volume.labels
     if volume.data.dtype == "bfloat16":
         raise ValueError("volume has voxels of bfloat16, which .npz cannot hold; convert them to float32.")
-    with path.open("wb") as stream:
-        np.savez_compressed(stream, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
+    names = ("data", "spacing", "origin", "direction", "labels")
+    arrays = {name: np.asarray(getattr(volume, name)) for name in names if getattr(volume, name) is not None}
+    with path.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
+        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _write_medical(volume: Volume, path: Path) -> None:
-    try:
-        import SimpleITK as sitk  # pyright: ignore[reportMissingImports]
-    except ImportError as fault:
-        raise ImportError(f"writing {path.name} needs SimpleITK: pip install jaxvol[io]") from fault
+    sitk = simple_itk(path)
     if volume.labels is not None:
         raise ValueError(
             f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
@@ -125,9 +120,3 @@ def _write_medical(volume: Volume, path: Path) -> None:
         sitk.WriteImage(image, str(path), compress)
     except RuntimeError as fault:
         raise ValueError(f"path: {path.name} cannot be written ({reason(fault)}).") from fault
-
-
-WRITERS: dict[str, Callable[[Volume, Path], None]] = {
-    ".npz": _write_npz,
-    **dict.fromkeys((".nrrd", ".mha", ".mhd", ".nii", ".nii.gz"), _write_medical),
-}

@@ -32,20 +32,19 @@ LENGTHS = {
 def read_tiff(path: Path, header: Header) -> dict[str, Any]:
     """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
     header.refuse(path)
-    pages, spacing = _pages(path)
-    if len(pages) < 2:
+    images, spacing = _images(path)
+    if len(images) < 2:
         raise ValueError(
-            f"path: {path} must hold at least 2 images; got {len(pages)}. For a folder of images, give the "
+            f"path: {path} must hold at least 2 images; got {len(images)}. For a folder of images, give the "
             "path of the folder."
         )
-    # [z][y][x], as pages, rows and columns come
-    return {"data": np.stack(pages).transpose(2, 1, 0)} | spacing
+    return {"data": images.transpose(2, 1, 0)} | spacing
 
 
 def tiff_spacing(path: Path) -> dict[str, Any]:
     """The spacing that a file tells, as `read_tiff` has it; its images are not read."""
     with _tifffile(path).TiffFile(path) as file:
-        return _spacing(file, file.pages[0].aspage())
+        return _spacing(file)
 
 
 def tiff_files(folder: Path) -> list[Path]:
@@ -53,8 +52,8 @@ def tiff_files(folder: Path) -> list[Path]:
     files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS and file.is_file()]
 
     def key(file: Path) -> list[tuple[int, str]]:
-        parts = re.split(r"([0-9]+)", file.name.lower())
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+        words = re.split(r"([0-9]+)", file.name.lower())
+        return [(int(word), "") if word.isdigit() else (-1, word) for word in words]
 
     return sorted(files, key=key)
 
@@ -70,30 +69,27 @@ def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
     _check_numbers(folder, files)
     slices: list[np.ndarray] = []
     for file in files:
-        pages, _ = _pages(file)
-        if len(pages) != 1:
-            raise ValueError(f"path: {file} must hold one image, as a slice of {folder}; got {len(pages)}.")
-        (image,) = pages
-        if slices and (image.shape, image.dtype) != (slices[0].shape, slices[0].dtype):
+        images, _ = _images(file)
+        if len(images) != 1:
+            raise ValueError(f"path: {file} must hold one image, as a slice of {folder}; got {len(images)}.")
+        slices.append(images[0])
+        first, last = (f"{each.shape} of {each.dtype}" for each in (slices[0], slices[-1]))
+        if first != last or len(slices) * images.size > MOST_VOXELS:
             raise ValueError(
-                f"path: the slices in {folder} must have the same size and type; {files[0].name} has "
-                f"{slices[0].shape} of {slices[0].dtype}, and {file.name} {image.shape} of {image.dtype}."
+                f"path: the slices in {folder} must have the same size and type, and fewer than 2**31 "
+                f"voxels; {files[0].name} has {first}, and {file.name} {last}."
             )
-        slices.append(image)
-        if len(slices) * image.size > MOST_VOXELS:
-            raise ValueError(f"path: {folder} must have fewer than 2**31 voxels.")
     return {"data": np.stack(slices).transpose(2, 1, 0)}
 
 
 def _check_numbers(folder: Path, files: list[Path]) -> None:
     """**Raises** `ValueError` if files' names differ in one number, and some of its values are missing."""
-    last = [re.findall(r"[0-9]+", file.stem) for file in files]
-    numbers = [int(found[-1]) for found in last if found]
     if len(files) < 2:
         raise ValueError(f"path: {folder} must hold at least 2 slices; got {len(files)}.")
-    if len(numbers) != len(files) or len({tuple(found[:-1]) for found in last}) > 1:
+    numbers = [[int(number) for number in re.findall(r"[0-9]+", file.stem)] for file in files]
+    if not all(numbers) or len({tuple(each[:-1]) for each in numbers}) > 1:
         return
-    steps = np.diff(numbers)
+    steps = np.diff([each[-1] for each in numbers])
     if steps.min() != steps.max():
         i = int(np.argmax(steps)) if steps.max() > np.median(steps) else int(np.argmin(steps))
         raise ValueError(
@@ -110,40 +106,38 @@ def _tifffile(path: Path) -> Any:
     return tifffile
 
 
-def _pages(path: Path) -> tuple[list[np.ndarray], dict[str, Any]]:
-    """The images in a file, which are of one size and type, and their spacing where it is known."""
+def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """The images [z, y, x] in a file, and their spacing where it is known."""
     tifffile = _tifffile(path)
     n_bytes = file_size(path)
     try:
         with tifffile.TiffFile(path) as file:
-            if file.is_imagej or len(file.pages) == 1:  # ImageJ may hold a stack in its only page
-                pages = [page for page in file.series[0].pages if page is not None]
-                shape = file.series[0].shape
-            else:
-                pages = list(file.pages)
-                shape = (len(pages), *pages[0].shape)
-            first = pages[0].aspage()
             _check_last(path, file)
-            _check_ome(path, file)
-            if len(shape) not in (2, 3) or first.samplesperpixel != 1:
+            pages = [page.aspage() for page in file.pages]
+            first, kinds = pages[0], {(page.shape, page.dtype) for page in pages}
+            axes, whole = file.series[0].axes, file.is_imagej or len(pages) == 1
+            # ImageJ may hold a stack in its only page
+            shape = file.series[0].shape if whole else (len(pages), *first.shape)
+            several = file.is_ome and (len(file.series) > 1 or set(axes) & set("CT"))
+            if several or len(kinds) > 1 or len(shape) not in (2, 3) or first.samplesperpixel != 1:
                 raise ValueError(
-                    f"path: {path} must hold images of one value per pixel, in one stack; got shape {shape}, "
-                    f"{first.samplesperpixel} values per pixel."
+                    f"path: {path} must hold one stack of images of one size, type and value per pixel; got "
+                    f"{len(file.series)} stacks, the first of shape {file.series[0].shape} ({axes}), and "
+                    f"pages of {len(kinds)} kinds. Save one stack alone."
                 )
-            _check_backed(path, n_bytes, shape, first)
-            if len(shape) == 3 and len(pages) == 1:
-                return list(file.series[0].asarray()), _spacing(file, first)
-            images = []
-            for number, page in enumerate(pages):
-                page = page.aspage()
-                if (page.shape, page.dtype) != (first.shape, first.dtype):
-                    raise ValueError(
-                        f"path: the images in {path} must have the same size and type; the first has "
-                        f"{first.shape} of {first.dtype}, and number {number + 1} {page.shape} of "
-                        f"{page.dtype}."
-                    )
-                images.append(page.asarray())
-            return images, _spacing(file, first)
+            if not 0 < math.prod(shape) <= MOST_VOXELS or first.dtype is None:
+                raise ValueError(
+                    f"path: {path} must hold 1 to 2**31 - 1 voxels of a known type; got shape {shape}."
+                )
+            expected = math.prod(shape) * first.dtype.itemsize
+            packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
+            if n_bytes * (MOST_COMPRESSED if packed else 1) < expected:
+                raise ValueError(
+                    f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces voxels of "
+                    f"{expected}."
+                )
+            images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
+            return images.reshape(-1, *shape[-2:]), _spacing(file)
     except MemoryError:
         raise
     except Exception as fault:
@@ -164,59 +158,27 @@ def _check_last(path: Path, file: Any) -> None:
         raise ValueError(f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
 
 
-def _check_backed(path: Path, n_bytes: int, shape: tuple[int, ...], page: Any) -> None:
-    voxels = math.prod(shape)
-    if not 0 < voxels <= MOST_VOXELS or page.dtype is None:
-        raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels of a known type; got shape {shape}.")
-    expected = voxels * page.dtype.itemsize
-    packed = page.compression != 1 or page.bitspersample < 8 * page.dtype.itemsize
-    if n_bytes * (MOST_COMPRESSED if packed else 1) < expected:
-        raise ValueError(
-            f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces voxels of "
-            f"{expected}."
-        )
-
-
-def _check_ome(path: Path, file: Any) -> None:
-    """**Raises** `ValueError` if OME says that not all images of a file are slices of one volume."""
-    images = _ome_images(file)
-    for pixels in (image["Pixels"] for image in images):
-        counts = [int(pixels[f"Size{axis}"]) for axis in "CT"]
-        if len(images) > 1 or math.prod(counts) > 1:
-            raise ValueError(
-                f"path: {path} must hold one volume of one channel; by OME it holds {len(images)}, the first "
-                f"of {counts[0]} channels at {counts[1]} times. Save one of them alone."
-            )
-
-
-def _ome_images(file: Any) -> list[Any]:
-    """What OME tells of each volume in a file."""
-    if not file.is_ome:
-        return []
-    found = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"].get("Image", [])
-    return found if isinstance(found, list) else [found]
-
-
-def _spacing(file: Any, page: Any) -> dict[str, Any]:
+def _spacing(file: Any) -> dict[str, Any]:
     """Spacing (x, y, z) as OME or ImageJ wrote it, in mm, or in its own unit if that is none of length."""
     try:
-        steps = _ome_spacing(file) if file.is_ome else _imagej_spacing(file, page)
+        steps = _ome_spacing(file) if file.is_ome else _imagej_spacing(file)
     except (KeyError, IndexError, ZeroDivisionError, TypeError, ValueError):
         return {}
     return {"spacing": steps} if all(0 < step < math.inf for step in steps) else {}
 
 
 def _ome_spacing(file: Any) -> list[float]:
-    pixels = _ome_images(file)[0]["Pixels"]
+    image = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"]["Image"]
+    pixels = (image[0] if isinstance(image, list) else image)["Pixels"]
     return [
         float(pixels[f"PhysicalSize{axis}"]) * _unit(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
         for axis in "XYZ"
     ]
 
 
-def _imagej_spacing(file: Any, page: Any) -> list[float]:
-    found = file.imagej_metadata or {}
-    (nx, dx), (ny, dy) = (page.tags[name].value for name in ("XResolution", "YResolution"))
+def _imagej_spacing(file: Any) -> list[float]:
+    found, tags = file.imagej_metadata or {}, file.pages[0].aspage().tags
+    (nx, dx), (ny, dy) = (tags[name].value for name in ("XResolution", "YResolution"))
     unit = _unit(found.get("unit", ""))
     return [dx / nx * unit, dy / ny * unit, float(found["spacing"]) * unit]
 

@@ -2,8 +2,8 @@
 
 Every phantom spans the world cube [-1, 1]³, with nodes on the cube's faces, and is the same scene at every
 resolution: shapes are signed distances and textures are waves, both in world units, and a shape's coverage
-falls off over a ramp of a fixed number of voxels. Each scene has its own file; they share a library of
-shapes, a canvas to draw them on, and waves.
+falls off over a ramp of a fixed number of voxels. Drawn scenes have a file each; `canvas.py` and `shapes.py`
+are what they are drawn with.
 """
 
 from collections.abc import Callable
@@ -13,25 +13,47 @@ import numpy as np
 
 from ..._util.checks import integer
 from ...scene.volume import Volume
-from . import colon, engine, formulas, frog, head, vessels
+from . import colon, engine, frog, head, vessels
+from .canvas import Canvas
 from .colon import colon_path as colon_path
+from .shapes import Block
 from .toroidal import toroidal_phantom as toroidal_phantom
 
 
-# functions from a resolution and a random generator to a scene's voxels and, for some, labels
-PHANTOMS: dict[str, Callable[[int, np.random.Generator], np.ndarray | tuple[np.ndarray, np.ndarray]]] = {
+def _plane(x: Block, y: Block, z: Block) -> Block:
+    return _logistic(((z + 1) / 2 - (0.25 + 0.35 * (x + 1) / 2)) / 0.004)
+
+
+def _cut_block(x: Block, y: Block, z: Block) -> Block:
+    return np.where(x < 0, 0.5 + 0.1 * np.sin(20 * (z + 1)), _plane(x, y, z))
+
+
+def _logistic(x: Block) -> Block:
+    from scipy.special import expit  # here, so that a first image does not wait for it
+
+    return expit(x)
+
+
+FORMULAS: dict[str, Callable[[Block, Block, Block], Block]] = {
+    "plane": _plane,
+    "cut_block": _cut_block,
+    "sphere": lambda x, y, z: _logistic((0.5 - np.sqrt(x * x + y * y + z * z)) / 0.008),
+    "constant": lambda x, y, z: np.ones_like(x),
+    "linear": lambda x, y, z: (x + 1) / 2,
+    "gaussian": lambda x, y, z: np.exp((x * x + y * y + z * z) / (-2 * 0.3**2)),
+}
+"""Values at world points x, y, z, an open mesh, of phantoms whose images have a known answer."""
+
+DRAWN: dict[str, Callable[[int, np.random.Generator], np.ndarray | tuple[np.ndarray, np.ndarray]]] = {
     "head": head.make,
     "engine": engine.make,
     "colon": colon.make,
     "vessels": vessels.make,
     "labels": frog.make,
-    "plane": formulas.maker(formulas.plane),
-    "cut_block": formulas.maker(formulas.cut_block),
-    "sphere": formulas.maker(formulas.sphere),
-    "constant": formulas.maker(formulas.constant),
-    "linear": formulas.maker(formulas.linear),
-    "gaussian": formulas.maker(formulas.gaussian),
 }
+"""Functions from a resolution and a random generator to voxels and, for some, labels."""
+
+PHANTOMS = (*DRAWN, *FORMULAS)
 
 
 def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> Volume:
@@ -72,6 +94,13 @@ along +z | none |
     if name not in PHANTOMS:
         raise ValueError(f"name must be one of {', '.join(PHANTOMS)}; got {name!r}.")
     resolution = integer("resolution", resolution, 8)
-    result = PHANTOMS[name](resolution, np.random.default_rng(integer("seed", seed, 0)))
-    data, labels = result if isinstance(result, tuple) else (result, None)
+    rng, labels = np.random.default_rng(integer("seed", seed, 0)), None
+    if name in DRAWN:
+        made = DRAWN[name](resolution, rng)
+        data, labels = made if isinstance(made, tuple) else (made, None)
+    else:
+        canvas = Canvas(resolution)
+        for where, at in canvas.slabs():
+            canvas.values[where] = FORMULAS[name](*at)
+        data = canvas.values
     return Volume(data, spacing=(2 / (resolution - 1),) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)

@@ -1,4 +1,4 @@
-"""Rasterises shapes at the nodes of the cube [-1, 1]³, as values or as signed distances.
+"""Rasterises shapes at the nodes of the cube [-1, 1]³, as values or as signed distances; and textures.
 
 A shape is evaluated only near its bounding box, in slabs small enough for the cache. A *field* is a canvas
 of signed distances, `FAR` where there is nothing, that shapes are joined to and carved from; a canvas of
@@ -21,12 +21,8 @@ FAR = 10.0  # world units; more than any distance in the cube
 class Canvas:
     """Values, or signed distances, at the nodes of [-1, 1]³."""
 
-    axis: Float[np.ndarray, " nodes"]
-    spacing: float
-    values: Block
-
     def __init__(self, resolution: int, fill: float = 0.0):
-        self.axis = np.linspace(-1, 1, resolution, dtype=np.float32)
+        self.axis: Float[np.ndarray, " nodes"] = np.linspace(-1, 1, resolution, dtype=np.float32)
         self.spacing = 2 / (resolution - 1)
         self.values = np.full((resolution,) * 3, fill, np.float32)
 
@@ -94,3 +90,25 @@ def smooth_min(a: Block, b: Block, blend: float) -> Block:
         return np.minimum(a, b)
     overlap = np.maximum(blend - abs(a - b), 0)
     return np.minimum(a, b) - overlap**2 / (4 * blend)
+
+
+class PlaneWaves:
+    """A smooth random texture, the same at every resolution: a sum of plane waves with wavelengths of a given
+    range, variance 1."""
+
+    def __init__(self, rng: np.random.Generator, shortest: float, longest: float, count: int = 32):
+        direction = rng.normal(size=(count, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        self.wave_vector = 2 * np.pi * direction / rng.uniform(shortest, longest, (count, 1))
+        self.phase = rng.uniform(0, 2 * np.pi, count)
+
+    def __call__(self, x: Block, y: Block, z: Block) -> Block:
+        # the cosine as the real part of a product of three exponentials: one matrix product sums all waves
+        ex, ey, ez = (
+            np.exp(1j * np.outer(v.ravel(), k)).astype(np.complex64)
+            for v, k in zip((x, y, z), self.wave_vector.T, strict=True)
+        )
+        ex = ex * (np.exp(1j * self.phase) * np.sqrt(2 / len(self.phase))).astype(np.complex64)
+        exy = (ex[:, None, :] * ey).reshape(-1, len(self.phase))
+        real, imaginary = exy.real @ ez.real.T, exy.imag @ ez.imag.T
+        return (real - imaginary).reshape(x.size, y.size, z.size)

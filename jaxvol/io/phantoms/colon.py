@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._util.checks import integer
-from .canvas import FAR, Canvas
+from .canvas import FAR, Canvas, PlaneWaves
 from .shapes import ball, box, capsule, lengths, to_segment
-from .waves import PlaneWaves
 
 
 def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:

@@ -29,9 +29,9 @@ def make(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         for where, at in canvas.slabs(organ.low, organ.high):
             # a node belongs to the organ it is deepest in, so overlapping organs meet in a smooth face
             distance = organ.distance(*at)
-            mine = distance < deepest[where]
-            np.copyto(labels[where], label, where=mine)
-            np.copyto(deepest[where], distance, where=mine)
+            nearer = distance < deepest[where]
+            np.copyto(labels[where], label, where=nearer)
+            np.copyto(deepest[where], distance, where=nearer)
     return canvas.as_uint8(), labels
 
 

@@ -4,16 +4,13 @@ A CT-like head, face towards -y, crown towards +z; 1 world unit is about 14 cm. 
 everything else is painted over them.
 """
 
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
-from .canvas import FAR, Canvas
+from .canvas import FAR, Canvas, PlaneWaves
 from .shapes import Block, Shape, ball, box, capsule, ellipsoid, lengths, pair, tube
-from .waves import PlaneWaves
 
-
-Number = TypeVar("Number", float, np.ndarray)
 
 _BRAIN = (
     ellipsoid((0, 0.08, 0.345), (0.425, 0.565, 0.445)),
@@ -133,7 +130,7 @@ def _bones(n: int) -> Canvas:
     return bone
 
 
-def _arch(x: Number) -> Number:
+def _arch(x: Any) -> Any:
     """The dental arch: y of a tooth at x, a number or an array."""
     return -0.585 + 7.5 * x * x
 

@@ -9,7 +9,7 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from ..._util.checks import flag, integer
 from ...march.transforms.toroidal_map import ToroidalMap
@@ -20,7 +20,6 @@ from .shapes import Block, Shape, ball, capsule, ellipsoid, tube
 
 SOFT = 1.2  # mm over which a boundary falls from full to none
 GRAIN = 0.35  # mm along a beam over which speckle is correlated: half the pulse length
-DEGREES = np.pi / 180
 
 Scene = Callable[[Block, Block, Block, Block], Block]
 """Mean echo, 0 to 255, at world points x, y, z of depth γ; all in mm."""
@@ -73,7 +72,8 @@ spheres; wires 255 |
     n_beta, n_sigma, n_gamma = (integer("shape", n, 8) for n in shape)
     rng, speckle = np.random.default_rng(integer("seed", seed, 0)), flag("speckle", speckle)
     if probe is None:
-        probe = ToroidalMap(20.0, 30.0, _about(35), _about(40), (0.0, 100.0))
+        beta, sigma = np.deg2rad([[55, 125], [50, 130]]).tolist()
+        probe = ToroidalMap(20.0, 30.0, beta, sigma, (0.0, 100.0))
     if not isinstance(probe, ToroidalMap):
         raise ValueError(f"probe must be a ToroidalMap; got {probe!r}.")
     data = np.empty((n_beta, n_sigma, n_gamma), np.uint8)
@@ -88,17 +88,8 @@ spheres; wires 255 |
         echo = SCENES[name](x, y, z, nodes[..., 2])
         if speckle:
             echo = echo * _speckle(rng, echo.shape, GRAIN / float(gamma[1] - gamma[0]))
-        data[start : start + thick] = _rounded(echo)
+        data[start : start + thick] = np.rint(np.clip(echo, 0, 255)).astype(np.uint8)
     return Volume(data), probe
-
-
-def _about(half: float) -> tuple[float, float]:
-    """The range 90° ± `half` degrees, in radians."""
-    return (90 - half) * DEGREES, (90 + half) * DEGREES
-
-
-def _rounded(echo: Block) -> UInt8[np.ndarray, "_ _ _"]:
-    return np.rint(np.clip(echo, 0, 255)).astype(np.uint8)
 
 
 def _speckle(

@@ -179,7 +179,7 @@ BAD = {
     ),
     "two series": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, tags=OTHER),
-        r"holds 2 series \(.*(chest|head) \(.*file of the series",
+        r"holds several series: .*(chest|head) \(.*file of the series",
     ),
     "an overview": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, turned(90, 0, 0)),
@@ -194,9 +194,9 @@ BAD = {
         lambda folder, paths: edit(
             paths[3], b"\x20\x00", lambda rest: rest.replace(b"\x20\x00\x32\x00", b"\x20\x00\x33\x00", 1)
         ),
-        r"say where it lies: element \(0020,0032\) must be 3 numbers",
+        r"say where it lies: element \(0020\|0032\) must be 3 numbers",
     ),
-    "HTJ2K": (unreadable, r"is stored as HTJ2K lossless \(transfer syntax 1\.2\.840\.10008\.1\.2\.4\.201\)"),
+    "HTJ2K": (unreadable, r"is stored in the transfer syntax 1\.2\.840\.10008\.1\.2\.4\.201, which"),
     "huge sizes": (huge, "cannot be read|cut short"),
     "no DICOM": (
         lambda folder, paths: [path.rename(path.with_suffix(".txt")).write_text("no") for path in paths],
@@ -237,14 +237,13 @@ def test_one_of_two_series_is_chosen_by_a_file_of_it(tmp_path):
 
 def test_what_simpleitk_decompresses_is_read(tmp_path):
     slices = np.random.default_rng(2).integers(0, 4000, (64, 64, 2)).astype(np.int16)
-    for name, kind in (("JPEG", "JPEG lossless"), ("JPEG2000", "JPEG 2000")):
+    for name, syntax in (("JPEG", "1.2.840.10008.1.2.4.70"), ("JPEG2000", "1.2.840.10008.1.2.4.90")):
         folder = tmp_path / name
         folder.mkdir()
         for z in range(2):
             tags = {"0028|1052": "0", "0028|1053": "1"}
             write_slice(folder / f"{z}.dcm", slices[:, :, z], (0, 0, z), tags=tags, compressor=name)
-        syntax = dicom._meta(folder / "0.dcm", dicom.SYNTAX)
-        assert dicom.READABLE[str(syntax)].startswith(kind)
+        assert dicom._meta(folder / "0.dcm", dicom.SYNTAX) == syntax
         np.testing.assert_array_equal(jv.load(folder).data, slices)
 
 

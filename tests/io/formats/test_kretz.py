@@ -113,7 +113,10 @@ BAD = {
     ),
     "compressed": (changed(VOXELS, bytes(40)), "4 x 5 x 6 = 120 bytes.*holds 40, which is less, as in"),
     "too many voxels": (changed(VOXELS, bytes(121)), "= 120 bytes.*holds 121, which is more"),
-    "Cartesian": (without(PLANES, BEAMS), "no angles .*Cartesian"),
+    "Cartesian": (
+        without(PLANES, BEAMS),
+        r"no item C300:1 .*, no item C300:2 .*Cartesian",
+    ),
     "an item twice": (kretz(more=[((0xC000, 1), b"\x06\x00")]), "holds item C000:1 .* twice"),
     "zero size": (changed((0xC000, 3), bytes(2)), r"C000:3 \(the number of planes\) must be at least 2"),
     "huge sizes": (

@@ -147,7 +147,7 @@ def write_mhd(path, content, *lines):
     return path
 
 
-def test_a_metaimages_voxels_may_be_the_end_of_another_file_or_text(tmp_path):
+def test_a_metaimages_voxels_may_be_a_part_of_another_file(tmp_path):
     expected, longer = VALUES.reshape(4, 3, 2, order="F"), b"\xff" * 10 + VALUES.tobytes()
     path = tmp_path / "a.mhd"
     for size in (-1, 10):
@@ -159,27 +159,17 @@ def test_a_metaimages_voxels_may_be_the_end_of_another_file_or_text(tmp_path):
             load(write_mhd(path, longer, f"HeaderSize = {told}"))
     with pytest.raises(ValueError, match="cut short"):
         load(write_mhd(path, longer[:10], "HeaderSize = -1"))
-    text = " ".join(map(str, VALUES))
-    assert same(load(write_mhd(path, text.encode(), "BinaryData = False")), expected)
-    for wrong in ("300", "-1", "7.5", "nan"):
-        write_mhd(path, text.replace("23", wrong).encode(), "BinaryData = False")
-        with pytest.raises(ValueError, match=rf"must hold integers from 0 to 255.*; got {wrong}"):
-            load(path)
     doubles = write_mhd(path, VALUES.astype("<f8").tobytes())
     doubles.write_text(doubles.read_text().replace("MET_UCHAR", "MET_DOUBLE"))
     assert same(load(doubles), expected.astype(np.float32))
     doubles.write_text(doubles.read_text().replace("MET_DOUBLE", "MET_STRING"))
     with pytest.raises(ValueError, match=r"ElementType must be one of .*got 'MET_STRING'"):
         load(doubles)
+    with pytest.raises(ValueError, match=r"BinaryData true; got 'MET_UCHAR' and 'False'"):
+        load(write_mhd(path, b"1 " * 24, "BinaryData = False"))
     for spacing in ("1 1", "1 1 far"):
         with pytest.raises(ValueError, match=f"ElementSpacing must be 3 numbers; got '{spacing}'"):
             load(write_mhd(path, VALUES.tobytes(), f"ElementSpacing = {spacing}"))
-    for wrong, message in ((text.replace("23", "many"), "must hold numbers in text"),):
-        with pytest.raises(ValueError, match=message):
-            load(write_mhd(path, wrong.encode(), "BinaryData = False"))
-    for count in (23, 25, 10**6):
-        with pytest.raises(ValueError, match=r"cut short|oversized"):
-            load(write_mhd(path, b"1 " * count, "BinaryData = False"))
 
 
 @pytest.mark.parametrize("digits", [3, 4])

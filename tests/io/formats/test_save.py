@@ -36,7 +36,7 @@ def test_a_volume_comes_back_as_it_was(tmp_path, ending):
 
 def test_npz_keeps_labels_and_float16(tmp_path):
     volume = jv.Volume(ramp("float16"), labels=ramp() % 5)
-    again = jv.load(jv.save(volume, tmp_path / "a.npz"))
+    again = jv.load(jv.save(volume, tmp_path / "a.NPZ"))
     assert again.data.dtype == "float16"
     np.testing.assert_array_equal(again.labels, volume.labels)
 
