@@ -138,8 +138,7 @@ def fit(
     - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, at the end, and when the
       fit is interrupted after its first step (Ctrl-C; `KeyboardInterrupt` is raised again, with a note).
       Before the fit, it is checked that the file can be written. If it exists, the fit continues from it and
-      ends with the same parameters, bit for bit, as an uninterrupted fit (on the same machine). A damaged
-      file is reported in a warning, and the previous one is used.
+      ends with the same parameters, bit for bit, as an uninterrupted fit (on the same machine).
 
     **Returns:** a `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success`, `Fit.message` and
     `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
@@ -150,8 +149,8 @@ def fit(
     "fits under noise".
 
     **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
-    residual that is not finite at the start, a checkpoint of another fit or of an earlier version, and one
-    that cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.
+    residual that is not finite at the start, a checkpoint that is damaged or of another fit, and one that
+    cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.
     """
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
         if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
