@@ -176,7 +176,7 @@ def fit(
                 run = run.step(solver, problem)
                 show(run)
                 if callback is not None:
-                    callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
+                    callback(len(run.losses), problem.free.forward(run.evaluated), run.losses[-1])
                 if checkpointer is not None:
                     checkpointer.save(run, checkpoint_seconds)
     except KeyboardInterrupt as stop:
@@ -220,7 +220,7 @@ class _Run(eqx.Module):
 
     y: FreeVariables
     state: Any
-    seen: FreeVariables
+    evaluated: FreeVariables
     """The solver's point whose loss is known."""
     best: FreeVariables
     triangle: Array | None
@@ -244,11 +244,11 @@ class _Run(eqx.Module):
         return run
 
     def step(self, solver: Any, problem: Problem) -> "_Run":
-        y, state, (loss, seen, triangle), done, result = _advance(solver, problem, self.y, self.state)
+        y, state, (loss, evaluated, triangle), done, result = _advance(solver, problem, self.y, self.state)
         loss = float(loss)
         better = loss < min(self.losses, default=math.inf)
-        best, triangle = (seen, triangle) if better else (self.best, self.triangle)
-        return _Run(y, state, seen, best, triangle, done, result, [*self.losses, loss])
+        best, triangle = (evaluated, triangle) if better else (self.best, self.triangle)
+        return _Run(y, state, evaluated, best, triangle, done, result, [*self.losses, loss])
 
     def ended(self, max_steps: int, patience: int, rtol: float) -> Any:
         """The result if the fit has ended, else None."""

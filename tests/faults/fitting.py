@@ -8,7 +8,7 @@ from . import Fault
 def last_is_best(step):
     def faulty(self, *scene):
         run = step(self, *scene)
-        return replace(run, best=run.seen)
+        return replace(run, best=run.evaluated)
 
     return faulty
 

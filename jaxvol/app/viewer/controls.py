@@ -199,7 +199,7 @@ class _TransferControls:
             ),
             Slider(
                 "opacity",
-                lambda: float(np.asarray(self.transfer.opacity)[labels[self.chosen]]),
+                lambda: min(float(np.asarray(self.transfer.opacity)[labels[self.chosen]]), MAX_LABEL_OPACITY),
                 change(LabelTransferFunction.with_opacity),
                 low=0.0,
                 high=MAX_LABEL_OPACITY,
@@ -210,6 +210,14 @@ class _TransferControls:
 
 def _march_controls(model: Model) -> list[Control]:
     """Step, transforms, light."""
+
+    def switch(name: str) -> Field:
+        def turn(on: bool) -> None:
+            enabled = model.state.enabled - {name}
+            model.change(enabled=enabled | {name} if on else enabled)
+
+        return Field("checkbox", name, lambda: name in model.state.enabled, turn)
+
     step = Slider(
         "step (voxels)",
         lambda: model.state.step,
@@ -219,14 +227,6 @@ def _march_controls(model: Model) -> list[Control]:
         step=MIN_STEP,
         logarithmic=True,
     )
-    transforms = [
-        Field(
-            "checkbox",
-            name,
-            lambda name=name: name in model.state.enabled,
-            lambda _, name=name: model.change(enabled=model.state.enabled ^ {name}),
-        )
-        for name in model.scene.transform_names
-    ]
     light = Field("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
-    return [step, *transforms, *([] if model.scene.lighting is None else [light])]
+    is_lightable = model.scene.lighting is not None
+    return [step, *map(switch, model.scene.transform_names), *([light] if is_lightable else [])]

@@ -178,7 +178,7 @@ def _input_widget(control: Input) -> Any:
         low, high = math.log2(control.low), math.log2(control.high)
         return ipywidgets.FloatLogSlider(base=2, min=low, max=high, step=0.25, **how)
     limits = {"min": control.low, "max": control.high, "step": control.step}
-    return ipywidgets.FloatSlider(readout_format=".4~g", **limits, **how)
+    return ipywidgets.FloatSlider(readout_format=".4g", **limits, **how)
 
 
 class PromptCanvas(RenderCanvas):
