@@ -68,22 +68,22 @@ import sys, time
 begun = float(sys.argv[1])
 import jaxvol as jv
 from jaxvol.app.viewer.model import Model
-from jaxvol.app.viewer.start import begin
+from jaxvol.app.viewer.state import initial
 jv.keep_programs(sys.argv[3])
 volume = jv.load(sys.argv[2])
 how = {"lighting": None, "lit": True, "compositing": "over", "background": (1, 1, 1), "size": (640, 480)}
-scene = begin(volume, jv.preset("head", unit_distance=0.01), None, None, **how)
+scene = initial(volume, jv.preset("head", unit_distance=0.01), None, None, **how)
 seconds = []
 
 
-def show(frame):
+def show(pixels, stage):
     seconds.append(time.time() - begun)
     model.close()
 
 
 model = Model(*scene, show, lambda text: None)
-model.draw()
-model._worker._thread.join()
+model.ask(model.state)
+model._thread.join()
 print(seconds[0])
 """
 

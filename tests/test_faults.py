@@ -27,7 +27,7 @@ def test_what_faults_replace_and_the_tests_that_must_see_it_are_there():
 
 def test_a_fault_is_replaced_wherever_it_was_imported():
     from jaxvol import metrics
-    from jaxvol.app.viewer import drawing
+    from jaxvol.app.viewer import tiles
 
     from .faults import Fault
 
@@ -36,7 +36,7 @@ def test_a_fault_is_replaced_wherever_it_was_imported():
     try:
         fault.inject()
         assert metrics.rmse(np.ones((2, 2)), np.zeros((2, 2))) == 2
-        assert drawing.rmse is metrics.rmse is not original
+        assert tiles.rmse is metrics.rmse is not original
     finally:
         Fault("undo", "metrics:rmse", lambda _: original, ()).inject()
-    assert drawing.rmse is original
+    assert tiles.rmse is original

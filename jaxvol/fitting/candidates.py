@@ -1,6 +1,7 @@
 """Which models are nested in one another? Candidates for `choose`, each of which contains the one before."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -75,13 +76,6 @@ def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
     return TransferFunction(at, between(transfer.colors), between(transfer.extinction))
 
 
-class _Refine(eqx.Module):
-    points: int
-
-    def __call__(self, found: TransferFunction) -> TransferFunction:
-        return refined(found, self.points)
-
-
 def nested_points(
     start: TransferFunction | Any, points: Sequence[int] | Any = (2, 4, 8, 16), **of_each: Any
 ) -> list[Candidate]:
@@ -105,33 +99,8 @@ def nested_points(
     if not numbers or any(b <= a for a, b in pairwise(numbers)):
         raise ValueError(f"points must be increasing numbers of control points; got {points!r}.")
     first = Candidate(f"{numbers[0]} points", refined(start, numbers[0]), **of_each)
-    return [first, *(Candidate(f"{n} points", grow=_Refine(n), **of_each) for n in numbers[1:])]
-
-
-def _whole(part: Any) -> Any:
-    return part
-
-
-class _Merged(eqx.Module):
-    """From the parameters of each class to those of each part."""
-
-    parts: tuple[Any, ...]
-    classes: tuple[int, ...] = eqx.field(static=True)
-    shared: Where
-
-    def __call__(self, found: Sequence[Any]) -> tuple[Any, ...]:
-        pairs = zip(self.parts, self.classes, strict=True)
-        return tuple(_with(self.shared, part, found[number]) for part, number in pairs)
-
-
-class _Split(eqx.Module):
-    """From the parameters of each class to those of each class of a finer partition."""
-
-    coarse: _Merged
-    fine: tuple[int, ...] = eqx.field(static=True)
-
-    def __call__(self, found: Sequence[Any]) -> tuple[Any, ...]:
-        return _firsts(self.coarse(found), self.fine)
+    larger = (Candidate(f"{n} points", grow=partial(refined, points=n), **of_each) for n in numbers[1:])
+    return [first, *larger]
 
 
 def nested_materials(
@@ -166,37 +135,51 @@ def nested_materials(
     if shared is None:
         shared = _mean_free_path if isinstance(parts[0], Material) else _whole
     chain = _partitions(partitions, len(parts))
+    expand = [partial(_expanded, parts, classes, shared) for classes in chain]
     candidates: list[Candidate] = []
     for number, classes in enumerate(chain):
         count = max(classes) + 1
-        merged = _Merged(tuple(parts), classes, shared)
         candidates.append(
             Candidate(
                 _name(classes),
-                start=None if number else _firsts(parts, classes),
-                grow=_Split(_Merged(tuple(parts), chain[number - 1], shared), classes) if number else None,
-                expand=merged,
+                start=None if number else _first_of_each(parts, classes),
+                grow=partial(_split, expand[number - 1], classes) if number else None,
+                expand=expand[number],
                 constraints=None if constraints is None else (constraints,) * count,
-                where=None if where is None else _of_each(where),
+                where=None if where is None else lambda parts: [where(part) for part in parts],
             )
         )
     return candidates
+
+
+def _whole(part: Any) -> Any:
+    return part
 
 
 def _mean_free_path(material: Material) -> Any:
     return material.mean_free_path
 
 
-def _of_each(where: Where) -> Where:
-    return lambda parts: [where(part) for part in parts]
+def _expanded(
+    parts: Sequence[Any], classes: tuple[int, ...], shared: Where, found: Sequence[Any]
+) -> tuple[Any, ...]:
+    """The parts, each with what it shares with its class as `found` for that."""
+    of_class = [found[number] for number in classes]
+    if shared is _whole:
+        return tuple(of_class)
+    pairs = zip(parts, of_class, strict=True)
+    return tuple(eqx.tree_at(shared, part, shared(own)) for part, own in pairs)
 
 
-def _with(shared: Where, part: Any, other: Any) -> Any:
-    """A part with what it shares with another."""
-    return other if shared is _whole else eqx.tree_at(shared, part, shared(other))
+def _split(
+    expand: Callable[[Sequence[Any]], tuple[Any, ...]], classes: tuple[int, ...], found: Sequence[Any]
+) -> tuple[Any, ...]:
+    """Parameters of each class, from those `found` for the classes that they divide, which `expand` makes
+    parts of."""
+    return _first_of_each(expand(found), classes)
 
 
-def _firsts(parts: Sequence[Any], classes: tuple[int, ...]) -> tuple[Any, ...]:
+def _first_of_each(parts: Sequence[Any], classes: tuple[int, ...]) -> tuple[Any, ...]:
     """The first part of each class."""
     return tuple(parts[classes.index(number)] for number in range(max(classes) + 1))
 

@@ -1,8 +1,7 @@
 """Checkpoints, so that a fit survives being killed: the file is complete at all times and identifies its fit.
 
 A file is one line with a checksum over the rest, one line of JSON that describes the fit, and the arrays, one
-after the other, as `equinox.tree_serialise_leaves` writes them: NumPy's .npy, never pickled. A new file is
-written beside the old one and moved into its place in one operation; the old one is kept as `NAME.before`.
+after the other, as `equinox.tree_serialise_leaves` writes them: NumPy's .npy, never pickled.
 """
 
 import hashlib
@@ -10,7 +9,6 @@ import io
 import itertools
 import json
 import os
-import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,73 +23,40 @@ T = TypeVar("T")
 
 def save(path: Path, state: Any, about: dict[str, Any]) -> None:
     """Write the arrays of `state` and the description `about` of its fit to `path`, replacing its content."""
-    buffer = io.BytesIO()
-    buffer.write(json.dumps(about).encode() + b"\n")
-    eqx.tree_serialise_leaves(buffer, state)
-    with whole_file(path) as part:
-        with part.open("wb") as file:
-            file.write(_checksum_line(buffer))
-            file.write(buffer.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        if path.exists():
-            os.replace(path, before(path))
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    content = io.BytesIO()
+    content.write(json.dumps(about).encode() + b"\n")
+    eqx.tree_serialise_leaves(content, state)
+    with whole_file(path) as part, part.open("wb") as file:
+        file.write(_checksum_line(content))
+        file.write(content.getbuffer())
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]] | None:
-    """The saved state, a tree like `like`, with its description; or None if none was saved. A damaged file is
-    named in a warning, and the previous one is used.
+    """The saved state, a tree like `like`, with its description; or None if none was saved.
 
-    **Raises:** `ValueError` for a checkpoint of another fit than `about` describes (the saved description may
-    have more entries), or of an earlier version.
+    **Raises:** `ValueError` for a damaged file, and for a checkpoint of another fit than `about` describes
+    (the saved description may have more entries).
     """
-    for candidate in (path, before(path)):
-        if not candidate.exists():
-            continue
-        try:
-            saved, leaves = _read(candidate)
-        except (OSError, ValueError) as fault:
-            warnings.warn(
-                f"checkpoint {candidate} is damaged and ignored ({fault}); the fit continues from the "
-                "previous one, or from the start if there is none.",
-                stacklevel=4,
-            )
-            continue
-        if saved is None:
-            raise ValueError(
-                f"checkpoint {candidate} is a zip archive, as earlier versions of jaxvol wrote; this version "
-                "cannot continue from it. Choose another file, or delete this one."
-            )
-        for key, expected in about.items():
-            if not _agree(saved.get(key), expected):
-                raise ValueError(
-                    f"checkpoint {candidate} belongs to another fit: its {key} "
-                    f"{_differing(saved.get(key), expected)}. Choose another file, or delete this one."
-                )
-        return eqx.tree_deserialise_leaves(leaves, like), saved
-    return None
-
-
-def before(path: Path) -> Path:
-    """Path of the previous checkpoint."""
-    return path.with_name(path.name + ".before")
-
-
-def _read(path: Path) -> tuple[dict[str, Any] | None, io.BytesIO]:
-    """The description, None for a zip archive; and the rest of the file."""
+    if not path.exists():
+        return None
     with path.open("rb") as file:
-        first = file.readline()
-        content = io.BytesIO(file.read())
-    if first.startswith(b"PK"):
-        return None, content
+        first, content = file.readline(), io.BytesIO(file.read())
     if first != _checksum_line(content):
-        raise ValueError("its checksum does not match")
-    return json.loads(content.readline()), content
+        raise ValueError(
+            f"checkpoint {path} is damaged, or no checkpoint: its checksum does not match. Choose another "
+            "file, or delete this one."
+        )
+    saved = json.loads(content.readline())
+    for key, expected in about.items():
+        if not _agree(saved.get(key), expected):
+            difference = _differing(saved.get(key), expected)
+            raise ValueError(
+                f"checkpoint {path} belongs to another fit: its {key} {difference}. Choose another file, or "
+                "delete this one."
+            )
+    return eqx.tree_deserialise_leaves(content, like), saved
 
 
 def _checksum_line(content: io.BytesIO) -> bytes:

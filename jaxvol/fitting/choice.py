@@ -211,8 +211,8 @@ def choose(
         raise ValueError(f"{' and '.join(sorted(wrong))} must be given with each Candidate, not to choose.")
     candidates = _list("candidates", candidates)
     start = _check(candidates)
-    seen, unseen = _residuals(residual, views, _list("held_out", held_out), start)
-    judge = HeldOut(unseen, block)
+    training, validation = _residuals(residual, views, _list("held_out", held_out), start)
+    judge = HeldOut(validation, block)
     if judge.blocks < 2:
         raise ValueError(f"block must leave two blocks of the held-out views at least; got {block}.")
 
@@ -221,7 +221,7 @@ def choose(
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=UNDETERMINED)
             found = fit(
-                ModelResidual(seen, candidate.expand),
+                ModelResidual(training, candidate.expand),
                 candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters),
                 constraints=candidate.constraints,
                 where=candidate.where,
@@ -234,10 +234,10 @@ def choose(
     residuals = [judge.residual(f.parameters, c.expand) for c, f in zip(candidates, fits, strict=True)]
     at_start = judge.residual(candidates[0].start, candidates[0].expand)
     norms = (
-        data_norm([seen]) or math.sqrt(2 * fits[0].losses[0]),
-        data_norm(unseen) or math.sqrt(2 * judge.loss(at_start)[0]),
+        data_norm([training]) or math.sqrt(2 * fits[0].losses[0]),
+        data_norm(validation) or math.sqrt(2 * judge.loss(at_start)[0]),
     )
-    rows = _evidence(candidates, fits, residuals, judge, seen.count(), norms, errors, resolution)
+    rows = _evidence(candidates, fits, residuals, judge, training.count(), norms, errors, resolution)
     chosen = [row.supported for row in rows].index(True)
     return Choice(rows, chosen, candidates[chosen].expand(rows[chosen].fit.parameters))
 

@@ -138,8 +138,7 @@ def fit(
     - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, at the end, and when the
       fit is interrupted after its first step (Ctrl-C; `KeyboardInterrupt` is raised again, with a note).
       Before the fit, it is checked that the file can be written. If it exists, the fit continues from it and
-      ends with the same parameters, bit for bit, as an uninterrupted fit (on the same machine). A damaged
-      file is reported in a warning, and the previous one is used.
+      ends with the same parameters, bit for bit, as an uninterrupted fit (on the same machine).
 
     **Returns:** a `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success`, `Fit.message` and
     `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
@@ -150,8 +149,8 @@ def fit(
     "fits under noise".
 
     **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
-    residual that is not finite at the start, a checkpoint of another fit or of an earlier version, and one
-    that cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.
+    residual that is not finite at the start, a checkpoint that is damaged or of another fit, and one that
+    cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.
     """
     for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
         if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
@@ -177,7 +176,7 @@ def fit(
                 run = run.step(solver, problem)
                 show(run)
                 if callback is not None:
-                    callback(len(run.losses), problem.free.forward(run.seen), run.losses[-1])
+                    callback(len(run.losses), problem.free.forward(run.evaluated), run.losses[-1])
                 if checkpointer is not None:
                     checkpointer.save(run, checkpoint_seconds)
     except KeyboardInterrupt as stop:
@@ -221,7 +220,7 @@ class _Run(eqx.Module):
 
     y: FreeVariables
     state: Any
-    seen: FreeVariables
+    evaluated: FreeVariables
     """The solver's point whose loss is known."""
     best: FreeVariables
     triangle: Array | None
@@ -245,11 +244,11 @@ class _Run(eqx.Module):
         return run
 
     def step(self, solver: Any, problem: Problem) -> "_Run":
-        y, state, (loss, seen, triangle), done, result = _advance(solver, problem, self.y, self.state)
+        y, state, (loss, evaluated, triangle), done, result = _advance(solver, problem, self.y, self.state)
         loss = float(loss)
         better = loss < min(self.losses, default=math.inf)
-        best, triangle = (seen, triangle) if better else (self.best, self.triangle)
-        return _Run(y, state, seen, best, triangle, done, result, [*self.losses, loss])
+        best, triangle = (evaluated, triangle) if better else (self.best, self.triangle)
+        return _Run(y, state, evaluated, best, triangle, done, result, [*self.losses, loss])
 
     def ended(self, max_steps: int, patience: int, rtol: float) -> Any:
         """The result if the fit has ended, else None."""

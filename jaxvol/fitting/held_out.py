@@ -135,8 +135,8 @@ def check_apart(training: Sequence[Any], held_out: Sequence[Any]) -> None:
     """Raise `ValueError` if a held-out view is a training view. Of pairs (camera, image), cameras are
     compared: another picture by the same camera tells nothing of other views."""
     for number, view in enumerate(held_out):
-        for other, seen in enumerate(training):
-            if _same(_camera(view), _camera(seen)):
+        for other, fitted in enumerate(training):
+            if eqx.tree_equal(_camera(view), _camera(fitted)):
                 raise ValueError(
                     f"held_out[{number}] must not be among the views that are fitted; it is the same as "
                     f"number {other} of these. Hold out views of other cameras."
@@ -146,12 +146,3 @@ def check_apart(training: Sequence[Any], held_out: Sequence[Any]) -> None:
 def _camera(view: Any) -> Any:
     """The camera of a pair (camera, image), or any other view itself."""
     return view[0] if isinstance(view, tuple | list) and view and isinstance(view[0], Camera) else view
-
-
-def _same(view: Any, other: Any) -> bool:
-    if view is other:
-        return True
-    if jax.tree.structure(view) != jax.tree.structure(other):
-        return False
-    pairs = list(zip(jax.tree.leaves(view), jax.tree.leaves(other), strict=True))
-    return all(np.array_equal(a, b) for a, b in pairs)

@@ -78,7 +78,7 @@ FAULTS: list[Fault] = [
     Fault(
         "viewer: a fine image is finished before a newer request is drawn",
         "app.viewer.worker:Worker._draw",
-        lambda draw: lambda self, request, asked: [self._coarse(request, asked), *self._fine(request)][:0],
+        lambda draw: lambda self, request: [self._coarse(request), *self._fine(request)][:0],
         ("app/viewer/test_worker.py::test_a_newer_request_cancels_a_fine_image_between_two_parts",),
     ),
     Fault(

@@ -1,7 +1,8 @@
 """Looks at volumes: `view` in a notebook, and `serve` as a page of its own, which `jaxvol view FILE` shows.
 
-One small model (`model`: camera, transfer function, march and light in a `State`, drawn by a thread, coarse
-while it changes and fine at rest) has two faces, `notebook` and `page`, which only show and ask.
+One model (`model`: camera, transfer function, march and light in a `State`, drawn by a thread, coarse
+while it changes and fine at rest) and one description of its controls (`controls`) have two faces,
+`notebook` and `page`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from ...scene.camera import Camera
 from ...scene.transfer import TransferFunction
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs_by_default
-from .start import begin
+from .state import initial
 
 
 if TYPE_CHECKING:
@@ -40,9 +41,9 @@ def view(
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
     return. Beside the image are window and level, the points of the transfer function in front of the
     volume's histogram, or its labels, the step, and every transform and the light to be turned on and off.
-    While something changes, the image is as coarse as it must be to follow within some 150 ms
-    (`viewer.pace`); at rest it has all pixels. Its time, its step and an estimate of its error are shown
-    live. It needs `pip install jaxvol[notebooks]`.
+    While something changes, the image is as coarse as it must be to follow within some 150 ms; at rest it has
+    all pixels. Its time, its step and an estimate of its error are shown live. It needs
+    `pip install jaxvol[notebooks]`.
 
     The first image, and the first one with another set of transforms, is compiled, which takes seconds;
     compiled programs are kept for the next time, as by `keep_programs`.
@@ -78,7 +79,7 @@ def view(
         raise ImportError(f"view needs {fault.name}: pip install jaxvol[notebooks]") from fault
     keep_programs_by_default()
     how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
-    return NotebookView(*begin(volume, transfer, camera, march, size=size, **how))
+    return NotebookView(*initial(volume, transfer, camera, march, size=size, **how))
 
 
 def serve(
@@ -117,4 +118,4 @@ def serve(
     port = integer("port", port, 1, 65535)
     keep_programs_by_default()
     how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
-    return Page(*begin(volume, transfer, camera, march, size=(640, 480), **how), port=port, title=title)
+    return Page(*initial(volume, transfer, camera, march, size=(640, 480), **how), port=port, title=title)

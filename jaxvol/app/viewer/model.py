@@ -1,179 +1,162 @@
 """A viewer without a face: its state, and a thread that draws it."""
 
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-from jaxtyping import UInt8
-
-from .drawing import Content, Drawing, Pixels, place
-from .pace import Pace
-from .state import State
-from .tiles import SIDE, Grid
+from .state import Scene, State
+from .tiles import Grid, Pixels, TileRenderer, estimated_error
 from .worker import REST, Worker
 
 
-EVERY = 0.25
-"""Seconds between two looks at a fine image that is being drawn."""
+Stage = Literal["coarse", "drawing", "fine"]
+"""Of an image: coarse; fine, but for parts in whose place there is the coarse one; fine."""
+
+JPEG_QUALITY: dict[Stage, int] = {"coarse": 85, "drawing": 88, "fine": 94}
+"""With which images are sent to a browser."""
+
+MAX_SIDE = 2048
+"""Pixels of a view's width and height."""
+
+INTERVAL = 0.25
+"""Seconds after which an unfinished fine image is shown again."""
+
+BUDGET = 0.06
+"""Seconds that a coarse image may take: of the 150 ms in which it is to follow the pointer, what is left
+once a tile that was being drawn is finished, and the image was encoded and sent to the browser."""
+
+LEVELS = ((1, 4.0), (1, 2.0), (1, 1.0), (2, 1.0), (4, 1.0), (6, 1.0), (9, 1.0), (16, 1.0))
+"""Coarse images, from the coarsest on: tiles, and how many times as long their steps are. One takes up to
+some two times as long as the one before."""
+
+FIRST_LEVEL = 2
 
 
-@dataclass(frozen=True)
-class Frame:
-    """An image for a face to show.
+@dataclass
+class CoarseLevel:
+    """The finest coarse image that is drawn within `BUDGET`: an index of `LEVELS`."""
 
-    - `pixels`: sRGB; the face stretches them over the view.
-    - `stage`: `"coarse"`; `"drawing"`, a fine image of which parts are missing, in whose place there is the
-      coarse one; `"fine"`.
-    - `state`: that it shows. `seconds`: that it took to draw; `latency`: from the request for it until it was
-      drawn.
-    - `step`: distance between its samples, voxels.
-    """
-
-    pixels: Pixels
-    stage: Literal["coarse", "drawing", "fine"]
-    state: State
-    seconds: float
-    latency: float
-    step: float
+    index: int = FIRST_LEVEL
 
     @property
-    def quality(self) -> int:
-        """Of the JPEG as which it is sent to a browser."""
-        return {"coarse": 85, "drawing": 88, "fine": 94}[self.stage]
+    def tiles(self) -> int:
+        """How many tiles the next coarse image has."""
+        return LEVELS[self.index][0]
+
+    @property
+    def step_factor(self) -> float:
+        """How many times as long its steps are."""
+        return LEVELS[self.index][1]
+
+    def adapt(self, seconds: float, fine_tiles: int) -> None:
+        """To the time that the last one took, without compilation. A coarse image has at most half as many
+        tiles as the fine one."""
+        if seconds > BUDGET:
+            self.index -= 2 if seconds > 2 * BUDGET else 1
+        elif seconds < BUDGET / 2.5:
+            self.index += 1
+        allowed = sum(tiles <= max(1, fine_tiles // 2) for tiles, _ in LEVELS)
+        self.index = min(max(self.index, 0), allowed - 1)
 
 
-class Model:
+class Model(Worker[State]):
     """The state of a viewer, drawn whenever it changes.
 
     **Arguments:**
 
-    - `content`: what is looked at. `state`: how, at first.
-    - `show`: called with each `Frame`, and `tell` with what there is to say, two lines, in the thread that
-      draws.
+    - `scene`: what is viewed. `state`: how, at first.
+    - `show`: called with an image, which is to be stretched over the view, and its `Stage`; and `tell` with a
+      status of two lines. In the thread that draws, and no more once it is closed.
+    - `rest`: seconds without a change after which a fine image is begun.
     """
 
     def __init__(
         self,
-        content: Content,
+        scene: Scene,
         state: State,
-        show: Callable[[Frame], None],
+        show: Callable[[Pixels, Stage], None],
         tell: Callable[[str], None],
         rest: float = REST,
     ):
-        self.content, self.state = content, state
-        self._faces = show, tell
-        self._pace: dict[Any, Pace] = {}
-        self._last: Frame | None = None
-        self._worker = Worker(self._coarse, self._fine, self._failed, rest)
+        self.scene, self.state = scene, state
+        self._face = show, tell
+        self._levels: dict[Any, CoarseLevel] = {}
+        self._last: Pixels | None = None
+        super().__init__(rest)
 
     def change(self, **changes: Any) -> None:
         """Replace fields of the state, and draw it."""
-        self.state = replace(self.state, **changes)
-        self._worker.ask(self.state)
+        self.apply(lambda state: replace(state, **changes))
 
-    def apply(self, change: Callable[[State], State]) -> str | None:
+    def apply(self, change: Callable[[State], State]) -> None:
         """Change the state by a function of it, and draw it. Bad input, such as points that make no transfer
-        function, changes nothing: what is wrong with it is told, and returned."""
+        function, changes nothing: what is wrong with it is told."""
         try:
-            changed = change(self.state)
-            if changed.look is not self.state.look:
-                changed.look.padded()
+            self.state = change(self.state)
         except ValueError as fault:
             self._tell(str(fault))
-            return str(fault)
-        self.state = changed
-        self._worker.ask(self.state)
-        return None
+        else:
+            self.ask(self.state)
 
-    def drag(self, right: float, down: float, *, pan: bool = False) -> None:
-        """A drag by these pixels of the view."""
-        height = self.state.size[1]
-        move = self.state.orbit.panned if pan else self.state.orbit.turned
-        self.change(orbit=move(right / height, down / height))
+    def resize(self, width: float, height: float, **changes: Any) -> None:
+        """Change the view to this many pixels, or to fewer if it is wider or higher than `MAX_SIDE`; and
+        replace other fields of the state."""
+        if math.isfinite(width) and math.isfinite(height) and min(width, height) >= 1:
+            scale = min(1.0, MAX_SIDE / max(width, height))
+            size = max(1, round(width * scale)), max(1, round(height * scale))
+            self.change(size=size, **changes)
 
-    def zoom(self, factor: float) -> None:
-        """What is seen grows by this factor."""
-        self.change(orbit=self.state.orbit.zoomed(factor))
-
-    def draw(self) -> None:
-        """Draw the state again."""
-        self._worker.ask(self.state)
-
-    def wait(self, seconds: float = 600) -> bool:
-        """Wait until the state is drawn, fine; False if that takes longer."""
-        return self._worker.wait(seconds)
-
-    def close(self, *, wait: bool = True) -> None:
-        """Draw no more, and show no more. `wait` until a part that was begun is finished."""
-        self._worker.close(wait=wait)
-
-    def _show(self, frame: Frame) -> None:
-        self._last = frame
-        if not self._worker.closed:
-            self._faces[0](frame)
+    def _show(self, pixels: Pixels, stage: Stage, seconds: float, step: float) -> str:
+        """Show an image. Returns what there is to say of it. `step`: voxels."""
+        self._last = pixels
+        if not self._closed:
+            self._face[0](pixels, stage)
+        height, width, _ = pixels.shape
+        return f"{stage}: {width} x {height}, step {step:.3g} voxels\n{1e3 * seconds:.0f} ms"
 
     def _tell(self, text: str) -> None:
-        if not self._worker.closed:
-            self._faces[1](text)
+        if not self._closed:
+            self._face[1](text)
 
-    def _coarse(self, state: State, asked: float) -> None:
-        drawing = Drawing(self.content, state)
-        new = drawing.program not in self._pace
-        pace = self._pace.setdefault(drawing.program, Pace())
-        if new:
+    def _coarse(self, request: State) -> None:
+        renderer = TileRenderer(self.scene, request)
+        if renderer.program_key not in self._levels:
             self._tell("compiling …\nfor these transforms; the program is kept for the next time")
             begun = time.perf_counter()
-            drawing.tile(Grid(1, 1, (SIDE, SIDE)), 0, 0)
+            renderer.overview()
             self._tell(f"compiled in {time.perf_counter() - begun:.1f} s\n")
-        fine = Grid.fine(state.size)
-        begun, coarser = time.perf_counter(), pace.coarser
-        pixels = Drawing(self.content, state, coarser).image(Grid.coarse(state.size, pace.tiles))
-        done = time.perf_counter()
-        pace.took(done - begun, len(fine))
-        frame = Frame(pixels, "coarse", state, done - begun, done - asked, state.step * coarser)
-        self._show(frame)
-        self._tell(_timing(frame))
+        level = self._levels.setdefault(renderer.program_key, CoarseLevel())
+        begun, step_factor = time.perf_counter(), level.step_factor
+        pixels = TileRenderer(self.scene, request, step_factor).image(Grid.coarse(request.size, level.tiles))
+        seconds = time.perf_counter() - begun
+        level.adapt(seconds, len(Grid.fine(request.size)))
+        self._tell(self._show(pixels, "coarse", seconds, request.step * step_factor))
 
-    def _fine(self, state: State) -> Iterator[None]:
-        drawing, grid, begun = Drawing(self.content, state), Grid.fine(state.size), time.perf_counter()
+    def _fine(self, request: State) -> Generator[None]:
         assert self._last is not None
-        pixels, shown = _stretched(self._last.pixels, grid), begun
-        width, height = grid.size
-        tiles = grid.inside_out()
+        renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
+        pixels, (width, height) = grid.canvas(self._last), grid.size
+        begun = shown = time.perf_counter()
 
-        def show(stage: Literal["drawing", "fine"], more: str) -> None:
-            took = time.perf_counter() - begun
-            frame = Frame(pixels[:height, :width].copy(), stage, state, took, took, state.step)
-            self._show(frame)
-            self._tell(f"{_timing(frame)}{more}")
+        def show(stage: Stage) -> str:
+            seconds = time.perf_counter() - begun
+            return self._show(pixels[:height, :width].copy(), stage, seconds, request.step)
 
-        for count, (column, row) in enumerate(tiles):
-            if time.perf_counter() - shown > EVERY:
+        for count, (column, row) in enumerate(grid.center_first()):
+            if time.perf_counter() - shown > INTERVAL:
                 shown = time.perf_counter()
-                show("drawing", f", {count} of {len(tiles)} tiles")
-            pixels[place(column, row)] = drawing.tile(grid, column, row)
+                self._tell(f"{show('drawing')}, {count} of {len(grid)} tiles")
+            renderer.draw(pixels, grid, column, row)
             yield
-        show("fine", ", estimating its error …")
-        fine = self._last
-        for error in drawing.error():
-            yield
-            if error is not None:
-                self._tell(f"{_timing(fine)}, RMSE {error:.2g} (estimate)")
+        summary = show("fine")
+        self._tell(f"{summary}, estimating its error …")
+        image = renderer.overview()
+        yield
+        doubled = TileRenderer(self.scene, request, 2.0).overview()
+        error = estimated_error(image, doubled, self.scene.quadrature)
+        self._tell(f"{summary}, RMSE {error:.2g} (estimate)")
 
     def _failed(self, fault: Exception) -> None:
         self._tell(f"not drawn:\n{' '.join(str(fault).split())}")
-
-
-def _timing(frame: Frame) -> str:
-    height, width, _ = frame.pixels.shape
-    return f"{frame.stage}: {width} x {height}, step {frame.step:.3g} voxels\n{1e3 * frame.seconds:.0f} ms"
-
-
-def _stretched(pixels: Pixels, grid: Grid) -> UInt8[np.ndarray, "height width 3"]:
-    """An image, as large as a grid of tiles, each pixel the nearest one."""
-    (rows, columns, _), (width, height) = pixels.shape, grid.size
-    row = np.minimum(np.arange(grid.rows * SIDE) * rows // height, rows - 1)
-    column = np.minimum(np.arange(grid.columns * SIDE) * columns // width, columns - 1)
-    return pixels[row[:, None], column[None, :]]

@@ -2,25 +2,30 @@
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable
 from typing import Any
 
 import ipywidgets
+import numpy as np
+from rendercanvas.anywidget import RenderCanvas
 
 from ...lighting.shading import Lighting
 from ...march.march import March
 from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from .canvas import PromptCanvas
-from .drawing import Content
-from .model import Frame, Model
-from .notebook_look import WIDE, look_controls
-from .state import State
+from .controls import Buttons, Control, Dropdown, Field, Html, Input, controls_of
+from .model import JPEG_QUALITY, Model, Stage
+from .state import Scene, State
+from .tiles import Pixels
 
 
-PER_NOTCH = 1.2
+ZOOM_PER_NOTCH = 1.2
 """How much nearer one notch of a mouse wheel brings the camera, which browsers report as 100."""
+
+WIDE, LABEL = {"width": "330px"}, {"description_width": "90px"}
+"""Layout and style of what stands in a line of its own."""
 
 
 class NotebookView(ipywidgets.HBox):
@@ -31,10 +36,10 @@ class NotebookView(ipywidgets.HBox):
     - `canvas`: the image, a canvas of rendercanvas.
     - `close()` ends the viewer's thread. A cell that shows another viewer does not.
 
-    **Arguments:** `content`, `state`: what is looked at, and how at first. `view` makes them.
+    **Arguments:** `scene`, `state`: what is looked at, and how at first. `view` makes them.
     """
 
-    def __init__(self, content: Content, state: State):
+    def __init__(self, scene: Scene, state: State):
         super().__init__()
         self._loop: asyncio.AbstractEventLoop | None = None
         with contextlib.suppress(RuntimeError):
@@ -44,17 +49,19 @@ class NotebookView(ipywidgets.HBox):
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
         self._status = ipywidgets.HTML(layout=WIDE)
-        self.model = Model(content, state, self._show, self._tell)
+        self.model = Model(scene, state, self._show, self._tell)
         self._first = state
-        self._at: tuple[float, float] | None = None
+        self._pointer: tuple[float, float] | None = None
+        self._widgets: list[tuple[Any, Html | Input]] = []
+        self._updating = False
         self.children = (self.canvas, ipywidgets.VBox(self._controls(), layout={"margin": "0 0 0 12px"}))
-        self.model.draw()
+        self.model.ask(state)
 
     @property
     def volume(self) -> Volume:
         """What is looked at. Of voxels that are labels, shown without a transfer function, it is a smooth
         volume with them."""
-        return self.model.content.volume
+        return self.model.scene.volume
 
     @property
     def camera(self) -> Camera:
@@ -64,17 +71,17 @@ class NotebookView(ipywidgets.HBox):
     @property
     def transfer(self) -> Transfer:
         """The transfer function."""
-        return self.model.state.look.transfer()
+        return self.model.state.transfer
 
     @property
     def march(self) -> March:
         """The march of the fine image."""
-        return self.model.content.choices.march(self.model.state)
+        return self.model.scene.march(self.model.state)
 
     @property
     def lighting(self) -> Lighting | None:
         """The light, None if it is off."""
-        return self.model.content.choices.light(self.model.state)
+        return self.model.scene.light(self.model.state)
 
     def close(self) -> None:
         """Remove the widget, and end its thread."""
@@ -85,8 +92,8 @@ class NotebookView(ipywidgets.HBox):
 
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
-    def _show(self, frame: Frame) -> None:
-        self._in_loop(lambda: self.canvas.show(frame.pixels, frame.quality))
+    def _show(self, pixels: Pixels, stage: Stage) -> None:
+        self._in_loop(lambda: self.canvas.show(pixels, JPEG_QUALITY[stage]))
 
     def _tell(self, text: str) -> None:
         self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))
@@ -100,64 +107,118 @@ class NotebookView(ipywidgets.HBox):
     def _pointed(self, event: dict[str, Any]) -> None:
         kind, at = event["event_type"], (float(event["x"]), float(event["y"]))
         if kind == "wheel":
-            self.model.zoom(PER_NOTCH ** (-float(event["dy"]) / 100))
+            factor = ZOOM_PER_NOTCH ** (-float(event["dy"]) / 100)
+            self.model.change(orbit=self.model.state.orbit.zoomed(factor))
         elif kind == "pointer_down":
-            self._at = at
+            self._pointer = at
         elif kind == "pointer_up":
-            self._at = None
-        elif (
-            self._at is not None and event["buttons"]
-        ):  # one without may come late, after the button went down
-            ratio = self.canvas.get_pixel_ratio()
-            moved = [(new - old) * ratio for new, old in zip(at, self._at, strict=True)]
-            self._at = at
+            self._pointer = None
+        elif self._pointer is not None and event["buttons"]:
+            # a move without a button may come late, after the button went down
+            scale = self.canvas.get_pixel_ratio() / self.model.state.size[1]
+            right, down = ((new - old) * scale for new, old in zip(at, self._pointer, strict=True))
+            self._pointer, orbit = at, self.model.state.orbit
             pans = "Shift" in event["modifiers"] or 1 not in event["buttons"]
-            self.model.drag(*moved, pan=pans)
+            self.model.change(orbit=orbit.panned(right, down) if pans else orbit.turned(right, down))
 
     def _resized(self, event: dict[str, Any]) -> None:
         ratio = float(event["pixel_ratio"])
-        size = event["width"] * ratio, event["height"] * ratio
-        if min(size) >= 1:
-            self.model.apply(lambda state: state.with_size(*size))
+        self.model.resize(event["width"] * ratio, event["height"] * ratio)
 
-    def _reset(self, event: dict[str, Any] | None = None) -> None:
+    def _reset(self, _: Any = None) -> None:
         self.model.change(orbit=self._first.orbit)
 
     def _controls(self) -> list[ipywidgets.Widget]:
-        state, choices = self.model.state, self.model.content.choices
-        step = ipywidgets.FloatLogSlider(
-            value=state.step, base=2, min=-4, max=4, step=0.25, description="step (voxels)", layout=WIDE
-        )
-        step.style.description_width = "initial"  # pyright: ignore[reportAttributeAccessIssue]
-        step.observe(lambda change: self.model.apply(lambda s: s.with_step(change["new"])), "value")
-        light = _box("light", state.lit, lambda on: self.model.change(lit=on))
-        reset = ipywidgets.Button(description="reset view", layout={"width": "110px"})
-        reset.on_click(lambda _: self._reset())
-        self._look = look_controls(self.model)
-        return [
-            self._status,
-            _heading("transfer function"),
-            self._look,
-            _heading("march and light"),
-            step,
-            *(self._switch(name) for name in choices.names),
-            *([] if choices.lighting is None else [light]),
-            reset,
-        ]
+        shown: list[ipywidgets.Widget] = [self._status]
+        for heading, controls in controls_of(self.model).items():
+            shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
+        reset = Buttons("", ("reset view",), self._reset)
+        return [*shown, self._widget(reset)]
 
-    def _switch(self, name: str) -> ipywidgets.Checkbox:
-        return _box(
-            name,
-            name in self.model.state.on,
-            lambda on: self.model.apply(lambda state: state.with_transform(name, on)),
-        )
+    def _widget(self, control: Control) -> ipywidgets.Widget:
+        """A widget that shows what a control describes, and changes the model."""
+        if isinstance(control, Buttons):
+            buttons = [ipywidgets.Button(description=text) for text in control.options]
+            for button in buttons:
+                button.on_click(lambda pressed: self._change(control.press, pressed.description))
+            return ipywidgets.HBox(buttons)
+        if isinstance(control, Html):
+            widget = ipywidgets.HTML(control.get(), layout=WIDE)
+        else:
+            widget = _input_widget(control)
+            widget.observe(lambda event: self._change(control.set, event["new"]), "value")
+        self._widgets.append((widget, control))
+        return widget
+
+    def _change(self, change: Callable[[Any], None], value: Any) -> None:
+        """Change the model, and let all controls show it; not while they are being made to."""
+        if self._updating:
+            return
+        change(value)
+        self._updating = True
+        try:
+            for widget, control in self._widgets:
+                if isinstance(control, Dropdown):
+                    widget.options = control.options()
+                widget.value = control.get()
+        finally:
+            self._updating = False
 
 
-def _heading(text: str) -> ipywidgets.HTML:
-    return ipywidgets.HTML(f"<b>{text}</b>")
+def _input_widget(control: Input) -> Any:
+    how: dict[str, Any] = {"value": control.get(), "description": control.label, "layout": WIDE}
+    if isinstance(control, Field) and control.kind == "checkbox":
+        return ipywidgets.Checkbox(indent=False, **how)
+    how["style"] = LABEL
+    if isinstance(control, Field):
+        return {"number": ipywidgets.FloatText, "color": ipywidgets.ColorPicker}[control.kind](**how)
+    if isinstance(control, Dropdown):
+        return ipywidgets.Dropdown(options=control.options(), **how)
+    if control.logarithmic:
+        low, high = math.log2(control.low), math.log2(control.high)
+        return ipywidgets.FloatLogSlider(base=2, min=low, max=high, step=0.25, **how)
+    limits = {"min": control.low, "max": control.high, "step": control.step}
+    return ipywidgets.FloatSlider(readout_format=".4g", **limits, **how)
 
 
-def _box(name: str, on: bool, switch: Callable[[bool], Any]) -> ipywidgets.Checkbox:
-    box = ipywidgets.Checkbox(value=on, description=name, indent=False, layout=WIDE)
-    box.observe(lambda change: switch(bool(change["new"])), "value")
-    return box
+class PromptCanvas(RenderCanvas):
+    """Calls handlers of events at once, and sends an image as soon as fewer than two wait for the browser.
+
+    rendercanvas does both at ticks of a scheduler, at most `max_fps` a second, and none while an image waits
+    for the browser: some 10 ms for the event, and as many for the image, of the 150 in which a coarse image
+    is to follow the pointer. It sends what has been shown for 0.3 s once more, without loss, and its
+    compression holds up events for 25 ms; here images are sent once, as JPEG, those that are to stay in a
+    better quality. Its browser's part keeps a move of the pointer back for 20 ms, to join it with those that
+    follow; there is no need for this, since a newer request replaces an older one.
+
+    `pixels`: of the next image.
+    """
+
+    _esm = RenderCanvas._esm.replace("setThrottle(20)", "setThrottle(0)")
+    pixels: Pixels | None = None
+
+    def __init__(self, **how: Any):
+        super().__init__(**how)
+        self._bitmap = self.get_bitmap_context()
+        self.request_draw(self._set_bitmap)
+
+    def show(self, pixels: Pixels, quality: int) -> None:
+        """Send an image, in place of those that have not been sent. In the thread of the event loop.
+        `quality`: of JPEG, below 100."""
+        self.pixels, self._quality = pixels, quality
+        self.request_draw()
+
+    def request_draw(self, draw_function: Callable[[], None] | None = None) -> None:
+        super().request_draw(draw_function)
+        self._rc_request_draw()
+
+    def submit_event(self, event: dict[str, Any]) -> None:
+        super().submit_event(event)
+        self._events.flush()
+
+    def _set_bitmap(self) -> None:
+        if self.pixels is not None:
+            self._bitmap.set_bitmap(np.pad(self.pixels, ((0, 0), (0, 0), (0, 1)), constant_values=255))
+
+    def _rfb_schedule_lossless_draw(self, array: Any, delay: float = 0.3) -> None:
+        pass

@@ -18,9 +18,6 @@ Vector = Float[np.ndarray, "3"]
 STEEPEST = math.radians(89)
 """The camera stays so far from the axis that it turns about, seen from which nothing says what is up."""
 
-NEAREST, FARTHEST = 1e-3, 1e3
-"""Distances from the focal point between which a zoom ends, in units of the first one."""
-
 
 @dataclass(frozen=True)
 class Orbit:
@@ -29,7 +26,6 @@ class Orbit:
     - `focal_point`: world point. `toward`: unit direction from there to the camera. `distance`: between them,
       world length.
     - `view_up`: unit direction about which it turns. `view_angle`: degrees, over the height of the image.
-    - `first`: the distance at which it began.
     """
 
     focal_point: Vector
@@ -37,7 +33,6 @@ class Orbit:
     distance: float
     view_up: Vector
     view_angle: float
-    first: float
 
     @classmethod
     def of(cls, camera: Camera) -> "Orbit":
@@ -50,18 +45,11 @@ class Orbit:
 
     @classmethod
     def at(cls, position: object, focal_point: object, view_up: object, view_angle: float) -> "Orbit":
-        """A camera at a world position. One that looks along `view_up` is turned away from it a little.
-
-        **Raises:** `ValueError` for what is not finite, a position at the focal point and a `view_up` of
-        0."""
+        """A camera at a world position. One that looks along `view_up` is turned away from it a little."""
         position, focal, up = (np.asarray(v, np.float64) for v in (position, focal_point, view_up))
         offset = position - focal
         distance, length = float(np.linalg.norm(offset)), float(np.linalg.norm(up))
-        numbers = [*position, *focal, *up, view_angle]
-        if not np.isfinite(numbers).all() or distance == 0 or length == 0 or not 0 < view_angle < 180:
-            raise ValueError(f"a camera at {position} that looks at {focal}, with {up} up, is none.")
-        made = cls(focal, offset / distance, distance, up / length, view_angle, distance)
-        return made.turned(0, 0)
+        return cls(focal, offset / distance, distance, up / length, view_angle).turned(0, 0)
 
     def turned(self, right: float, down: float) -> "Orbit":
         """After a drag that turns what is seen, as if the pointer held its front: by half a turn for a drag
@@ -88,8 +76,7 @@ class Orbit:
 
     def zoomed(self, factor: float) -> "Orbit":
         """Nearer by this factor: what lies at the focal point appears so many times as large."""
-        distance = min(max(self.distance / factor, NEAREST * self.first), FARTHEST * self.first)
-        return replace(self, distance=distance)
+        return replace(self, distance=self.distance / factor)
 
     @property
     def position(self) -> Vector:

@@ -6,19 +6,19 @@ import io
 import logging
 import math
 import re
-from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import viser
+from matplotlib.colors import to_rgb
 from websockets.exceptions import ConnectionClosed
 
-from .drawing import Content
-from .model import Frame, Model
+from .controls import Buttons, Control, Dropdown, Html, Input, Slider, controls_of
+from .model import JPEG_QUALITY, Model, Stage
 from .orbit import Orbit
-from .page_look import add_look, answer
-from .state import LONGEST, SHORTEST, State
+from .state import Scene, State
+from .tiles import Pixels
 
 
 HOST = "127.0.0.1"
@@ -48,13 +48,13 @@ class Page:
     - `models`: of the pages that are open, by viser's numbers of clients.
     - `close()` ends it.
 
-    **Arguments:** `content`, `state`: what is looked at, and how at first; `serve` makes them. `port` and
+    **Arguments:** `scene`, `state`: what is looked at, and how at first; `serve` makes them. `port` and
     `title`: as for `serve`.
     """
 
-    def __init__(self, content: Content, state: State, *, port: int = 8080, title: str = "jaxvol"):
-        self._content, self._state = content, state
-        low, high = (np.asarray(corner, np.float64) for corner in content.volume.corners)
+    def __init__(self, scene: Scene, state: State, *, port: int = 8080, title: str = "jaxvol"):
+        self._scene, self._state = scene, state
+        low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
         # viser's cameras have limits that suit scenes of about this size
         self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
         self.models: dict[int, Model] = {}
@@ -69,10 +69,8 @@ class Page:
         self._server.scene.set_up_direction(tuple(state.orbit.view_up))
         first = self._server.initial_camera
         first.up = tuple(state.orbit.view_up)
-        first.position, first.look_at = (
-            self._shown(state.orbit.position),
-            self._shown(state.orbit.focal_point),
-        )
+        first.position = self._to_viser(state.orbit.position)
+        first.look_at = self._to_viser(state.orbit.focal_point)
         first.fov = math.radians(state.orbit.view_angle)
         self._server.on_client_connect(self._opened)
         self._server.on_client_disconnect(self._closed)
@@ -95,7 +93,7 @@ class Page:
                 while True:
                     await socket.recv(decode=False)
 
-    def _shown(self, point: np.ndarray) -> np.ndarray:
+    def _to_viser(self, point: np.ndarray) -> np.ndarray:
         """A world point in viser's scene."""
         return (point - self._center) / self._radius
 
@@ -105,14 +103,14 @@ class Page:
         return Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
 
     async def _opened(self, client: viser.ClientHandle) -> None:
-        panel = _Panel(client, self._content, self._state)
-        self.models[client.client_id] = panel.model
+        model = _Panel(client, self._scene, self._state).model
+        self.models[client.client_id] = model
 
-        @client.camera.on_update
-        async def _(camera: viser.CameraHandle) -> None:
-            panel.look(self._orbit(camera), camera.image_width, camera.image_height)
+        async def turned(camera: viser.CameraHandle) -> None:
+            model.resize(camera.image_width, camera.image_height, orbit=self._orbit(camera))
 
-        panel.look(self._orbit(client.camera), client.camera.image_width, client.camera.image_height)
+        client.camera.on_update(turned)
+        await turned(client.camera)
 
     async def _closed(self, client: viser.ClientHandle) -> None:
         model = self.models.pop(client.client_id, None)
@@ -121,40 +119,81 @@ class Page:
 
 
 class _Panel:
-    """The controls of one page."""
+    """The model and the controls of one page."""
 
-    def __init__(self, client: viser.ClientHandle, content: Content, state: State):
-        self.client, self.gui = client, client.gui
-        self.status = self.gui.add_markdown("starting …  \n")
-        self.model = Model(content, state, self._show, self._tell)
-        with self.gui.add_folder("transfer function"):
-            add_look(self.gui, self.model)
-        with self.gui.add_folder("march and light"):
-            self._march(state)
+    def __init__(self, client: viser.ClientHandle, scene: Scene, state: State):
+        self.client = client
+        self.status = client.gui.add_markdown("starting …  \n")
+        self.model = Model(scene, state, self._show, self._tell)
+        self._widgets: list[tuple[Any, Control]] = []
+        for heading, controls in controls_of(self.model).items():
+            with client.gui.add_folder(heading):
+                for control in controls:
+                    self._add(control)
 
-    def look(self, orbit: Orbit, width: float, height: float) -> None:
-        """From where, and at how many pixels."""
-        self.model.apply(lambda state: replace(state.with_size(width, height), orbit=orbit))
-
-    def _show(self, frame: Frame) -> None:
-        self.client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=frame.quality)
+    def _show(self, pixels: Pixels, stage: Stage) -> None:
+        quality = JPEG_QUALITY[stage]
+        self.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=quality)
         self.client.flush()
 
     def _tell(self, text: str) -> None:
         self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
 
-    def _march(self, state: State) -> None:
-        choices = self.model.content.choices
-        step = self.gui.add_slider("step (voxels)", SHORTEST, float(LONGEST), SHORTEST, state.step)
-        answer(step, lambda: self.model.apply(lambda s: s.with_step(step.value)))
-        for name in choices.names:
-            self._switch(name, name in state.on)
-        if choices.lighting is None:
-            return
-        light = self.gui.add_checkbox("light", state.lit)
-        answer(light, lambda: self.model.change(lit=bool(light.value)))
+    def _add(self, control: Control) -> None:
+        widget = _widget(self.client.gui, control)
+        self._widgets.append((widget, control))
 
-    def _switch(self, name: str, on: bool) -> None:
-        may_wrap = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", name)  # where words meet
-        box = self.gui.add_checkbox(may_wrap, on)
-        answer(box, lambda: self.model.apply(lambda s: s.with_transform(name, bool(box.value))))
+        # viser runs coroutines one after the other, and plain functions in any order
+        async def changed(event: Any) -> None:
+            if event.client is None:  # changed by `_update`
+                return
+            if isinstance(control, Buttons):
+                control.press(widget.value)
+            elif isinstance(control, Input):
+                control.set(_from_viser(widget.value))
+            for each in self._widgets:
+                _update(*each)
+
+        if isinstance(control, Buttons):
+            widget.on_click(changed)
+        elif isinstance(control, Input):
+            widget.on_update(changed)
+
+
+def _widget(gui: viser.GuiApi, control: Control) -> Any:
+    if isinstance(control, Html):
+        return gui.add_html(control.get())
+    if isinstance(control, Buttons):
+        return gui.add_button_group(control.label, control.options)
+    label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
+    value = _to_viser(control.get())
+    if isinstance(control, Slider):
+        return gui.add_slider(label, control.low, control.high, control.step, value)
+    if isinstance(control, Dropdown):
+        return gui.add_dropdown(label, tuple(control.options()), initial_value=value)
+    add = {"number": gui.add_number, "checkbox": gui.add_checkbox, "color": gui.add_rgb}[control.kind]
+    return add(label, value)
+
+
+def _update(widget: Any, control: Control) -> None:
+    """Let a widget show what the model has."""
+    if isinstance(control, Html):
+        widget.content = control.get()
+    if not isinstance(control, Input):
+        return
+    if isinstance(control, Dropdown):
+        widget.options = control.options()
+    value = _to_viser(control.get())
+    # what only rounding has changed is not sent back, or a slider would lag behind in a drag
+    if not (isinstance(value, float) and math.isclose(value, widget.value, rel_tol=1e-5)):
+        widget.value = value
+
+
+def _to_viser(value: Any) -> Any:
+    """viser's colours are three integers."""
+    is_color = isinstance(value, str) and value.startswith("#")
+    return tuple(round(255 * channel) for channel in to_rgb(value)) if is_color else value
+
+
+def _from_viser(value: Any) -> Any:
+    return "#{:02x}{:02x}{:02x}".format(*value) if isinstance(value, tuple) else value

@@ -1,80 +1,181 @@
-"""What does a viewer show? All that its controls change, in one value that never changes itself."""
+"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace."""
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any, get_args
 
+import numpy as np
+
+from ..._util.checks import described, finite_array
+from ...arguments import check_arguments
+from ...compositing.compositing import Compositing
+from ...compositing.modes import Mode, compositing_of
+from ...compositing.projections import Average
+from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
-from .look import Look
+from ...march.transforms import (
+    AdaptiveSampling,
+    AlphaCorrection,
+    EarlyTermination,
+    EmptySpaceJitter,
+    Jitter,
+    SpaceLeaping,
+)
+from ...scene.camera import Camera
+from ...scene.occupancy import BLOCK
+from ...scene.space import median_node_distance
+from ...scene.volume import Volume
+from ..automatic import automatic_transfer, framed, labels_shown, visible_points
+from .editing import EditableTransfer
+from .histogram import Histogram
 from .orbit import Orbit
 
 
-SHORTEST, LONGEST = 1 / 16, 16
-"""Steps, in voxels, between which a viewer's step lies."""
+MIN_STEP, MAX_STEP = 1 / 16, 16.0
+"""Voxels."""
+
+DEFAULT_STEP = 0.5
+"""Voxels between the samples of a fine image where no march is given."""
+
+ENABLED = AlphaCorrection, SpaceLeaping, EarlyTermination
+"""Transforms that are applied where no march is given."""
 
 
 @dataclass(frozen=True)
 class State:
     """All that the controls of a viewer change.
 
-    - `orbit`: the camera. `look`: the transfer function. `size`: (width, height) of the view, pixels.
+    - `orbit`: the camera. `size`: (width, height) of the view, pixels.
+    - `transfer`: the transfer function.
     - `step`: distance between samples, in voxels.
-    - `on`: names of the transforms that are applied. `lit`: whether there is light.
+    - `enabled`: names of the transforms that are applied. `lit`: whether there is light.
     """
 
     orbit: Orbit
-    look: Look
     size: tuple[int, int]
+    transfer: EditableTransfer
     step: float
-    on: frozenset[str]
+    enabled: frozenset[str]
     lit: bool
-
-    def with_step(self, step: float) -> "State":
-        """With another step, in voxels.
-
-        **Raises:** `ValueError` for one that is too short or too long."""
-        if not (math.isfinite(step) and SHORTEST <= step <= LONGEST):
-            raise ValueError(f"step must be from {SHORTEST} to {LONGEST} voxels; got {step}.")
-        return replace(self, step=float(step))
-
-    def with_size(self, width: float, height: float, most: int = 2048) -> "State":
-        """With a view of this many pixels, or, if it is wider or higher than `most`, as many fewer."""
-        if not (math.isfinite(width) and math.isfinite(height)) or min(width, height) < 1:
-            raise ValueError(f"a view has at least one pixel; got {width} x {height}.")
-        shrunk = min(1.0, most / max(width, height))
-        return replace(self, size=(max(1, round(width * shrunk)), max(1, round(height * shrunk))))
-
-    def with_transform(self, name: str, on: bool) -> "State":
-        """With a transform turned on or off."""
-        return replace(self, on=self.on | {name} if on else self.on - {name})
 
 
 @dataclass(frozen=True)
-class Choices:
-    """What a viewer offers.
+class Scene:
+    """What stays the same while a volume is viewed, and what the controls choose from.
 
     - `transforms`: those that can be turned on, in the order in which they are applied.
     - `lighting`: the light that can be turned on; None where nothing can be lit.
-    - `quadrature`: of the march. `voxel`: world length of a step of 1.
+    - `quadrature`, `max_samples`: of the march. `voxel`: world length of a step of 1.
+    - `compositing`: how cells become a pixel. `background`: linear RGB.
+    - `histogram`: of the volume.
     """
 
+    volume: Volume
     transforms: tuple[Transform, ...]
     lighting: Lighting | None
     quadrature: str
+    max_samples: int | None
     voxel: float
-    max_samples: int | None = None
+    compositing: Compositing[Any]
+    background: tuple[float, float, float]
+    histogram: Histogram
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of the transforms."""
+    def transform_names(self) -> tuple[str, ...]:
         return tuple(type(transform).__name__ for transform in self.transforms)
 
-    def march(self, state: State, coarser: float = 1.0) -> March:
+    def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
-        chosen = tuple(t for t in self.transforms if type(t).__name__ in state.on)
-        step = state.step * coarser * self.voxel
-        return March(step, chosen, self.quadrature, max_samples=self.max_samples)
+        enabled = tuple(t for t in self.transforms if type(t).__name__ in state.enabled)
+        step = state.step * step_factor * self.voxel
+        return March(step, enabled, self.quadrature, max_samples=self.max_samples)
 
     def light(self, state: State) -> Lighting | None:
         """The light, if it is on."""
         return self.lighting if state.lit else None
+
+
+def initial(
+    volume: Volume | Any,
+    transfer: EditableTransfer | Any | None,
+    camera: Camera | Any | None,
+    march: March | Any | None,
+    *,
+    lighting: Lighting | Any | None,
+    lit: bool,
+    compositing: Mode | Compositing[Any] | Any,
+    background: Any,
+    size: tuple[int, int] | Any,
+) -> tuple[Scene, State]:
+    """What is viewed, and how at first. Arguments as for `view`.
+
+    **Raises:** `ValueError` as `render` does, for a transfer function that is no `EditableTransfer`, an
+    orthographic camera, a march whose step is below `MIN_STEP` or above `MAX_STEP` voxels, and a background
+    that is not linear RGB."""
+    if not isinstance(transfer, EditableTransfer | None):
+        kinds = " or ".join(kind.__name__ for kind in get_args(EditableTransfer))
+        raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
+    whole = Camera.looking_at(volume, size=size)  # checks volume and size
+    seen: Any = whole if camera is None else camera
+    if transfer is None:
+        volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
+        seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
+    given = March(1.0) if march is None else march
+    check_arguments(
+        "view(volume, transfer, camera, march)",
+        volume=volume,
+        transfer=transfer,
+        camera=seen,
+        march=given,
+        lighting=lighting,
+    )
+    mode = compositing_of(compositing)
+    mode.marched(transfer, given, volume)  # refuses what it cannot show
+    can_be_lit = not isinstance(mode, Average)
+    if lighting is not None and not can_be_lit:
+        raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
+    r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
+    blocks = tuple(-(-n // BLOCK) for n in volume.shape)
+    voxel = float(median_node_distance(given.locate(volume), blocks))
+    step = DEFAULT_STEP if march is None else float(march.step) / voxel
+    if not MIN_STEP <= step <= MAX_STEP:
+        raise ValueError(
+            f"march must have a step from {MIN_STEP * voxel:.4g} to {MAX_STEP * voxel:.4g}, {MIN_STEP:g} to "
+            f"{MAX_STEP:g} voxels, to be shown; got one of {float(given.step):.4g}, {step:.4g} voxels."
+        )
+    scene = Scene(
+        volume,
+        transforms=_transforms(given),
+        lighting=Phong() if lighting is None and can_be_lit else lighting,
+        quadrature="midpoint" if march is None else given.quadrature,
+        max_samples=given.max_samples,
+        voxel=voxel,
+        compositing=mode,
+        background=(r, g, b),
+        histogram=Histogram.of(volume),
+    )
+    enabled = ENABLED if march is None else map(type, given.transforms)
+    state = State(
+        orbit=Orbit.of(seen),
+        size=whole.size,
+        transfer=transfer,
+        step=step,
+        enabled=frozenset(kind.__name__ for kind in enabled),
+        lit=lit and can_be_lit,
+    )
+    return scene, state
+
+
+def _transforms(march: March) -> tuple[Transform, ...]:
+    """Those of a march, and others that can be turned on."""
+    # not a constant: their arrays are made on a device, and none may be in use before `jax.distributed`
+    offered = (
+        EmptySpaceJitter(seed=0),
+        Jitter(seed=0),
+        AdaptiveSampling(0.005),
+        AlphaCorrection(),
+        SpaceLeaping(),
+        EarlyTermination(1 / 256),
+    )
+    own = {type(transform) for transform in march.transforms}
+    return (*march.transforms, *(transform for transform in offered if type(transform) not in own))

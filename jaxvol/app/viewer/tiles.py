@@ -1,4 +1,4 @@
-"""Into which parts is a view divided, so that one compiled program draws an image of any size?
+"""How is an image drawn part by part, by one compiled program for any size of the view?
 
 All parts are tiles of `SIDE` x `SIDE` rays. A coarse image is a few of them, stretched over the view, whose
 pixels need not be square; a fine one has a tile's pixel for each of the view's.
@@ -6,11 +6,26 @@ pixels need not be square; a fine one has a tile's pixel for each of the view's.
 
 import math
 from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from ..._util.srgb import to_srgb
+from ...metrics import rmse
+from ...render import render
+from .editing import padded
+from .state import Scene, State
 
 
 SIDE = 192
-"""Rays along a side of a tile. Finding out what is empty, which each tile does anew, then takes less time
-than the rays; and a drag waits for one tile at most."""
+"""Rays along a side of a tile. Each tile finds out anew what is empty: at this size that takes less time than
+its rays, and a drag waits for one tile at most."""
+
+Pixels = UInt8[np.ndarray, "height width 3"]
+"""sRGB of a view or a part of it."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +57,90 @@ class Grid:
     def __len__(self) -> int:
         return self.columns * self.rows
 
-    def inside_out(self) -> list[tuple[int, int]]:
+    def center_first(self) -> list[tuple[int, int]]:
         """(column, row) of the tiles, those in the middle of the view first."""
-        every = [(c, r) for r in range(self.rows) for c in range(self.columns)]
+        tiles = [(c, r) for r in range(self.rows) for c in range(self.columns)]
         middle = self.size[0] / SIDE / 2 - 0.5, self.size[1] / SIDE / 2 - 0.5
-        return sorted(every, key=lambda tile: math.dist(tile, middle))
+        return sorted(tiles, key=lambda tile: math.dist(tile, middle))
+
+    def canvas(self, pixels: Pixels | None = None) -> Pixels:
+        """An image that holds all tiles whole: of another image, each pixel the nearest one, or empty."""
+        height, width = self.rows * SIDE, self.columns * SIDE
+        if pixels is None:
+            return np.empty((height, width, 3), np.uint8)
+        rows, columns, _ = pixels.shape
+        row = np.minimum(np.arange(height) * rows // self.size[1], rows - 1)
+        column = np.minimum(np.arange(width) * columns // self.size[0], columns - 1)
+        return pixels[row[:, None], column[None, :]]
 
     def window(self, column: int, row: int, aspect: float) -> tuple[float, float, float, float]:
         """The part of the image plane that a tile shows, as `Camera.window`. `aspect`: width over height of
         the view."""
         width, height = self.size
-        x, y = (2 * aspect * SIDE / width, 2 * SIDE / height)
-        return (column * x - aspect, (column + 1) * x - aspect, 1 - (row + 1) * y, 1 - row * y)
+        x, y = 2 * aspect * SIDE / width, 2 * SIDE / height
+        return column * x - aspect, (column + 1) * x - aspect, 1 - (row + 1) * y, 1 - row * y
+
+
+class TileRenderer:
+    """Draws tiles of one state of a viewer, with steps that are `step_factor` times as long."""
+
+    def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
+        self.scene, self.state = scene, state
+        self.march = scene.march(state, step_factor)
+        self.lighting = scene.light(state)
+        self.transfer = padded(state.transfer)
+
+    @property
+    def program_key(self) -> tuple[Any, ...]:
+        """Equal for states that one compiled program draws."""
+        leaves, structure = jax.tree.flatten(self.transfer)
+        return self.state.enabled, self.state.lit, structure, *(leaf.shape for leaf in leaves)
+
+    def draw(self, pixels: Pixels, grid: Grid, column: int, row: int) -> None:
+        """Draw a tile into its place in a `Grid.canvas`."""
+        drawn = np.asarray(_displayed(self.rgba(grid, column, row), self._background))
+        pixels[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE] = drawn
+
+    def image(self, grid: Grid) -> Pixels:
+        """All tiles."""
+        width, height = grid.size
+        pixels = grid.canvas()
+        for column, row in grid.center_first():
+            self.draw(pixels, grid, column, row)
+        return pixels[:height, :width]
+
+    def overview(self) -> Float[np.ndarray, "side side 3"]:
+        """Linear colours of one tile that is stretched over the view."""
+        rgba = np.asarray(self.rgba(Grid.coarse(self.state.size, 1), 0, 0))
+        return rgba[..., :3] + (1 - rgba[..., 3:]) * self._background
+
+    def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
+        """A tile as `render` returns it."""
+        width, height = self.state.size
+        window, corner = grid.window(column, row, width / height), (column * SIDE, row * SIDE)
+        camera = self.state.orbit.camera((SIDE, SIDE), window, corner)
+        how = {"compositing": self.scene.compositing, "lighting": self.lighting, "outputs": "rgba"}
+        return render(self.scene.volume, self.transfer, camera, self.march, **how).rgba
+
+    @property
+    def _background(self) -> Float[np.ndarray, "3"]:
+        return np.asarray(self.scene.background, np.float32)
+
+
+def estimated_error(
+    image: Float[np.ndarray, "side side 3"], doubled: Float[np.ndarray, "side side 3"], quadrature: str
+) -> float:
+    """How far linear colours are from the converged ones because of the step, as an RMSE: an estimate, from
+    an image and the same with steps of twice the length.
+
+    It takes the error to fall with the square of the step, and with the step under `quadrature="left"`; where
+    steps are longer than what is seen, it falls by other amounts. What `EarlyTermination` adds is not in it.
+    """
+    order = 1 if quadrature == "left" else 2
+    return float(rmse(image, doubled)) / (2**order - 1)
+
+
+@jax.jit
+def _displayed(rgba: Float[Array, "height width 4"], background: Float[Array, "3"]) -> UInt8[Array, "..."]:
+    linear = rgba[..., :3] + (1 - rgba[..., 3:]) * background[None, None, :]
+    return jnp.round(255 * to_srgb(linear)).astype(jnp.uint8)

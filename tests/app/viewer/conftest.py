@@ -7,6 +7,5 @@ import pytest
 def side():
     """Rays along the side of a tile."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("tiles", "drawing", "model"):
-            patch.setattr(f"jaxvol.app.viewer.{module}.SIDE", 24)
+        patch.setattr("jaxvol.app.viewer.tiles.SIDE", 24)
         yield 24

@@ -11,13 +11,11 @@ import pytest
 
 import jaxvol as jv
 from jaxvol import to_srgb
-from jaxvol.app.viewer.drawing import Drawing
-from jaxvol.app.viewer.labelled import Labelled
-from jaxvol.app.viewer.model import Model
-from jaxvol.app.viewer.pace import BUDGET, LADDER, Pace
-from jaxvol.app.viewer.start import begin
-from jaxvol.app.viewer.table import Table
-from jaxvol.app.viewer.tiles import Grid
+from jaxvol.app.viewer.controls import controls_of
+from jaxvol.app.viewer.editing import padded, with_color, with_point_after, with_window_level
+from jaxvol.app.viewer.model import BUDGET, LEVELS, CoarseLevel, Model
+from jaxvol.app.viewer.state import initial
+from jaxvol.app.viewer.tiles import Grid, TileRenderer, estimated_error
 from jaxvol.metrics import rmse
 
 
@@ -39,79 +37,80 @@ HOW = {"lighting": None, "lit": False, "compositing": "over", "background": (0.2
 
 
 def begun(volume=BALL, transfer: Any = LOOK, camera=None, march: jv.March | None = MARCH, **more):
-    return begin(volume, transfer, camera, march, **{**HOW, **more})
+    return initial(volume, transfer, camera, march, **{**HOW, **more})
 
 
 class Shown:
     """A model, and what it showed and told."""
 
     def __init__(self):
-        self.frames, self.told = [], []
-        self.model = Model(*begun(), self.frames.append, self.told.append, rest=0)
+        self.images, self.told = [], []
+        self.model = Model(*begun(), lambda *image: self.images.append(image), self.told.append, rest=0)
 
     def after(self, change):
         """The fine image after a change of the state."""
         self.model.apply(change)
-        assert self.model.wait(600)
-        assert self.frames[-1].stage == "fine"
-        return self.frames[-1].pixels.astype(float)
+        assert self.model.wait()
+        pixels, stage = self.images[-1]
+        assert stage == "fine"
+        return pixels.astype(float)
 
 
 @pytest.fixture(scope="module")
 def shown(side):
     made = Shown()
-    made.model.draw()
-    assert made.model.wait(600)
+    made.after(lambda s: s)
     yield made
     made.model.close()
 
 
 def test_a_coarse_image_is_followed_by_the_fine_one_of_render(shown, side, monkeypatch):
-    state, content = shown.model.state, shown.model.content
-    first, last = shown.frames[0], shown.frames[-1]
-    assert (last.stage, last.state, last.pixels.shape) == ("fine", state, (27, 38, 3))
+    state, scene = shown.model.state, shown.model.scene
+    (first, stage), (last, _) = shown.images[0], shown.images[-1]
+    assert last.shape == (27, 38, 3)
     for left, top in ((0, 0), (38 - side, 27 - side)):  # by the program of a tile
         camera = state.orbit.camera(state.size).crop(left, top, side, side)
-        rendering = jv.render(BALL, state.look.padded(), camera, content.choices.march(state), outputs="rgba")
+        rendering = jv.render(BALL, padded(state.transfer), camera, scene.march(state), outputs="rgba")
         expected = np.round(255 * np.asarray(to_srgb(rendering.image((0.2, 0.5, 0.8)))))
-        difference = np.abs(last.pixels[top : top + side, left : left + side].astype(int) - expected)
+        difference = np.abs(last[top : top + side, left : left + side].astype(int) - expected)
         assert difference.max() <= 1
         assert np.mean(difference > 0) < 1e-3
-    assert float(content.choices.march(state).step) == pytest.approx(0.4)
-    assert first.stage == "coarse"
-    assert first.latency >= first.seconds > 0
-    rows, columns = (np.arange(n) * m // n for n, m in zip(SIZE[::-1], first.pixels.shape, strict=False))
-    stretched = first.pixels[rows[:, None], columns[None, :]].astype(float)
-    assert np.abs(stretched - last.pixels).mean() < 12  # the same view
+    assert float(scene.march(state).step) == pytest.approx(0.4)
+    assert stage == "coarse"
+    rows, columns = (np.arange(n) * m // n for n, m in zip(SIZE[::-1], first.shape, strict=False))
+    stretched = first[rows[:, None], columns[None, :]].astype(float)
+    assert np.abs(stretched - last).mean() < 12  # the same view
     assert shown.told[0].startswith("compiling …")
     assert "RMSE" in shown.told[-1]
-    assert first.quality < last.quality
-    monkeypatch.setattr("jaxvol.app.viewer.model.EVERY", 0.0)  # seconds until a part of it is shown
+    monkeypatch.setattr("jaxvol.app.viewer.model.INTERVAL", 0.0)  # seconds until a part of it is shown
     shown.after(lambda s: s)
-    assert shown.frames[-2].stage == "drawing"
+    assert shown.images[-2][1] == "drawing"
 
 
 def test_changes_need_no_other_program(shown, side):
     """What a drag or a slider changes is traced: nothing is compiled again."""
-    content, state = shown.model.content, shown.model.state
-    changed = state.with_step(state.step * 1.7)
-    changed = replace(changed, orbit=state.orbit.turned(0.1, 0.2).zoomed(1.3), look=state.look.over(90, 110))
-    changed = replace(changed, look=changed.look.split(1), size=(67, 43))
-    before, after = Drawing(content, state), Drawing(content, changed, 4.0)
-    before.tile(Grid(1, 1, (side, side)), 0, 0)
+    scene, state = shown.model.scene, shown.model.state
+    changed = replace(state, step=state.step * 1.7, orbit=state.orbit.turned(0.1, 0.2).zoomed(1.3))
+    transfer = with_point_after(with_window_level(state.transfer, 90, 110), 1)
+    changed = replace(changed, transfer=transfer, size=(67, 43))
+    before, after = TileRenderer(scene, state), TileRenderer(scene, changed, 4.0)
+    before.image(Grid(1, 1, (side, side)))
+    pixels, grid = Grid(1, 1, (side, side)).canvas(), Grid.fine(changed.size)
     compiled: list[str] = []
 
     def note(event: str, duration_secs: float, **kwargs: str | int) -> None:
         compiled.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(note)
-    pixels = after.tile(Grid.fine(changed.size), 1, 1)
-    assert after.program == before.program
-    assert np.ptp(pixels) > 50
+    pixels = grid.canvas()
+    after.draw(pixels, grid, 1, 1)
+    assert after.program_key == before.program_key
+    assert np.ptp(pixels[side:, side : 2 * side]) > 50
     assert not [event for event in compiled if "compile" in event]
     jax.jit(lambda x: x + 17.25)(np.float32(1))
     assert [event for event in compiled if "compile" in event]  # it would have been seen
-    assert Drawing(content, replace(state, on=state.on - {"SpaceLeaping"})).program != before.program
+    other = replace(state, enabled=state.enabled - {"SpaceLeaping"})
+    assert TileRenderer(scene, other).program_key != before.program_key
 
 
 def test_a_drag_turns_the_image_and_a_point_changes_it(shown):
@@ -127,47 +126,46 @@ def test_a_drag_turns_the_image_and_a_point_changes_it(shown):
     assert np.any(nearer != background, -1).mean() > 1.7 * np.any(start != background, -1).mean()
     moved = shown.after(lambda s: replace(state, orbit=state.orbit.panned(5 / 27, 0)))  # to the right
     assert np.subtract(middle(moved), middle(start)) == pytest.approx((5, 0), abs=0.5)
-    red = shown.after(lambda s: replace(state, look=state.look.changed(2, color=(1.0, 0.0, 0.0))))
+    red = shown.after(lambda s: replace(state, transfer=with_color(state.transfer, 2, "red")))
     center = tuple(n // 2 for n in SIZE[::-1])
     assert red[center][2] < start[center][2] - 30  # less blue in what was white
 
 
 def test_bad_input_and_faults_are_told_and_the_viewer_lives_on(shown):
-    state, told = shown.model.state, len(shown.told)
-    for change in (
-        lambda s: s.with_step(math.nan),
-        lambda s: s.with_step(0),
-        lambda s: s.with_size(0, 100),
-        lambda s: replace(s, look=s.look.over(-1, 0)),
-        lambda s: replace(s, look=s.look.over(1e-9, 1e3)),  # float32 has one number there
-    ):
-        assert shown.model.apply(change) is not None
-    assert shown.model.state is state
-    assert len(shown.told) == told + 5
-    shown.model.apply(lambda s: replace(s, orbit=replace(s.orbit, view_up=np.zeros(3))))
-    assert shown.model.wait(600)
+    model, told = shown.model, len(shown.told)
+    state = model.state
+    for window, level in ((-1, 0), (1e-9, 1e3)):
+        model.apply(lambda s, to=(window, level): replace(s, transfer=with_window_level(s.transfer, *to)))
+    for size in ((0, 100), (math.nan, 100), (math.inf, 100)):
+        model.resize(*size)
+    assert model.state is state
+    assert len(shown.told) == told + 2
+    model.change(orbit=replace(state.orbit, view_up=np.zeros(3)))
+    assert model.wait()
     assert shown.told[-1].startswith("not drawn:\nview_up")
     shown.after(lambda s: begun()[1])
 
 
+def test_a_view_has_2048_pixels_on_a_side_at_most(shown, monkeypatch):
+    monkeypatch.setattr(Model, "ask", lambda *_: None)
+    state = shown.model.state
+    shown.model.resize(4096, 1000.2)
+    assert shown.model.state.size == (2048, 500)
+    shown.model.state = state
+
+
 def test_the_error_is_about_that_of_the_image(side):
     """Compared with steps a sixteenth as long."""
-    content, state = begun(march=jv.March(0.8, MARCH.transforms, "midpoint"))
-    whole = Grid(1, 1, (side, side))
-    drawing, truth = Drawing(content, state), Drawing(content, state, 1 / 16)
-    rgba = [np.asarray(each._rgba(whole, 0, 0)) for each in (drawing, truth)]
-    background = np.asarray(content.background, np.float32)
-    images = [each[..., :3] + (1 - each[..., 3:]) * background for each in rgba]
-    first, second, error = drawing.error()
-    assert first is second is None
-    assert error == pytest.approx(float(rmse(*images)), rel=0.5)
+    scene, state = begun(march=jv.March(0.8, MARCH.transforms, "midpoint"))
+    image, doubled, truth = (TileRenderer(scene, state, factor).overview() for factor in (1, 2, 1 / 16))
+    assert estimated_error(image, doubled, "midpoint") == pytest.approx(float(rmse(image, truth)), rel=0.5)
 
 
 def test_grids_cover_the_view_without_gaps(side):
     for size, most in ((SIZE, 1), (SIZE, 4), ((160, 90), 6), ((13, 113), 5)):
         for grid in (Grid.fine(size), Grid.coarse(size, most)):
             aspect = size[0] / size[1]
-            tiles = sorted(grid.inside_out())
+            tiles = sorted(grid.center_first())
             assert len(set(tiles)) == len(grid) == grid.columns * grid.rows
             windows = {tile: grid.window(*tile, aspect) for tile in tiles}
             left, _, _, top = windows[0, 0]
@@ -183,27 +181,27 @@ def test_grids_cover_the_view_without_gaps(side):
             assert bottom <= -1 + 1e-9
     assert Grid.fine((side, side + 1)) == Grid(1, 2, (side, side + 1))
     assert Grid.coarse((1600, 400), 4).columns == 4
-    assert Grid.fine((3 * side + 5, 2 * side + 9)).inside_out()[0] == (1, 1)
+    assert Grid.fine((3 * side + 5, 2 * side + 9)).center_first()[0] == (1, 1)
 
 
-def test_the_pace_settles_on_what_is_fast_enough():
+def test_the_coarse_level_settles_on_what_is_fast_enough():
     def settled(seconds_per_tile):
-        pace, taken = Pace(), 0.0
+        level, seconds = CoarseLevel(), 0.0
         for _ in range(20):
-            taken = pace.tiles * seconds_per_tile * (0.4 + 0.6 / pace.coarser)
-            pace.took(taken, 100)
-        return pace, taken
+            seconds = level.tiles * seconds_per_tile * (0.4 + 0.6 / level.step_factor)
+            level.adapt(seconds, 100)
+        return level, seconds
 
-    pace, taken = settled(0.02)
-    assert BUDGET / 2.5 <= taken <= BUDGET
-    assert pace.tiles > 1
+    level, seconds = settled(0.02)
+    assert BUDGET / 2.5 <= seconds <= BUDGET
+    assert level.tiles > 1
     slow, _ = settled(0.3)
-    assert (slow.tiles, slow.coarser) == LADDER[0]
+    assert (slow.tiles, slow.step_factor) == LEVELS[0]
     fast, _ = settled(1e-6)
-    assert (fast.tiles, fast.coarser) == LADDER[-1]
-    small = Pace()
+    assert (fast.tiles, fast.step_factor) == LEVELS[-1]
+    small = CoarseLevel()
     for _ in range(20):
-        small.took(1e-6, 2)
+        small.adapt(1e-6, 2)
     assert small.tiles == 1
 
 
@@ -212,32 +210,94 @@ def equal_arrays(one, other):
     return all(np.allclose(a, b, rtol=1e-6) for a, b in pairs)
 
 
-def test_every_kind_of_transfer_function_is_drawn_as_it_is_changed():
-    content, state = begun(LABELS, None)
-    look = state.look
-    assert isinstance(look, Labelled)
-    assert look.labels == (1, 2)
-    changed = replace(state, look=look.changed(1, shown=False).changed(2, opacity=0.02))
-    expected = look.function.with_visibility({1: False}).with_opacity({2: 0.02})
-    assert equal_arrays(Drawing(content, changed).transfer, expected)
-    with pytest.raises(ValueError, match="there is no label 3; there are 1, 2"):
-        look.changed(3, shown=True)
-    with pytest.raises(ValueError, match="from 0 to 4"):
-        look.changed(1, opacity=math.nan)
+@pytest.fixture
+def controlled(monkeypatch):
+    """A function that makes a model that draws nothing, and its controls by their labels."""
+    monkeypatch.setattr(Model, "ask", lambda *_: None)
+    models = []
 
+    def made(*scene, **more):
+        models.append(Model(*begun(*scene, **more), lambda *_: None, lambda _: None, rest=0))
+        controls = [control for group in controls_of(models[-1]).values() for control in group]
+        return models[-1], {
+            getattr(control, "label", type(control).__name__): control for control in controls
+        }
+
+    yield made
+    for model in models:
+        model.close()
+
+
+def test_the_controls_change_the_points_that_they_show(controlled):
+    model, controls = controlled()
+    controls["level"].set(150.0)
+    controls["point"].set("2: 110")
+    assert controls["value"].get() == 110
+    controls["opacity"].set(0.5)
+    controls["color"].set("#ff0000")
+    assert controls["opacity"].get() == pytest.approx(0.5)
+    np.testing.assert_allclose(model.state.transfer.colors[1], (1, 0, 0))
+    controls["point"].set("3: 220")
+    controls["value"].set(260.0)
+    assert (controls["window"].get(), controls["level"].get()) == (180, 170)
+    assert controls["point"].get() == "3: 260"
+    controls["point"].set("2: 110")
+    controls["points"].press("add behind")
+    assert controls["point"].options() == ["1: 80", "2: 110", "3: 185", "4: 260"]
+    controls["point"].set("4: 260")
+    controls["points"].press("remove")
+    assert controls["point"].get() == "3: 185"
+    assert controls["Html"].get().count("<circle") == 3
+    many, controls = controlled(BALL, jv.colormap("gray", (0, 200), n_colors=40))
+    assert "point" not in controls
+    controls["window"].set(100.0)
+    assert float(many.state.transfer.values[0]) == pytest.approx(50)
+
+
+def test_the_controls_change_march_and_light(controlled):
+    model, controls = controlled(lit=True)
+    controls["Jitter"].set(True)
+    controls["SpaceLeaping"].set(False)
+    controls["light"].set(False)
+    assert model.state.enabled == {"Jitter", "AlphaCorrection"}
+    assert controls["Jitter"].get()
+    assert not model.state.lit
+    for step, expected in ((0.5, 0.5), (0.0, 1 / 16), (1e9, 16)):
+        controls["step (voxels)"].set(step)
+        assert model.state.step == expected
+    assert "light" not in controlled(compositing="average")[1]
+
+
+def test_labels_are_shown_and_changed_by_their_controls(controlled):
+    model, controls = controlled(LABELS, None)
+    given = model.state.transfer
+    assert controls["label"].options() == ["1", "2"]
+    assert "#1f77b4" in controls["Html"].get()
+    controls["shown"].set(False)
+    assert not controls["shown"].get()
+    controls["label"].set("2")
+    assert controls["shown"].get()
+    controls["opacity"].set(0.02)
+    expected = given.with_visibility({1: False}).with_opacity({2: 0.02})
+    assert equal_arrays(model.state.transfer, expected)
+    controls["opacity"].set(math.nan)
+    assert equal_arrays(model.state.transfer, expected)
+
+
+def test_a_table_is_moved_along_its_values(controlled):
     given = jv.TransferFunction2D.from_transfer(LOOK, (2.0, 20.0), 0.5)
-    content, state = begun(BALL, given)
-    look = state.look
-    assert isinstance(look, Table)
-    assert look.count == "3 x 2 points"
-    assert content.histogram.plot(look).count("<line") == 2  # the ends of its range
-    moved = replace(state, look=look.over(look.window, look.level + 300))
-    assert equal_arrays(look.transfer(), given)
-    assert equal_arrays(
-        Drawing(content, moved).transfer, eqx.tree_at(lambda t: t.values, given, given.values + 300)
-    )
-    _, state = begun(transfer=None, march=None)  # found from the volume's values
-    assert state.look == begun(transfer=jv.automatic_transfer(BALL), march=None)[1].look
+    model, controls = controlled(BALL, given)
+    assert padded(model.state.transfer) is given
+    plot = model.scene.histogram.plot(given, 1.0)
+    assert plot.count("<line") == 2  # the ends of its range
+    assert controls["Html"].get() == "3 x 2 points, not edited one by one"
+    controls["level"].set(controls["level"].get() + 300)
+    assert equal_arrays(model.state.transfer, eqx.tree_at(lambda t: t.values, given, given.values + 300))
+
+
+def test_a_transfer_function_is_found_where_none_is_given():
+    _, state = begun(transfer=None, march=None)
+    assert equal_arrays(state.transfer, jv.automatic_transfer(BALL))
 
 
 def test_what_the_viewer_does_not_show_is_refused():
@@ -265,33 +325,32 @@ MODES = ["over", "maximum", "minimum", "average", jv.FirstVisible(), jv.Isosurfa
 
 def test_every_mode_is_shown_as_it_begins_and_lit_where_it_can_be(side):
     for mode in MODES:
-        content, state = begun(march=None, lit=True, compositing=mode)
-        drawing = Drawing(content, state)
+        scene, state = begun(march=None, lit=True, compositing=mode)
+        renderer = TileRenderer(scene, state)
         if mode in MODES[-3::2]:
-            tile = jax.eval_shape(
-                lambda d=drawing: d._rgba(Grid(1, 1, (side, side)), 0, 0)
-            )  # compiles nothing
+            grid = Grid(1, 1, (side, side))
+            tile = jax.eval_shape(lambda r=renderer, g=grid: r.rgba(g, 0, 0))  # compiles nothing
             assert tile.shape == (side, side, 4)
         assert state.lit == (mode != "average")
-        assert (content.choices.light(replace(state, lit=True)) is not None) == (mode != "average")
+        assert (scene.light(replace(state, lit=True)) is not None) == (mode != "average")
     for given in (None, PHONG):
         for lit in (True, False):
-            content, state = begun(lighting=given, lit=lit)
+            scene, state = begun(lighting=given, lit=lit)
             assert state.lit is lit
-            assert isinstance(content.choices.lighting, jv.lighting.Phong)
-            assert (content.choices.light(state) is not None) is lit
+            assert isinstance(scene.lighting, jv.lighting.Phong)
+            assert (scene.light(state) is not None) is lit
 
 
 def test_without_a_march_the_defaults_are_on_and_all_others_are_offered():
-    content, state = begun(transfer=None, march=None, lit=True)
-    assert state.on == {"AlphaCorrection", "SpaceLeaping", "EarlyTermination"}
+    scene, state = begun(transfer=None, march=None, lit=True)
+    assert state.enabled == {"AlphaCorrection", "SpaceLeaping", "EarlyTermination"}
     assert state.lit
-    assert {"Jitter", "EmptySpaceJitter", "AdaptiveSampling"} <= set(content.choices.names)
+    assert {"Jitter", "EmptySpaceJitter", "AdaptiveSampling"} <= set(scene.transform_names)
     clip = jv.Clip(box=(0, 5, 0, 5, 0, 5))
-    own, state = begun(march=jv.March(0.2, (clip,)))
-    assert own.choices.names[0] == "Clip"
-    assert state.on == {"Clip"}
-    assert own.choices.voxel == pytest.approx(0.8)
+    scene, state = begun(march=jv.March(0.2, (clip,)))
+    assert scene.transform_names[0] == "Clip"
+    assert state.enabled == {"Clip"}
+    assert scene.voxel == pytest.approx(0.8)
     assert state.step == pytest.approx(0.25)
-    march = own.choices.march(state.with_transform("Jitter", True).with_transform("Clip", False))
+    march = scene.march(replace(state, enabled=frozenset({"Jitter"})))
     assert [type(t).__name__ for t in march.transforms] == ["Jitter"]

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.app.viewer.model import Frame
+from jaxvol.app.viewer.editing import window_level
 
 from .test_model import BALL, LABELS, LOOK, MARCH
 
 
 pytest.importorskip("rendercanvas.anywidget", reason="needs rendercanvas: pip install jaxvol[notebooks]")
+ipywidgets = pytest.importorskip("ipywidgets")
 
 
 @pytest.fixture(autouse=True)
@@ -66,15 +67,14 @@ def test_a_drag_orbits_and_with_shift_or_the_right_button_it_moves(shown):
 
 
 def test_what_is_drawn_and_told_is_shown(shown, monkeypatch):
-    images = []
+    images, pixels = [], np.zeros((210, 300, 3), np.uint8)
     monkeypatch.setattr(shown.canvas, "show", lambda *image: images.append(image))
-    frame = Frame(np.zeros((210, 300, 3), np.uint8), "coarse", shown.model.state, 0.1, 0.1, 0.4)
-    shown.model._show(frame)
+    shown.model._show(pixels, "coarse", 0.1, 0.4)
     shown.model._tell("one\ntwo")
-    assert images == [(frame.pixels, 85)]
+    assert images == [(pixels, 85)]
     assert shown._status.value == "one<br>two"
     shown.model.close()
-    shown.model._show(frame)
+    shown.model._show(pixels, "fine", 0.1, 0.4)
     shown.model._tell("nothing more")
     assert (len(images), shown._status.value) == (1, "one<br>two")
 
@@ -89,65 +89,67 @@ def test_what_is_shown_can_be_rendered(shown):
     assert isinstance(shown.lighting, jv.lighting.Phong)
 
 
-def test_the_controls_of_points_window_and_level_agree(shown):
-    shown._look.level.value = 150.0
-    assert shown.model.state.look.level == pytest.approx(150)
-    value, color, opacity, more, _ = shown._look.points.children[1].children
-    assert value.value == pytest.approx(shown.model.state.look.values[1])
-    opacity.value, color.value = 0.5, "#ff0000"
-    assert shown.model.state.look.opacity(1) == pytest.approx(0.5)
-    assert shown.model.state.look.colors[1] == pytest.approx((1, 0, 0))
-    last = shown._look.points.children[2].children[0]
-    last.value = last.value + 40
-    assert shown._look.window.value == pytest.approx(180)
-    more.click()
-    assert len(shown.model.state.look) == len(shown._look.points.children) == 4
-    shown._look.points.children[0].children[4].click()
-    assert len(shown.model.state.look) == len(shown._look.points.children) == 3
+def widgets(view) -> dict[str, Any]:
+    """The controls by their descriptions, and the buttons."""
+    found = {control.label: widget for widget, control in view._widgets if hasattr(control, "label")}
+    rows = [row.children for row in view.children[1].children if isinstance(row, ipywidgets.HBox)]
+    return found | {button.description: button for row in rows for button in row}
+
+
+def test_the_widgets_change_the_model_and_show_what_it_has(shown):
+    found, plot = widgets(shown), shown._widgets[0][0]
+    before = plot.value
+    assert before.count("<circle") == 2  # the third lies beyond the volume's values
+    found["level"].value = 150.0
+    assert window_level(shown.transfer)[1] == pytest.approx(150)
+    assert plot.value != before
+    found["point"].value = "2: 110"
+    assert found["value"].value == 110
+    found["color"].value = "#ff0000"
+    np.testing.assert_allclose(shown.transfer.colors[1], (1, 0, 0))
+    found["point"].value = "3: 220"
+    found["value"].value = 260.0
+    assert (found["window"].value, found["point"].value) == (180, "3: 260")
+    assert found["point"].options == ("1: 80", "2: 110", "3: 260")
+    found["point"].value = "2: 110"
+    found["add behind"].click()
+    assert len(shown.transfer.values) == len(found["point"].options) == 4
+    found["step (voxels)"].value = 1.0
+    assert shown.model.state.step == 1
+    found["Jitter"].value = True
+    assert "Jitter" in shown.model.state.enabled
+    orbit = shown.model.state.orbit
+    shown.model.change(orbit=orbit.turned(0.1, 0))
+    found["reset view"].click()
+    assert shown.model.state.orbit is orbit
 
 
 def test_a_step_alone_is_moved_by_its_level_and_stretched_by_its_window():
     with viewed(BALL, jv.TransferFunction([90, 90], [(1, 0, 0), (0, 0, 1)], [0, 2])) as view:
-        assert (view._look.window.value, view._look.level.value) == (0, 90)
-        view._look.level.value = 110.0
-        assert view.model.state.look.values == pytest.approx((110, 110))
-        view._look.window.value = 20.0
-        assert view.model.state.look.values == pytest.approx((100, 120))
+        found = widgets(view)
+        assert (found["window"].value, found["level"].value) == (0, 90)
+        found["level"].value = 110.0
+        assert view.transfer.values.tolist() == [110, 110]
+        found["window"].value = 20.0
+        assert view.transfer.values.tolist() == [100, 120]
 
 
-def test_light_is_offered_where_something_can_be_lit():
-    for compositing, offered in (("over", True), ("average", False)):
-        with viewed(BALL, LOOK, compositing=compositing) as view:
-            names = [getattr(widget, "description", "") for widget in view.children[1].children]
-            assert ("light" in names) is offered
-            assert "AlphaCorrection" in names
-
-
-def test_the_plot_follows_the_points(shown):
-    plot = shown._look.children[0]
-    before = plot.value
-    assert before.count("<circle") == 2  # the third lies beyond the volume's values
-    shown._look.points.children[1].children[2].value = 0.1
-    assert plot.value != before
-
-
-def test_labels_are_shown_each_in_a_row_and_hidden_by_it():
+def test_labels_are_hidden_by_their_widgets():
     with viewed(LABELS) as view:
-        rows = view._look.children
-        assert [row.children[1].description for row in rows] == ["1", "2"]
-        assert "#1f77b4" in rows[0].children[0].value
-        rows[0].children[1].value = False
-        rows[1].children[2].value = 0.25
-        transfer = view.transfer
-        assert isinstance(transfer, jv.LabelTransferFunction)
-        assert np.asarray(transfer.shown).tolist()[1:3] == [False, True]
-        assert np.asarray(transfer.opacity).tolist()[1:3] == [1.0, 0.25]
+        found = widgets(view)
+        assert found["label"].options == ("1", "2")
+        found["shown"].value = False
+        found["label"].value = "2"
+        assert found["shown"].value
+        found["opacity"].value = 0.25
+        assert np.asarray(view.transfer.shown).tolist()[1:3] == [False, True]
+        assert np.asarray(view.transfer.opacity).tolist()[1:3] == [1.0, 0.25]
         assert view.volume.labels is not None
 
 
 def test_the_canvas_waits_for_no_tick(monkeypatch):
     """An event is handled when it comes, and an image sent in the next turn of the event loop, and once."""
-    from jaxvol.app.viewer.canvas import PromptCanvas
+    from jaxvol.app.viewer.notebook import PromptCanvas
 
     sent, handled, pixels = [], [], np.zeros((4, 6, 3), np.uint8)
     monkeypatch.setattr(PromptCanvas, "send", lambda self, message, buffers: sent.append(message["mimetype"]))
@@ -177,7 +179,7 @@ def test_the_canvas_waits_for_no_tick(monkeypatch):
 def test_without_the_extra_the_error_says_what_to_install(call, module, extra, monkeypatch):
     for name in [module, *(n for n in sys.modules if n.startswith(f"{module}."))]:
         monkeypatch.setitem(sys.modules, name, None)
-    for own in ("notebook", "canvas", "page"):
+    for own in ("notebook", "page"):
         monkeypatch.delitem(sys.modules, f"jaxvol.app.viewer.{own}", raising=False)
         monkeypatch.delattr(f"jaxvol.app.viewer.{own}", raising=False)
     with pytest.raises(ImportError, match=rf"pip install jaxvol\[{extra}\]"):

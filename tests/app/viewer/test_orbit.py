@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.app.viewer.orbit import NEAREST, STEEPEST, Orbit
+from jaxvol.app.viewer.orbit import STEEPEST, Orbit
 
 
 START = Orbit.at((5.0, -3.0, 2.0), (1.0, 2.0, 0.5), (0.0, 0.0, 2.0), 40.0)
@@ -62,11 +62,10 @@ def test_what_is_panned_stays_under_the_pointer(drag):
     np.testing.assert_allclose(moved, drag, atol=1e-12)
 
 
-def test_a_zoom_magnifies_what_is_at_the_focal_point_and_ends():
+def test_a_zoom_magnifies_what_is_at_the_focal_point():
     beside = START.focal_point + 1e-3 * np.cross(START.toward, START.view_up)
     grown = pixel(START.zoomed(3.0), beside) / pixel(START, beside)
     assert grown[0] == pytest.approx(3.0, rel=1e-5)
-    assert START.zoomed(1e9).distance == pytest.approx(NEAREST * START.distance)
 
 
 def test_the_camera_is_that_of_the_renderer():
@@ -80,15 +79,6 @@ def test_the_camera_is_that_of_the_renderer():
     np.testing.assert_allclose([x * HEIGHT, y * HEIGHT], [30.5 - HEIGHT / 2, 70.5 - HEIGHT / 2], atol=1e-2)
 
 
-def test_bad_cameras_are_refused():
+def test_an_orthographic_camera_is_refused():
     with pytest.raises(ValueError, match="perspective"):
         Orbit.of(jv.Camera((1, 0, 0), (0, 0, 0), (0, 0, 1), parallel_scale=1))
-    for position, up, angle in (
-        ((0, 0, 0), (0, 0, 1), 30),
-        ((1, 0, 0), (0, 0, 0), 30),
-        ((1, 0, 0), (0, 0, 1), 0),
-    ):
-        with pytest.raises(ValueError, match="is none"):
-            Orbit.at(position, (0, 0, 0), up, angle)
-    with pytest.raises(ValueError, match="is none"):
-        Orbit.at((math.nan, 0, 0), (0, 0, 0), (0, 0, 1), 30)

@@ -3,6 +3,8 @@
 import asyncio
 import socket
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.app.viewer.editing import point_color
 
 
 viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
@@ -104,71 +107,63 @@ def test_nobody_else_reaches_it_and_it_serves_no_other_files(page):
 def test_the_camera_of_a_page_is_that_of_the_volume(page):
     """viser's scene has the size of 1, whatever the volume's."""
     orbit = page._state.orbit
-    again = page._center + page._radius * page._shown(orbit.position)
+    again = page._center + page._radius * page._to_viser(orbit.position)
     np.testing.assert_allclose(again, orbit.position)
-    assert 1 < np.linalg.norm(page._shown(orbit.position)) < 10
+    assert 1 < np.linalg.norm(page._to_viser(orbit.position)) < 10
 
 
-def controls(transfer, **how) -> dict[str, Any]:
-    """Those of a page that is opened, by their labels."""
+@contextmanager
+def panel_of(*scene, **how) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """The panel of a page that is opened, and its widgets by their labels."""
     from jaxvol.app.viewer.page import _Panel
 
-    page = jv.serve(VOLUME, transfer, port=18090, **how)
+    page = jv.serve(*scene, port=18090, **how)
     try:
         gui = page._server.gui
         client: Any = SimpleNamespace(gui=gui)
-        _Panel(client, page._content, page._state).model.close()
-        return {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
+        panel = _Panel(client, page._scene, page._state)
+        panel.model.close()
+        yield panel, {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
     finally:
         page.close()
 
 
+def choose(widget, value, client: str | None = "a browser"):
+    """What is changed in a browser, or, without a client, what the program itself shows."""
+    widget._impl.value = value
+    for call in widget._impl.update_cb:
+        asyncio.run(call(SimpleNamespace(client=client)))
+
+
 def test_the_controls_show_how_it_begins():
-    shown = controls(GRAY, march=jv.March(16.0), compositing="average")
-    assert shown["step (voxels)"].value == shown["step (voxels)"].max == 16
-    assert "SpaceLeaping" in {name.replace("\u200b", "") for name in shown}
-    assert "light" not in shown
-    shown = controls(jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2]))
-    assert (shown["window"].value, shown["level"].value) == (0, 9)
-    assert shown["level"].max - shown["level"].min > 20
-    assert "light" in shown
+    with panel_of(VOLUME, GRAY, march=jv.March(16.0), compositing="average") as (_, found):
+        assert found["step (voxels)"].value == found["step (voxels)"].max == 16
+        assert "SpaceLeaping" in {name.replace("\u200b", "") for name in found}
+        assert "light" not in found
+    step = jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2])
+    with panel_of(VOLUME, step) as (_, found):
+        assert (found["window"].value, found["level"].value) == (0, 9)
+        assert found["level"].max - found["level"].min > 20
+        assert "light" in found
 
 
-def test_labels_are_shown_and_changed_by_their_controls(page, monkeypatch):
-    """What is changed in a browser; not what the program itself shows in its controls."""
-    from jaxvol.app.viewer.model import Model
-    from jaxvol.app.viewer.page_look import _LabelControls
-
-    from .test_model import LABELS, begun
-
-    changes: list[Any] = []
-    monkeypatch.setattr(Model, "change", lambda _, **changed: changes.append(changed["look"]))
-    model = Model(*begun(LABELS, None), lambda _: None, lambda _: None, rest=0)
-    try:
-        controls = _LabelControls(page._server.gui, model)
-    finally:
-        model.close()
-    look: Any = model.state.look
-    assert (controls.label.options, controls.label.value) == (("1", "2"), "1")
-
-    def choose(control, value, client):
-        control.value = value
-        for call in control._impl.update_cb:
-            asyncio.run(call(SimpleNamespace(client=client)))
-
-    choose(controls.shown, False, None)
-    assert not changes
-    choose(controls.shown, False, "a browser")
-    assert equal(changes.pop(), look.changed(1, shown=False))
-    choose(controls.label, "2", "a browser")
-    assert controls.shown.value  # as the look has it
-    assert controls.color.value == tuple(round(255 * part) for part in look.color(2))
-    choose(controls.opacity, 0.5, "a browser")
-    assert equal(changes.pop(), look.changed(2, opacity=0.5))
-
-
-def equal(one, other) -> bool:
-    return (one.shown, one.opacities) == (other.shown, other.opacities)
+def test_the_widgets_change_the_model_and_show_what_it_has():
+    with panel_of(VOLUME, GRAY) as (panel, found):
+        given = panel.model.state.transfer
+        choose(found["level"], 20.0, None)
+        assert panel.model.state.transfer is given
+        choose(found["level"], 20.0)
+        assert found["value"].value == 7
+        choose(found["point"], found["point"].options[3])
+        assert (found["value"].value, found["color"].value) == (33, (255, 255, 255))
+        choose(found["color"], (128, 64, 255))
+        assert point_color(panel.model.state.transfer, 3) == "#8040ff"
+        choose(found["value"], 39.0)
+        assert found["window"].value == pytest.approx(32)
+        assert found["point"].value == "4: 39"
+        choose(found["points"], "remove")
+        assert len(panel.model.state.transfer.values) == len(found["point"].options) == 3
+        assert found["point"].value == found["point"].options[2]
 
 
 def test_a_port_that_is_none_is_named():

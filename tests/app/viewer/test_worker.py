@@ -6,7 +6,7 @@ import time
 from jaxvol.app.viewer.worker import Worker
 
 
-class Log:
+class Log(Worker[int]):
     """A worker that waits to be let go on, and what it did."""
 
     def __init__(self, parts: int = 4, rest: float = 0.0):
@@ -14,16 +14,18 @@ class Log:
         self.faults: list[Exception] = []
         self.gate = threading.Semaphore(0)
         self.parts = parts
-        self.worker: Worker[int] = Worker(self.coarse, self.fine, self.faults.append, rest)
+        super().__init__(rest)
 
-    def coarse(self, request, asked):
-        assert asked <= time.perf_counter()
+    def _failed(self, fault):
+        self.faults.append(fault)
+
+    def _coarse(self, request):
         if request < 0:
             raise ValueError("negative")
         self.gate.acquire()
         self.done.append(("coarse", request))
 
-    def fine(self, request):
+    def _fine(self, request):
         try:
             for part in range(self.parts):
                 self.gate.acquire()
@@ -44,46 +46,46 @@ class Log:
 
 def test_a_newer_request_cancels_a_fine_image_between_two_parts():
     log = Log()
-    log.worker.ask(1)
+    log.ask(1)
     log.go(3)
     log.until(3)
-    log.worker.ask(2)  # while it waits in part 2
+    log.ask(2)  # while it waits in part 2
     log.go()
     log.go(5)
-    assert log.worker.wait(20)
+    assert log.wait(20)
     assert log.done[:5] == [("coarse", 1), ("part 0", 1), ("part 1", 1), ("part 2", 1), ("closed", 1)]
     assert log.done[5] == ("coarse", 2)
     assert log.done[-2:] == [("part 3", 2), ("closed", 2)]
-    log.worker.close()
+    log.close()
 
 
 def test_of_many_requests_the_one_begun_is_finished_and_the_last_one_follows():
     log = Log(rest=60)
-    log.worker.ask(1)
-    while log.worker._next is not None:
+    log.ask(1)
+    while log._next is not None:
         time.sleep(0.001)
     for request in range(2, 50):
-        log.worker.ask(request)
+        log.ask(request)
     log.go(2)
     log.until(2)
     assert log.done == [("coarse", 1), ("coarse", 49)]
-    log.worker.ask(50)  # at once, though the rest has not passed
+    log.ask(50)  # at once, though the rest has not passed
     log.go()
     log.until(3)
     assert log.done[-1] == ("coarse", 50)
     begun = time.monotonic()
-    log.worker.close()
+    log.close()
     assert time.monotonic() - begun < 20
 
 
 def test_a_fault_is_told_and_the_next_request_drawn():
     log = Log()
-    log.worker.ask(-1)
-    assert log.worker.wait(20)
+    log.ask(-1)
+    assert log.wait(20)
     assert [str(fault) for fault in log.faults] == ["negative"]
-    log.worker.ask(3)
+    log.ask(3)
     log.go(5)
-    assert log.worker.wait(20)
+    assert log.wait(20)
     assert ("coarse", 3) in log.done
-    log.worker.close()
-    assert log.worker.wait(0)
+    log.close()
+    assert log.wait(0)

@@ -1,0 +1,124 @@
+"""Do a viewer's controls change a transfer function as they say?"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.app.viewer.editing import (
+    MAX_POINTS,
+    has_editable_points,
+    label_color,
+    labels_of,
+    opacities,
+    padded,
+    point_color,
+    window_level,
+    with_color,
+    with_opacity,
+    with_point_after,
+    with_value,
+    with_window_level,
+    without_point,
+)
+
+
+GIVEN = jv.TransferFunction(
+    [10, 20, 20, 50], [(0, 0, 0), (1, 0, 0), (0, 0.5, 0), (0.2, 0.4, 0.6)], [0, 1, 3, 0.5]
+)
+AT = np.concatenate([np.linspace(-50, 300, 701), [19.999, 20.0, 20.001]]).astype(np.float32)
+
+
+@eqx.filter_jit
+def looked_up(transfer):
+    color, extinction = jax.vmap(transfer)(jnp.asarray(AT))
+    return jnp.stack([*color, extinction], axis=-1)
+
+
+def assert_same_function(one, other):
+    np.testing.assert_allclose(looked_up(one), looked_up(other), atol=1e-6)
+
+
+def test_padding_changes_nothing_and_gives_one_shape():
+    assert padded(GIVEN).values.shape == (MAX_POINTS,)
+    assert_same_function(padded(GIVEN), GIVEN)
+    assert padded(without_point(GIVEN, 3)).values.shape == (MAX_POINTS,)
+    many = jv.colormap("gray", (0, 1), n_colors=40)
+    assert not has_editable_points(many)
+    assert padded(many) is many
+
+
+def test_window_and_level_move_all_points():
+    moved = with_window_level(GIVEN, 80, 100)
+    assert window_level(moved) == (80, 100)
+    assert moved.values.tolist() == [60, 80, 80, 140]
+    assert moved.colors is GIVEN.colors
+    for window, level in ((0, 1), (-1, 1), (math.nan, 1), (1, math.inf)):
+        with pytest.raises(ValueError, match="window must be above 0"):
+            with_window_level(GIVEN, window, level)
+    with pytest.raises(ValueError, match="values must increase"):
+        with_window_level(GIVEN, 1e-9, 1e3)  # float32 has one number there
+
+
+def test_a_point_is_set_as_it_is_shown():
+    changed = with_opacity(with_color(GIVEN, 3, "#8040ff"), 3, 0.3, 0.5)
+    assert opacities(changed, 0.5)[3] == pytest.approx(0.3)
+    assert changed.opacity(0.5)[3] == pytest.approx(0.3)
+    assert point_color(changed, 3) == "#8040ff"
+    np.testing.assert_allclose(changed.colors[3], jv.from_srgb([128 / 255, 64 / 255, 1]), atol=1e-6)
+    np.testing.assert_array_equal(changed.colors[:3], GIVEN.colors[:3])
+    np.testing.assert_array_equal(changed.extinction[:3], GIVEN.extinction[:3])
+    assert np.isfinite(with_opacity(GIVEN, 3, 1.0, 0.5).extinction[3])
+
+
+def test_a_value_stays_between_its_neighbours():
+    plain = without_point(GIVEN, 2)
+    assert with_value(plain, 1, 33).values.tolist() == [10, 33, 50]
+    for value in (-7.0, 1e9):
+        low, middle, high = with_value(plain, 1, value).values
+        assert low < middle < high
+    assert with_value(plain, 2, 1e4).values[2] == 1e4
+
+
+def test_a_point_that_is_added_changes_nothing():
+    split = with_point_after(GIVEN, 2)
+    assert len(split.values) == 5
+    assert_same_function(split, GIVEN)
+    assert_same_function(without_point(split, 3), GIVEN)
+    with pytest.raises(ValueError, match="no room"):
+        with_point_after(GIVEN, 3)
+    with pytest.raises(ValueError, match="at least 2"):
+        without_point(without_point(without_point(GIVEN, 0), 0), 0)
+    with pytest.raises(ValueError, match="no room for another point in a step: two are at 20"):
+        with_point_after(GIVEN, 1)
+
+
+def test_a_step_alone_is_padded_moved_and_made_a_ramp():
+    for value in (0.0, 20.0, -1e6):
+        step = jv.TransferFunction([value, value], [(1, 0, 0), (0, 0, 1)], [0, 2])
+        assert padded(step).values.shape == (MAX_POINTS,)
+        np.testing.assert_array_equal(looked_up(padded(step)), looked_up(step))
+        assert with_window_level(step, 0, 7).values.tolist() == [7, 7]
+        ramp = with_window_level(step, 4, 7)
+        assert ramp.values.tolist() == [5, 9]
+        assert with_window_level(ramp, 0, value).values.tolist() == [value, value]
+
+
+def test_what_is_no_color_opacity_or_value_is_refused():
+    for opacity in (-0.1, 1.1, math.nan):
+        with pytest.raises(ValueError, match="opacity must"):
+            with_opacity(GIVEN, 1, opacity, 0.5)
+    with pytest.raises(ValueError, match="values must"):
+        with_value(GIVEN, 3, math.inf)
+    with pytest.raises(ValueError, match="Invalid hex color"):
+        with_color(GIVEN, 1, "#12")
+
+
+def test_labels_that_can_be_seen_are_offered_each_in_its_densest_color():
+    transfer = jv.LabelTransferFunction({1: GIVEN, 3: without_point(GIVEN, 3)})
+    assert labels_of(transfer) == [1, 3]
+    assert label_color(transfer, 3) == "#00bc00"
