@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._util.checks import Arrayable, all_finite, check_answer, finite_array
 from ._util.vec3 import Scalar, Vec3, apart
 from .arguments import check_arguments
-from .compositing.compositing import Compositing, Fragment, Outputs, Weighting
+from .compositing.blending import Compositing, Fragment, Outputs, Weighting
 from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, require
 from .arguments import check_arguments
-from .compositing.compositing import Compositing
+from .compositing.blending import Compositing
 from .compositing.modes import Mode, compositing_of
 from .engine.adjoints import Adjoint
 from .engine.devices import Devices

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
 from ..arguments import check_arguments
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, Int
 
-from ..compositing.compositing import Outputs
+from ..compositing.blending import Outputs
 from ..lighting.shading import lit_classification
 from ..march import strides
 from ..reference import Pipeline, begin, end, has_fault, step

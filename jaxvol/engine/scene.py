@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
-from ..compositing.compositing import Compositing, Over
+from ..compositing.blending import Compositing, Over
 from ..lighting.shading import Lighting
 from ..march.march import March
 from ..scene.camera import Camera

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..compositing.compositing import Outputs, Weighting
+from ..compositing.blending import Outputs, Weighting
 from ..march.march import EmptySpaceIndex
 from ..march.strides import steps_of
 from ..reference import Pipeline, Progress, begin, is_sample, measure, move, opacity, pieces, with_stride

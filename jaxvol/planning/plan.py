@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from .._util.checks import described, flag, integer
 from ..arguments import check_arguments
-from ..compositing.compositing import Compositing, Over
+from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import along
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..engine.driver import render_scene
 from ..engine.rays import OwnRays
 from ..engine.scene import Scene

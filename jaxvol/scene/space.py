@@ -7,7 +7,7 @@ different `Path`; the rest of the march is unaffected.
 
 from abc import abstractmethod
 from functools import partial
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -271,15 +271,13 @@ def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
     return jnp.median(node_distance(space, shape))
 
 
-def world_gradient(
-    volume: Volume, space: Space, point: Vec3, method: Literal["trilinear", "central"] = "central"
-) -> Vec3:
+def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:
     """Gradient of the value with respect to a world point, in value units per world length.
 
     `Volume.gradient`, transformed by the transposed Jacobian of `space.coordinate`.
     """
     coordinate, transpose = jax.vjp(space.coordinate, point)
-    slopes = volume.gradient(coordinate, method)
+    slopes = volume.gradient(coordinate)
     per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))
     return transpose(per_node)[0]
 

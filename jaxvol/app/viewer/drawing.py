@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from ..._util.srgb import to_srgb
-from ...compositing.compositing import Compositing
+from ...compositing.blending import Compositing
 from ...metrics import rmse
 from ...render import render
 from ...scene.camera import Camera

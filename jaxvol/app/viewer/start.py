@@ -6,7 +6,7 @@ import numpy as np
 
 from ..._util.checks import described, finite_array
 from ...arguments import check_arguments
-from ...compositing.compositing import Compositing
+from ...compositing.blending import Compositing
 from ...compositing.modes import Mode, compositing_of
 from ...compositing.projections import Average
 from ...lighting import Phong
