@@ -1,7 +1,7 @@
 """What is a volume's value at a grid coordinate?
 
-Grid coordinates count voxels: node `data[i, j, k]` lies at (i, j, k), so that n nodes span n - 1 cells. Values
-are interpolated trilinearly; outside the grid they are those of its nearest point.
+Grid coordinates count voxels: node `data[i, j, k]` lies at (i, j, k), so that n nodes span n - 1 cells.
+Values are interpolated trilinearly; outside the grid they are those of its nearest point.
 """
 
 from abc import abstractmethod

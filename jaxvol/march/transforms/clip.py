@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, described, finite_array, flag, require
-from ..._util.vec3 import Scalar, Vec3, apart, dot
-from ...scene.frame import Frame
+from ..._util.vec3 import Frame, Scalar, Vec3, apart, dot
 from ...scene.occupancy import Occupancy
 from ...scene.space import Gap, Path, Space
 from ..march import Transform
