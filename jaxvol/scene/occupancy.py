@@ -162,20 +162,8 @@ class Occupancy(eqx.Module):
     size: Vec3
     frame: Frame | None = None
 
-    def sums(self) -> Sums:
-        """For queries about boxes."""
-        return Sums.of(self.occupied)
-
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
-
-        def spread(grid: Bool[Array, "cx cy cz"]) -> Bool[Array, "cx cy cz"]:
-            for axis in range(3):
-                padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
-                n = grid.shape[axis]
-                grid = grid | jax.lax.slice_in_dim(padded, 0, n, axis=axis)
-                grid = grid | jax.lax.slice_in_dim(padded, 2, n + 2, axis=axis)
-            return grid
 
         def go_on(state: tuple[Array, Array, Array]) -> Array:
             reached, _, rounds = state
@@ -183,7 +171,11 @@ class Occupancy(eqx.Module):
 
         def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             reached, distance, rounds = state
-            return spread(reached), distance + (~reached).astype(distance.dtype), rounds + 1
+            return (
+                with_neighbours(reached, jnp.logical_or),
+                distance + (~reached).astype(distance.dtype),
+                rounds + 1,
+            )
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
@@ -203,6 +195,18 @@ class Occupancy(eqx.Module):
     def own_direction(self, direction: Vec3) -> Vec3:
         """A world direction along the grid's axes."""
         return direction if self.frame is None else self.frame.components(direction)
+
+
+def with_neighbours(
+    grid: Shaped[Array, "cx cy cz"], combine: Callable[[Array, Array], Array]
+) -> Shaped[Array, "cx cy cz"]:
+    """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
+    for axis in range(3):
+        padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
+        n = grid.shape[axis]
+        grid = combine(grid, jax.lax.slice_in_dim(padded, 0, n, axis=axis))
+        grid = combine(grid, jax.lax.slice_in_dim(padded, 2, n + 2, axis=axis))
+    return grid
 
 
 def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:

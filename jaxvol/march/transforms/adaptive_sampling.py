@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Int32
 
 from ..._util.checks import number, power_of_two
 from ..._util.vec3 import Scalar
-from ...scene.occupancy import BLOCK
+from ...scene.occupancy import BLOCK, with_neighbours
 from ...scene.space import Ray, Space, node_distance
 from ...scene.variation import MARGIN, Variation, Windows
 from ...xla.xla import gather, in_memory
@@ -155,7 +155,8 @@ def _errors(
         # a cell's front hides its back
         hidden = jnp.minimum(variation.hidden * width, variation.colored) * width / 8
         code = _coded(jnp.maximum(SHARE * error, HIDDEN * hidden))
-        code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
+        number = jnp.minimum(rounds, FARTHEST).astype(jnp.int32)
+        code = jax.lax.fori_loop(0, number, lambda _, code: with_neighbours(code, jnp.maximum), code)
         levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
     return jnp.stack(levels)
 
@@ -170,13 +171,3 @@ def _shortest(space: Space, windows: Windows, distance: Float[Array, "bx by bz"]
         lambda x: jnp.min(node_distance(space, (1, by, bz), jnp.stack([x, zero, zero]))), jnp.arange(bx)
     )
     return jnp.min(layers).astype(distance.dtype)
-
-
-def _dilated(_: Any, codes: Int32[Array, "bx by bz"]) -> Int32[Array, "bx by bz"]:
-    """The largest of each block and its neighbours."""
-    for axis in range(3):
-        ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
-        padded, n = jnp.pad(codes, ends, mode="edge"), codes.shape[axis]
-        for first in (0, 2):
-            codes = jnp.maximum(codes, jax.lax.slice_in_dim(padded, first, first + n, axis=axis))
-    return codes

@@ -71,7 +71,7 @@ class SpaceLeaping(Transform):
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
         occupancy = jax.lax.stop_gradient(occupancy)
         if self.method == "hierarchy":
-            return _Beams(occupancy, occupancy.sums())
+            return _Beams(occupancy, Sums.of(occupancy.occupied))
         distances = _Distances(occupancy, occupancy.distance(), None, None, self.cell)
         if self.method == "distance":
             return distances
@@ -100,7 +100,7 @@ class SpaceLeaping(Transform):
         x, y, z, *direction = cast(column, row)
         box = Box.within(occupancy, (x, y, z), tuple(direction))
         box = jax.tree.map(jnp.ravel, box)
-        beams = stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
+        beams = stretches(occupancy, Sums.of(occupancy.occupied), box, jnp.min(jnp.stack(occupancy.size)))
         first = beams.following[0].astype(beams.near.dtype)
         start = jnp.where(first < beams.following.shape[0], beams.near + first * beams.length, jnp.inf)
         return start.reshape(column.shape[:-1])
