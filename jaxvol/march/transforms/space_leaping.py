@@ -94,8 +94,8 @@ class SpaceLeaping(Transform):
     ) -> Float[Array, "rows cols"]:
         """Up to which distances the beams of the cells that begin at these pixels meet nothing visible."""
         last = self.cell - 1
-        column = column[..., None] + jnp.asarray([0, last, 0, last], column.dtype)
-        row = row[..., None] + jnp.asarray([0, 0, last, last], row.dtype)
+        column = jnp.stack([column, column + last, column, column + last], axis=-1)
+        row = jnp.stack([row, row, row + last, row + last], axis=-1)
         cast = jnp.vectorize(lambda x, y: tuple(part for end in view.ray(x, y) for part in end))
         x, y, z, *direction = cast(column, row)
         box = Box.within(occupancy, (x, y, z), tuple(direction))
