@@ -47,6 +47,9 @@ class _Index(EmptySpaceIndex):
     def skip_to(self, prepared, beam, rays, depth):
         return jnp.where(self.on, self.inner.skip_to(prepared, beam, rays, depth), depth)
 
+    def within_ranges(self):
+        return _Index(self.inner.within_ranges(), self.on)
+
 
 class _Space(Space):
     """A space of which a part is left out, or all of it. What does not differ is that of the whole."""

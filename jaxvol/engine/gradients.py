@@ -184,6 +184,8 @@ def _vjp_by_tiles(
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
     image = Pull.of(scene, perturbed, options, acceleration)
+    if image.empty_space is not None and ranges is not None:
+        image = image._replace(empty_space=image.empty_space.within_ranges())
 
     def tile(sums: Sums, each: Any) -> tuple[Sums, None]:
         number, range_, rendering, cotangent = each

@@ -79,6 +79,10 @@ class EmptySpaceIndex(eqx.Module):
     ) -> Float[Array, " rays"]:
         """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
 
+    def within_ranges(self) -> "EmptySpaceIndex":
+        """What is of use where each ray's first and last visible cell are known."""
+        return self
+
 
 class Transform(eqx.Module):
     """One change to a march. The defaults of the seams change nothing. All methods see one ray."""

@@ -213,9 +213,13 @@ def _earlier(a: Scalar, b: Scalar) -> Scalar:
 
 def _faces(box: Float[Array, "6"]) -> list[HalfSpace]:
     """The half-spaces inside the six faces of a box."""
-    axes = jnp.eye(3, dtype=box.dtype)
-    corners = (box[0::2], axes), (box[1::2], -axes)
-    return [HalfSpace(apart(corner), apart(normal)) for corner, normals in corners for normal in normals]
+    low, high, zero = box[0::2], box[1::2], jnp.zeros_like(box[0])
+    found = []
+    for corner, sign in ((low, 1), (high, -1)):
+        for axis in range(3):
+            x, y, z = (zero + sign * (i == axis) for i in range(3))
+            found.append(HalfSpace(apart(corner), (x, y, z)))
+    return found
 
 
 def _box(box: Arrayable) -> Float[Array, "6"]:

@@ -134,22 +134,28 @@ class SectorFaces(eqx.Module):
         """
         x, y, z = point
         rho = hypot(y, z)
-        tori, cones, planes = jnp.minimum(rho, hypot(x, rho - self.a)), rho, 1e3 * self.size
+        tori, cones = jnp.minimum(rho, hypot(x, rho - self.a)), rho
 
-        def clear(face: ToFace, near: Scalar) -> Scalar:
+        def clear(face: ToFace, near: Scalar | None) -> Scalar:
             # past the tolerance, which a step to the face itself might not pass
             away = jnp.maximum(2 * self._tolerance - face.distance if inside else face.distance, 0)
             fall = face.slope if inside else -face.slope
             falls = fall > 0
-            bend = 8 * away / jnp.maximum(near, jnp.maximum(away, self._tolerance))
-            root = jnp.sqrt(fall * fall + bend)
-            # the root of the quadratic, without differences
-            newton = jnp.where(falls, 2 * away / jnp.where(falls, root + fall, 1), (root - fall) * near / 4)
-            safe = jnp.maximum(away, jnp.minimum(newton, near / 2))
+            if near is None:
+                far = 4 * self.size
+                safe = jnp.where(falls, jnp.minimum(away / jnp.where(falls, fall, 1), far), far)
+            else:
+                bend = 8 * away / jnp.maximum(near, jnp.maximum(away, self._tolerance))
+                root = jnp.sqrt(fall * fall + bend)
+                # the root of the quadratic, without differences
+                newton = jnp.where(
+                    falls, 2 * away / jnp.where(falls, root + fall, 1), (root - fall) * near / 4
+                )
+                safe = jnp.maximum(away, jnp.minimum(newton, near / 2))
             return safe if inside else jnp.where(face.distance > 0, safe, 0)
 
         # it leaves at the first face that it passes, and has entered when it has passed all
-        near = tori, tori, cones, cones, planes, planes
+        near = tori, tori, cones, cones, None, None
         return reduce(jnp.minimum if inside else jnp.maximum, map(clear, to_faces, near))
 
     def _exact(self, origin: Vec3, direction: Vec3, t: Scalar) -> Scalar:

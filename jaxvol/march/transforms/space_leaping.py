@@ -148,6 +148,9 @@ class _Distances(EmptySpaceIndex):
     def any_visible(self, prepared: None) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
+    def within_ranges(self) -> EmptySpaceIndex:
+        return replace(self, starts=None, corner=None)
+
     def skip_to(
         self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
