@@ -1,8 +1,12 @@
-"""Which stretches of a beam of neighbouring rays are empty?
+"""Where is nothing visible? What marches ask, and which stretches of a beam of neighbouring rays are empty.
 
 A beam is a group of rays that share one query. At each distance from their origins, the rays lie in a
 bounding box whose faces move linearly with the distance.
 """
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +24,45 @@ STRETCHES = 128
 """Most stretches of a beam, each of one or several segments."""
 
 ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
+
+
+class EmptySpaceIndex(eqx.Module):
+    """Where nothing is visible, for beams of rays."""
+
+    @abstractmethod
+    def prepare(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Any:
+        """What the other methods need to know about beams, from the boxes around them. `stretch`: length of
+        the shortest leap that is of use."""
+
+    @abstractmethod
+    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
+        """Whether anything may be visible along each beam."""
+
+    @abstractmethod
+    def skip_to(
+        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+
+    def within_ranges(self) -> "EmptySpaceIndex":
+        """What is of use where each ray's first and last visible cell are known."""
+        return self
+
+
+class View(NamedTuple):
+    """The camera's rays, as `Transform.empty_space` may ask for them.
+
+    - `ray`: origin and unit direction of the ray through a column and a row.
+    - `size`: (width, height).
+    - `corner`: (column, row) of the image's first pixel, which keys random numbers.
+    - `first_hit`: marches the rays of these columns and rows, with leaps by an index, and returns the
+      distances to their first visible samples, infinite where there are none.
+    """
+
+    ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
+    size: tuple[int, int]
+    corner: tuple[Int[Array, ""], Int[Array, ""]]
+    first_hit: Callable[[EmptySpaceIndex, Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
 
 
 class Box(eqx.Module):

@@ -18,20 +18,18 @@ answers of all transforms are combined, so that they compose.
 How many steps long each cell is, one by default, is decided in `strides.py`.
 """
 
-from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._util.checks import check_answer, described, integer, number
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Scalar
 from ..scene.occupancy import Occupancy
 from ..scene.space import Affine, Ray, Space
 from ..scene.volume import Volume
-from .beams import Box
+from .beams import EmptySpaceIndex, View
 
 
 Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
@@ -43,45 +41,6 @@ class Cell(eqx.Module):
     front: Scalar
     width: Scalar
     cut: Bool[Array, ""]
-
-
-class View(NamedTuple):
-    """The camera's rays, as `Transform.empty_space` may ask for them.
-
-    - `ray`: origin and unit direction of the ray through a column and a row.
-    - `size`: (width, height).
-    - `corner`: (column, row) of the image's first pixel, which keys random numbers.
-    - `first_hit`: marches the rays of these columns and rows, with leaps by an index, and returns the
-      distances to their first visible samples, infinite where there are none.
-    """
-
-    ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
-    size: tuple[int, int]
-    corner: tuple[Int[Array, ""], Int[Array, ""]]
-    first_hit: Callable[["EmptySpaceIndex", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
-
-
-class EmptySpaceIndex(eqx.Module):
-    """Where nothing is visible, for beams of rays."""
-
-    @abstractmethod
-    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
-        """What the other methods need to know about beams, from the boxes around them. `stretch`: length of
-        the shortest leap that is of use."""
-
-    @abstractmethod
-    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
-        """Whether anything may be visible along each beam."""
-
-    @abstractmethod
-    def skip_to(
-        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
-        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
-
-    def within_ranges(self) -> "EmptySpaceIndex":
-        """What is of use where each ray's first and last visible cell are known."""
-        return self
 
 
 class Transform(eqx.Module):

@@ -14,8 +14,8 @@ from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
 from ...xla.xla import gather
-from ..beams import Box, Stretches, stretches
-from ..march import EmptySpaceIndex, Transform, View
+from ..beams import Box, EmptySpaceIndex, Stretches, View, stretches
+from ..march import Transform
 
 
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
