@@ -10,7 +10,7 @@ from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
 from .app.automatic import automatic_transfer as automatic_transfer
 from .app.viewer import serve as serve, view as view
 from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
-from .compositing.compositing import Compositing as Compositing, Over as Over, Weighting as Weighting
+from .compositing.blending import Compositing as Compositing, Over as Over, Weighting as Weighting
 from .compositing.isosurface import Isosurface as Isosurface
 from .compositing.projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .compositing.selection import FirstVisible as FirstVisible, Selection as Selection

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import all_finite, check_answer, described
 from ._util.vec3 import Scalar, Vec3
-from .compositing.compositing import Compositing, Fragment, Outputs, Over, Weighting
+from .compositing.blending import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
 from .march import strides

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ._util.checks import Arrayable, finite_array
 from ._util.vec3 import apart
-from .compositing.compositing import Compositing
+from .compositing.blending import Compositing
 from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting

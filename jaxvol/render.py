@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, require
-from .compositing.compositing import Compositing
+from .compositing.blending import Compositing
 from .compositing.modes import Mode, compositing_of
 from .engine.devices import Devices
 from .engine.image import Adjoint, RenderOutputs, render_scene

@@ -1,4 +1,4 @@
-"""Points, directions and colours as tuples of three scalars: arithmetic, rotation, and even directions.
+"""Points, directions and colours as tuples of three scalars: arithmetic, frames, and even directions.
 
 Batched over rays, three arrays of length n run 3 to 5 times faster in a loop than one of shape
 (n, 3), whose components XLA must extract and recombine at every step. Functions of a single point
@@ -9,6 +9,7 @@ position, an image) is stacked.
 import math
 from typing import TypeAlias
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -89,3 +90,36 @@ def golden_spiral(n: int) -> Float[np.ndarray, "n 3"]:
     z = 1 - (2 * np.arange(n) + 1) / n
     around, across = math.pi * (1 + math.sqrt(5)) * np.arange(n), np.sqrt(1 - z**2)
     return np.stack([across * np.cos(around), across * np.sin(around), z], axis=-1)
+
+
+class Frame(eqx.Module):
+    """A Cartesian frame of coordinates, in world length.
+
+    - `origin`: the world point that has coordinates 0.
+    - `axes`: world directions of its axes: unit vectors that are orthogonal to each other.
+    """
+
+    origin: Vec3
+    axes: tuple[Vec3, Vec3, Vec3]
+
+    @classmethod
+    def of(cls, origin: Float[Array, "3"], direction: Float[Array, "3 3"]) -> "Frame":
+        """`direction`: its columns are the axes."""
+        x, y, z = (apart(direction[:, axis]) for axis in range(3))
+        return cls(apart(origin), (x, y, z))
+
+    def coordinates(self, point: Vec3) -> Vec3:
+        """Coordinates of a world point."""
+        (x, y, z), (ox, oy, oz) = point, self.origin
+        return self.components((x - ox, y - oy, z - oz))
+
+    def components(self, direction: Vec3) -> Vec3:
+        """Components of a world direction along the axes."""
+        x, y, z = (dot(axis, direction) for axis in self.axes)
+        return x, y, z
+
+    def point(self, coordinates: Vec3) -> Vec3:
+        """World point of coordinates."""
+        a, b, c = coordinates
+        x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(self.origin, *self.axes, strict=True))
+        return x, y, z

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.vec3 import apart
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..compositing.isosurface import Isosurface
 from ..compositing.modes import Mode
 from ..march.march import March

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from .._util.checks import Arrayable
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..compositing.modes import Mode
 from ..lighting.shading import Lighting
 from ..march.march import March

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration

@@ -14,13 +14,13 @@ from ..march.transforms.alpha_correction import AlphaCorrection
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Classify, Measured, Transfer
 from ..scene.volume import Volume
-from .compositing import Fragment, Outputs
+from .blending import Fragment, Outputs
 from .selection import RaySampler, Selection
 
 
 class Crossing(NamedTuple):
-    """The depths at both ends of the first cell within which the value is crossed, infinite if there is none
-    so far; and whether values rise through it."""
+    """Depths of both ends of the first cell in which the value is crossed, infinite if there is none, and
+    whether values rise there."""
 
     front: Scalar
     back: Scalar
@@ -31,31 +31,30 @@ class Isosurface(Selection[Crossing]):
     """The surface on which the volume has a value, where a ray first crosses it: opaque, in the colour that
     the transfer function has for the value, shaded by the lighting, if there is one.
 
-    A cell holds the surface if the value lies between those at its two ends: one is below it, the other is
-    not. There the root of the interpolated field along the ray is found by bisection, down to the rounding of
-    depths (in float32 and grids of 256³ voxels, some 10⁻⁴ of a voxel). The volume's faces are no surface.
+    A cell holds the surface if the field is below the value at one of its ends, and not at the other. There
+    the root of the interpolated field along the ray is found by bisection, down to the rounding of depths (in
+    float32 and grids of 256³ voxels, some 10⁻⁴ of a voxel). The volume's faces are no surface.
     `Rendering.depth` is that of the root, `Rendering.normal` the unit vector -∇v / |∇v| there, which points
-    to lower values; ∇v is `Volume.gradient` by central differences, with an error of O(spacing²).
+    to lower values; ∇v is `Volume.gradient`, with an error of O(spacing²).
 
-    Cells are judged by both ends whatever `March.quadrature` says, and are cut at the exit even without
-    `AlphaCorrection`. They compose with all transforms. Cells without a crossing are the empty ones, in which
-    `EmptySpaceJitter` shifts; `SpaceLeaping` leaps over blocks whose range does not hold the value.
+    `March.quadrature` has no effect, and cells are cut at the exit even without `AlphaCorrection`. Cells
+    without a crossing are the empty ones, in which `EmptySpaceJitter` shifts; `SpaceLeaping` leaps over
+    blocks whose range does not hold the value.
 
     **What is missed:** a ray that crosses the value twice within a cell, as in a sheet thinner than a step,
-    sees neither; of three crossings within a cell, any may be found. `Jitter` begins its cells up to a step
-    behind the entry, and misses what lies before (not with `front_residual`).
+    sees neither; of three crossings within a cell, any may be found. `Jitter` misses what lies before its
+    first cell (not with `front_residual`).
 
     **Arguments:**
 
     - `value`: of the volume, on the surface. It has a gradient.
 
-    Gradients follow from the implicit function theorem, by one step of Newton's method at the root: of depth
-    and normal, by the value, the voxels, spacing and camera. They are those of a fixed crossing: the jumps at
-    silhouettes, where a ray loses the surface, have none, and where a ray only touches it, the gradient of
-    depth grows without bound. Inside a plane of voxels, where the interpolated field has an edge, they are
-    those of one side.
+    Gradients of depth and normal, by the value, the voxels, spacing and camera, follow from the implicit
+    function theorem. They miss the jumps at silhouettes, where a ray loses the surface, and where a ray only
+    touches it, that of depth grows without bound. In a plane of voxels, where the interpolated field has an
+    edge, they are those of one side.
 
-    Where it fails, and where not: `experiments/stability.py`, "isosurfaces of thin sheets".
+    Where it fails: `experiments/stability.py`, "isosurfaces of thin sheets".
 
     **Raises:** `ValueError` for a value that is not a finite number.
     """
@@ -66,7 +65,6 @@ class Isosurface(Selection[Crossing]):
         self.value = number("value", value)
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
-        """What is looked for, by cells whose two ends are measured, up to the exit."""
         cut = () if march.ends_at_exit else (AlphaCorrection(),)
         integrated = March(1.0, (*march.transforms, *cut), "preintegrated", max_samples=march.max_samples)
         # not as an argument, which would be checked once more
@@ -115,12 +113,12 @@ class Isosurface(Selection[Crossing]):
         def halved(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
             near, far = bracket
             middle = (near + far) / 2
-            # by the march's own direction: values at the ends, computed again, may round to the other side
+            # not by values at the ends: computed again, they may round to the other side
             behind = (sampler.value(middle) >= self.value) == state.rises
             return jnp.where(behind, near, middle), jnp.where(behind, middle, far)
 
         near, far = jax.lax.fori_loop(0, jnp.finfo(front.dtype).nmant, halved, (front, back))
-        # of both ends the one below the value: the other may lie where all values are equal to it
+        # the end below the value: around the other one, all values may be equal to it
         return jnp.where(state.rises, near, far)
 
     def _implicit(self, sampler: RaySampler, root: Scalar) -> Scalar:

@@ -5,7 +5,7 @@ from typing import Any, Literal, TypeAlias
 import jax
 
 from .._util.checks import described
-from .compositing import Compositing, Over, Weighting
+from .blending import Compositing, Over, Weighting
 from .projections import Average, Maximum, Minimum
 from .selection import Selection
 

@@ -18,16 +18,16 @@ from ..march.march import March
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Classification, Classify, Measured, Transfer
 from ..scene.volume import Volume
-from .compositing import Fragment, Outputs, Weighting
+from .blending import Fragment, Outputs, Weighting
 from .selection import RaySampler, Selection
 
 
 Chosen: TypeAlias = tuple[Scalar, Scalar]
-"""Rank and depth of the sample that is chosen."""
+"""Score and depth of the sample that is chosen."""
 
 
 class Extreme(Selection[Chosen]):
-    """A mode that shows the sample of the highest rank. `Maximum` says what holds for all of them."""
+    """A mode that shows the sample of the highest score. `Maximum` says what holds for all of them."""
 
     thickness: Float[Array, ""]
 
@@ -35,16 +35,16 @@ class Extreme(Selection[Chosen]):
         self.thickness = number("thickness", thickness, above=0)
 
     @abstractmethod
-    def rank(self, value: Scalar) -> Scalar:
-        """The highest for the sample that is shown."""
+    def score(self, value: Scalar) -> Scalar:
+        """Score; the maximum wins."""
 
     def begin(self, zero: Scalar, outputs: Outputs | None) -> Chosen:
         return zero - jnp.inf, zero + jnp.inf
 
     def add(self, state: Chosen, fragment: Fragment) -> Chosen:
-        (best, depth), rank = state, self.rank(fragment.value)
-        higher = fragment.valid & ~(rank <= best) & ~jnp.isnan(best)
-        return jnp.where(higher, rank, best), jnp.where(higher, fragment.depth, depth)
+        (best, depth), score = state, self.score(fragment.value)
+        higher = fragment.valid & ~(score <= best) & ~jnp.isnan(best)
+        return jnp.where(higher, score, best), jnp.where(higher, fragment.depth, depth)
 
     def depth(self, state: Chosen) -> Scalar:
         return state[1]
@@ -60,15 +60,14 @@ class Maximum(Extreme):
 
     Values are compared at the samples of the march: at a smooth peak the greatest of them is less than that
     of the ray by O(step²), and a peak thinner than a step may be missed. Of equal values, the nearest is
-    chosen. NaN ranks above all numbers, so that a fault of the volume shows. Where cells are integrated
-    (`quadrature="preintegrated"`), the means of the values at their two ends are compared, and what lies in
+    chosen. NaN is above all numbers, so that a fault of the volume shows. Under
+    `quadrature="preintegrated"`, means of the values at the two ends of cells are compared, and what lies in
     the middle of the cell is shown.
 
     `Rendering.depth` is that of the sample, infinite where it is transparent.
 
     `SpaceLeaping` leaps over blocks in which neither the values nor any that are less are visible: air, under
-    most transfer functions. A ray still takes samples of all other blocks, also of those that cannot raise
-    the greatest value it has found. `"min_distance"` is refused.
+    most transfer functions. `"min_distance"` is refused.
 
     **Arguments:**
 
@@ -85,15 +84,11 @@ class Maximum(Extreme):
     Source: VTK's MAXIMUM_INTENSITY_BLEND; Wallis et al. 1989.
     """
 
-    def __init__(self, thickness: Any = 1.0):
-        super().__init__(thickness)
-
-    def rank(self, value: Scalar) -> Scalar:
+    def score(self, value: Scalar) -> Scalar:
         return value
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Blocks in which some value is visible, or any that is less: where a ray's maximum lies in another
-        block, it is invisible."""
+        """Blocks in which some value is visible, or any that is less: a maximum in another is invisible."""
         return transfer.visible(Blocks(jnp.full_like(blocks.low, jnp.nanmin(blocks.low)), blocks.high, None))
 
 
@@ -110,10 +105,7 @@ class Minimum(Extreme):
     Source: VTK's MINIMUM_INTENSITY_BLEND.
     """
 
-    def __init__(self, thickness: Any = 1.0):
-        super().__init__(thickness)
-
-    def rank(self, value: Scalar) -> Scalar:
+    def score(self, value: Scalar) -> Scalar:
         return -value
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
@@ -125,14 +117,12 @@ class Average(Weighting):
     """The mean value along a ray, as classified by the transfer function.
 
     With the values v_k in cells of widths e_k, the mean is Σ e_k v_k / Σ e_k over what lies in the volume. It
-    is classified once. What is transparent counts like all else, so nothing is leapt over, and
-    `EmptySpaceJitter`, which waits for a transparent cell, does not shift. `Rendering.depth` is the middle of
-    the part of the ray that is in the volume.
+    is classified once. What is transparent counts, too, so that nothing is leapt over, and `EmptySpaceJitter`
+    does not shift. `Rendering.depth` is the middle of the ray's part in the volume.
 
-    With `AlphaCorrection`, the mean of values that are linear along the ray is exact but for rounding by the
-    quadratures `"midpoint"` and `"preintegrated"`; by `"left"` it errs by half their change over one step.
-    In general the error falls with the order of the quadrature. Without `AlphaCorrection`, the last cell
-    counts as a whole.
+    With `AlphaCorrection`, the mean of values that are linear along the ray is exact but for rounding under
+    `"midpoint"` and `"preintegrated"`; under `"left"` it errs by half their change over one step. Without
+    `AlphaCorrection`, the last cell counts as a whole.
 
     **Arguments:**
 
@@ -160,8 +150,7 @@ class Average(Weighting):
                 "compositing by an average needs a transfer function that depends on the value alone; "
                 f"{type(transfer).__name__} reads more."
             )
-        # of all cells of a ray, also of one that reaches past the exit, the optical depth is at most 1, where
-        # float32 resolves it well
+        # so that the optical depth of a ray is at most 1, where float32 resolves it well
         longest = march.locate(volume).diagonal + march.step
         return _Values(jax.lax.stop_gradient(1 / longest)), march
 
@@ -174,13 +163,13 @@ class Average(Weighting):
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         if classification.light is not None:
             raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
-        # the entries that fill up a chunk of pixels may be 0, and a derivative there must not be NaN
+        # of rays that only fill up a chunk, sums are 0, and derivatives must not be NaN
         mean = sums[0] / jnp.where(sums[3] == 0, 1, sums[3])
         return layer(*classification.classify(classification.searched((mean,))), self.thickness)
 
 
 class _Values(Transfer):
-    """A fog that shows the volume's values: the value is the red part of its colour."""
+    """A fog whose red is the volume's value."""
 
     extinction: Float[Array, ""]
 

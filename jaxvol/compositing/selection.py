@@ -1,4 +1,4 @@
-"""Which place on a ray does a pixel show? Modes that select a depth, and what they may ask for there."""
+"""Which depth of a ray does a pixel show? Modes that pick one, such as that of the greatest value."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -12,13 +12,13 @@ from ..lighting.shading import Sample
 from ..scene.occupancy import Blocks
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured, Transfer
-from .compositing import Compositing, Fragment, Outputs, State
+from .blending import Compositing, Fragment, Outputs, State
 
 
 class RaySampler(NamedTuple):
     """Measures, classifies and shades what is on a ray. Depths are past the entry.
 
-    - `depth_scale`: a factor for depths that stand for a number of steps. It is 1, and grows with the step.
+    - `depth_scale`: 1, with the derivative that depths of a fixed number of steps have by the step.
     - `gradient`: of the volume's value at a world point, by that point; None during the march.
     """
 
@@ -44,15 +44,14 @@ class RaySampler(NamedTuple):
         return along(self.ray.entry, self.ray.direction, self.differentiable_depth(depth))
 
     def differentiable_depth(self, depth: Scalar) -> Scalar:
-        """The same depth, as a number to compute with, as in a fog: its derivative by the step is that of so
-        many steps."""
+        """The same depth, which moves with the step as its sample does: to compute with, as in a fog."""
         return depth * self.depth_scale
 
     def color(
         self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
     ) -> Vec3:
-        """The colour of what was measured and classified at this depth, or around it, shaded where there is a
-        lighting. `transmittance`: between the place and the camera."""
+        """The colour of what was measured and classified at this depth, shaded if there is a lighting.
+        `transmittance`: between there and the camera."""
         color, extinction = classified
         if self.classification.light is None:
             return color
@@ -62,42 +61,40 @@ class RaySampler(NamedTuple):
         )
 
     def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
-        """Colour, shaded where there is a lighting, and extinction at this depth, which nothing hides."""
+        """Colour, shaded if there is a lighting, and extinction at this depth; nothing in front hides it."""
         measured = self.measured(depth)
         classified = self.classification.classify(measured)
         return self.color(depth, measured, classified, jnp.ones_like(depth)), classified[1]
 
 
 class Selection(Compositing[State]):
-    """A mode that compares the samples of a ray and chooses a depth. The pixel is computed from what is
+    """A mode that picks one depth on a ray by comparing samples. `pixel` then computes the pixel from what is
     there, once for each ray, after the march.
 
-    Gradients are those of `pixel`. What the march found is constant to them: the depths in its state stay the
-    same number of steps past the entry, while the ray, the step and what the ray meets change. They miss that
-    a pixel jumps where the choice does, and how the sample of a cell that is cut at a face moves with that
-    face. Parameters may have gradients, through `pixel`. The gradient of voxels takes an array of their size
-    for each fetch of `pixel`, for each chunk of 2048 pixels: slow for large volumes.
+    Gradients are those of `pixel`, also of parameters: the chosen depth stays the same number of steps past
+    the entry, while the ray, the step and what the ray meets change. They miss the jumps of a pixel where the
+    choice changes, and that a cell which is cut at a face moves with that face. The gradient of voxels takes
+    an array of their size for each fetch of `pixel`, for each chunk of 2048 pixels: slow for large volumes.
     """
 
     @abstractmethod
     def depth(self, state: State) -> Scalar:
-        """The depth that is chosen, past the entry; infinite as long as there is none."""
+        """The chosen depth, past the entry; infinite if there is none."""
 
     @abstractmethod
     def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
         """Premultiplied colour and opacity, and the depth that is reported (infinite where nothing is
-        visible), of a ray for which a depth was chosen. It is differentiated by JAX. Depths, of the state and
-        in the answer, are numbers of steps to it: to compute with one, take
+        visible), of a ray for which a depth was chosen. JAX differentiates it. To compute with a depth, take
         `sampler.differentiable_depth(depth)`."""
 
     def normal(self, sampler: RaySampler, depth: Scalar) -> Float[Array, "3"] | None:
-        """The unit normal, in the world, of what is shown at the depth that `pixel` reports; by default None.
-        It is differentiated by JAX, too."""
+        """The unit normal, in the world, at the depth that `pixel` reports; None by default. JAX
+        differentiates it."""
         return None
 
     @property
     def has_normal(self) -> bool:
-        """Whether `normal` is not None."""
+        """Whether `normal` is overridden."""
         return type(self).normal is not Selection.normal
 
     @property
@@ -114,7 +111,7 @@ class Selection(Compositing[State]):
         return jnp.ones_like(self.depth(state))
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """By default all blocks: what is transparent may still be chosen."""
+        """All blocks, by default: what is transparent may still be chosen."""
         return jnp.ones(blocks.low.shape, bool)
 
 

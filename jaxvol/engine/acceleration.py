@@ -18,7 +18,8 @@ from jaxtyping import Array, Int, Shaped, UInt32
 from .._util.checks import check_answer
 from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
-from ..march.march import EmptySpaceIndex, March, View
+from ..march.beams import EmptySpaceIndex, View
+from ..march.march import March
 from ..march.strides import stride_control
 from ..ray import Scene, end
 from ..scene.camera import GivenRays

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3, along
-from ..compositing.compositing import Weighting
+from ..compositing.blending import Weighting
 from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering

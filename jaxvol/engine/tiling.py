@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import equinox as eqx
 from jax.sharding import Mesh
 
-from ..compositing.compositing import Outputs
+from ..compositing.blending import Outputs
 from ..xla.compaction import CHUNK
 from ..xla.platform import on_gpu
 

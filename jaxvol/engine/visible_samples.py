@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Scalar, Vec3, along
-from ..compositing.compositing import Composite, Weighting
+from ..compositing.blending import Composite, Weighting
 from ..lighting.shading import Sample, Shader
 from ..march.march import Cell
 from ..ray import Progress, Scene, stopped

@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..compositing.compositing import Outputs, Weighting
-from ..march.beams import Box
-from ..march.march import EmptySpaceIndex, March
+from ..compositing.blending import Outputs, Weighting
+from ..march.beams import Box, EmptySpaceIndex
+from ..march.march import March
 from ..march.strides import steps_of
 from ..ray import Progress, Scene, begin, front, is_sample, measure, move, opacity, pieces, with_stride
 from ..scene.occupancy import Occupancy

@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._util.checks import Arrayable, described, finite, finite_array, require
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march.march import March

@@ -1,8 +1,12 @@
-"""Which stretches of a beam of neighbouring rays are empty? Bounding boxes around beams.
+"""Where is nothing visible? What marches ask, and which stretches of a beam of neighbouring rays are empty.
 
 A beam is a group of rays that share one query. At each distance from their origins, the rays lie in a
 bounding box whose faces move linearly with the distance.
 """
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,15 +21,53 @@ from ..xla.sharding import varying
 
 
 STRETCHES = 128
-"""Maximum number of stretches of a beam. If crossing the volume takes more segments (samples taken at once)
-than this, a stretch covers several."""
+"""Most stretches of a beam, each of one or several segments."""
 
 ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
 
 
+class EmptySpaceIndex(eqx.Module):
+    """Where nothing is visible, for beams of rays."""
+
+    @abstractmethod
+    def prepare(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Any:
+        """What the other methods need to know about beams, from the boxes around them. `stretch`: length of
+        the shortest leap that is of use."""
+
+    @abstractmethod
+    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
+        """Whether anything may be visible along each beam."""
+
+    @abstractmethod
+    def skip_to(
+        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
+    ) -> Float[Array, " rays"]:
+        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+
+    def within_ranges(self) -> "EmptySpaceIndex":
+        """What is of use where each ray's first and last visible cell are known."""
+        return self
+
+
+class View(NamedTuple):
+    """The camera's rays, as `Transform.empty_space` may ask for them.
+
+    - `ray`: origin and unit direction of the ray through a column and a row.
+    - `size`: (width, height).
+    - `corner`: (column, row) of the image's first pixel, which keys random numbers.
+    - `first_hit`: marches the rays of these columns and rows, with leaps by an index, and returns the
+      distances to their first visible samples, infinite where there are none.
+    """
+
+    ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
+    size: tuple[int, int]
+    corner: tuple[Int[Array, ""], Int[Array, ""]]
+    first_hit: Callable[[EmptySpaceIndex, Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
+
+
 class Box(eqx.Module):
-    """Bounding box of a beam's rays at each distance from their origins: at the distance `near + u`, from
-    `low + u low_rate` to `high + u high_rate`, in cells of the occupancy."""
+    """Bounding box of a beam's rays at the distance `near + u` from their origins: from `low + u low_rate` to
+    `high + u high_rate`, in cells of the occupancy."""
 
     near: Float[Array, "*beams"]
     far: Float[Array, "*beams"]
@@ -36,7 +78,7 @@ class Box(eqx.Module):
 
     @classmethod
     def around(cls, occupancy: Occupancy, rays: Ray) -> "Box":
-        """The box of rays; the last axis is that of a beam's rays. Rays that miss the volume are ignored."""
+        """The box of rays, by beam and ray. Rays that miss the volume are ignored."""
         rays = jax.lax.stop_gradient(rays)
         hit = rays.length > 0
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
@@ -48,19 +90,19 @@ class Box(eqx.Module):
 
     @classmethod
     def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
-        """The box of all camera rays between a beam's corner rays; the last axis is that of the corners."""
+        """The box of all camera rays between a beam's corner rays, by beam and corner."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
         origin, direction = occupancy.own_point(origin), occupancy.own_direction(direction)
         spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
         x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
         radius = jnp.sqrt(sum(span**2 for span in spans)) / 2
-        # A direction between the corners is an average of theirs, normalized, which lengthens it by at most 1
+        # A direction between the corners is their normalized average: normalizing lengthens it by at most 1
         # minus the cosine of the widest angle to the mean direction.
         axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
         cosine = sum(a * d for a, d in zip(axis, direction, strict=True))
         bulge = 1 - jnp.min(cosine, axis=-1) / jnp.sqrt(sum(a[..., 0] ** 2 for a in axis)) + 1e-6
-        # bounds for all rays: parallel rays have different origins, hence the nearest and farthest corner
+        # parallel rays have different origins, hence the nearest and the farthest corner
         nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
         spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
         near, far = jnp.maximum(nearest - radius - spread, 0), farthest + radius + spread
@@ -87,14 +129,9 @@ class Box(eqx.Module):
         for s, d, size, corner in zip(start, direction, occupancy.size, occupancy.origin, strict=True):
             # allows for rounding a ray's start to float32 when the camera is far away
             slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
-            s, d = (s - corner) / size, d / size
+            s, d, bulges = (s - corner) / size, d / size, bulge / size
             sides.append(
-                (
-                    least(s, 1) - slack,
-                    least(s, -1) + slack,
-                    least(d, 1) - bulge / size,
-                    least(d, -1) + bulge / size,
-                )
+                (least(s, 1) - slack, least(s, -1) + slack, least(d, 1) - bulges, least(d, -1) + bulges)
             )
         low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
         return cls(near, far, low, high, low_rate, high_rate)
@@ -107,10 +144,9 @@ class Box(eqx.Module):
 
 
 class Stretches(eqx.Module):
-    """Which stretches of beams are empty.
+    """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on.
 
-    - `near`: distance from the ray origins to the first stretch. `length`: of each stretch.
-    - `following`: for each stretch, the first at or behind it that is not empty.
+    `following`: for each stretch, the first one from there on that is not empty, or their number.
     """
 
     near: Float[Array, " beams"]
@@ -119,7 +155,7 @@ class Stretches(eqx.Module):
 
 
 def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
-    """Find the next occupied stretch for each stretch of each beam, from the last stretch to the first."""
+    """The stretches of beams in these boxes. `stretch`: the shortest that is of use."""
     across = jnp.maximum(box.far - box.near, 0)
     # a whole multiple of `stretch`, the same for all beams, so that no segment is cut in two
     multiple = jnp.ceil(jnp.max(across) / (stretch * STRETCHES))
@@ -134,7 +170,7 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
             inside &= (b >= 0) & (a <= n)
 
         def cells(corner: Vec3) -> Index:
-            """Cell indices of a corner, clipped to the grid; arbitrary for boxes outside it."""
+            """Cell indices of a corner, arbitrary for boxes outside the grid."""
             x, y, z = (
                 jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
                 for c, n in zip(corner, shape, strict=True)

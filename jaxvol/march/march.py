@@ -1,9 +1,9 @@
 """Where is the next sample, and which part of the ray does it stand for?
 
-A march is a step length and a tuple of transforms. Without any it is Levoy's ray casting: samples at depths
-0, d, 2d, … past the entry, each of which stands for a cell of width d behind it, up to the exit. A transform
-is one idea of one paper. It overrides one of these methods, the seams, or two, and leaves the others alone.
-At each seam the answers of all transforms are combined, so that they compose.
+A march is a step length d and a tuple of transforms. Without transforms it is Levoy's ray casting: samples at
+depths 0, d, 2d, … past the entry, each of which stands for the cell of width d behind it, up to the exit. A
+transform is one idea of one paper: it overrides one or two of these methods, the seams. At each seam the
+answers of all transforms are combined, so that they compose.
 
 | seam | question | default answer |
 |---|---|---|
@@ -18,88 +18,41 @@ At each seam the answers of all transforms are combined, so that they compose.
 How many steps long each cell is, one by default, is decided in `strides.py`.
 """
 
-from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._util.checks import check_answer, described, integer, number
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Scalar
 from ..scene.occupancy import Occupancy
 from ..scene.space import Affine, Ray, Space
 from ..scene.volume import Volume
-from .beams import Box
+from .beams import EmptySpaceIndex, View
 
 
 Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
 
 
 class Cell(eqx.Module):
-    """The piece of a ray that one sample stands for: from depth `front`, of this `width`.
-
-    `cut` tells that it was shortened at the volume's exit.
-    """
+    """The piece of a ray that one sample stands for. `cut`: whether the volume's exit shortened it."""
 
     front: Scalar
     width: Scalar
     cut: Bool[Array, ""]
 
 
-class View(NamedTuple):
-    """The image that is rendered.
-
-    - `ray`: origin and unit direction of the ray through a column and a row.
-    - `size`: (width, height).
-    - `corner`: pixel (column, row) that keys the random numbers of the ray through column 0 and row 0.
-    - `first_hit`: distances along the rays of columns and rows to their first visible sample, infinite where
-      there is none. It marches these rays, which leap by the index that it is given.
-    """
-
-    ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
-    size: tuple[int, int]
-    corner: tuple[Int[Array, ""], Int[Array, ""]]
-    first_hit: Callable[["EmptySpaceIndex", Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
-
-
-class EmptySpaceIndex(eqx.Module):
-    """Where nothing is visible. It is asked about beams of rays."""
-
-    @abstractmethod
-    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Any:
-        """What `any_visible` and `skip_to` need to know about these beams, from the boxes around them;
-        computed once. `stretch`: the length of a segment; leaps shorter than that are of no use."""
-
-    @abstractmethod
-    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
-        """Whether anything may be visible along each beam."""
-
-    @abstractmethod
-    def skip_to(
-        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
-        """For some rays, of these beams: a depth of at least `depth`, before which nothing is visible."""
-
-    def within_ranges(self) -> "EmptySpaceIndex":
-        """The part of it that is of use where each ray's first and last visible cell are known."""
-        return self
-
-
 class Transform(eqx.Module):
-    """One change to a march. Override the seam that the idea is about; the defaults change nothing.
-
-    All methods see one ray. Engines batch them.
-    """
+    """One change to a march. The defaults of the seams change nothing. All methods see one ray."""
 
     def locate(self, space: Space, volume: Volume) -> Space:
         """The space in which rays meet the volume, in place of `space`."""
         return space
 
     def clip(self, space: Space) -> Space:
-        """The same space, of which a part is left out: rays are shorter, or have more gaps. Called once all
-        transforms have answered `locate`."""
+        """The same space without a part of it: rays are shorter, or have more gaps. Called after the
+        `locate` of all transforms."""
         return space
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
@@ -107,33 +60,30 @@ class Transform(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps the samples after the ray's first transparent one move, in [-1, 0].
+        """By how many steps all samples behind the ray's first cell of opacity 0 move, in [-1, 0].
 
-        A march shifts each ray once, after its first cell of opacity 0, so that at most this cell is sampled
-        twice. Everywhere else rays advance by whole steps. The shifts of several transforms are summed, and
-        clipped to [-1, 0]."""
+        Otherwise rays advance by whole steps. The shifts of all transforms are summed and clipped."""
         return jnp.zeros_like(ray.length)
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
-        """Where nothing is visible; None if that is unknown. Called once for each image. `view`: of the
-        image; None for `render_rays`."""
+        """Where nothing is visible; None if that is unknown. Called once for each image. `view`: None for
+        `render_rays`."""
         return None
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
-        is fixed; where it is more than one, a piece may have width 0."""
+        is static; of several, some may have width 0."""
         return (cell,)
 
     joins: ClassVar[bool] = False
-    """Of a transform that overrides `cut`: whether each piece begins where the one in front of it ends, also
-    from cell to cell, unless it lies past the exit. Pieces that are integrated (`quadrature="preintegrated"`)
-    then share what is measured where they meet."""
+    """Whether each piece that `cut` returns begins where the one in front of it ends, also from cell to cell,
+    except past the exit. Pieces that are integrated then share the value where they meet."""
 
     ends_at_exit: ClassVar[bool] = False
-    """Whether `cut` ends at the exit what reaches past it."""
+    """Whether `cut` shortens what reaches past the exit."""
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
-        """Whether the ray is finished, given the answer of the transforms before this one."""
+        """Whether the ray is finished, given the answer of the transforms before."""
         return stopped
 
 
@@ -144,27 +94,22 @@ class March(eqx.Module):
 
     - `step`: distance d between samples, world length, > 0.
     - `transforms`: applied in this order at every seam; none may be given twice.
-    - `quadrature`: what a cell's colour and extinction are. `"left"`: those at its front, as the papers do;
-      the error falls with d. `"midpoint"`: those in its middle; the error falls with d².
+    - `quadrature`: how a cell's colour and extinction follow from the values along it.
+      `"left"`: those at its front, as in the papers; the error falls with d.
+      `"midpoint"`: those in its middle; the error falls with d².
       `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
-      along it, the colour weighted by the extinction. The error falls with d², too, and a narrow peak of the
-      transfer function counts wherever the two values lie on either side of it. A mean does not know that
-      what is in front in a cell hides what is behind: for a cell of opacity α and optical depth τ, this errs
-      by at most α τ / 8 times the difference of its colours. Where the transfer function is neither steep nor
-      has narrow peaks, `"midpoint"` may be more accurate, in half to two thirds of the time. It takes one
-      fetch for each cell and one more for each segment, or two for each piece where a transform's pieces are
-      not joined (`Transform.joins`). Extinction times the range of values must stay below the greatest number
-      of their type, 3e38 for float32: the integral over values is infinite beyond, and the image NaN.
-      Where two neighbouring control points have extinction 0, the gradient by both together is exact; how it
-      is divided between them is off by some 1e-4 of it, since the colour of a cell without extinction is not
-      weighted.
-      Of a labelled volume, a cell has the label in its middle. Modes that select a sample (`Selection`) take
-      it there, too, and light is computed there.
+      along it, the colour weighted by the extinction. The error falls with d², too, and narrow peaks of the
+      transfer function are not missed. Where there are none, `"midpoint"` may be more accurate, in half to
+      two thirds of the time. What the front of a cell hides of its back is neglected: for a cell of opacity α
+      and optical depth τ, this errs by at most α τ / 8 times the difference of its colours. Extinction times
+      the range of values must stay below 3e38 in float32, or the image is NaN. Between two control points of
+      extinction 0, the gradient is exact for their sum, and for each off by some 1e-4 of it.
+      A cell has the label, and the light, of its middle, which is also what a `Selection` compares.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
       2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
       default 131 072, so that every march ends.
 
-    What is thinner than a step is missed by a part of the rays. Where a march fails, and where not:
+    What is thinner than a step is missed by a part of the rays. Where a march fails:
     `experiments/stability.py`, "sheets thinner than a step", "rays of very many samples",
     "rays that run out of samples".
 
@@ -191,15 +136,12 @@ class March(eqx.Module):
                 f"transforms must be a tuple, such as (AlphaCorrection(),); got {described(transforms)}."
             )
         self.transforms = tuple(transforms)
-        kinds = [type(t) for t in transforms]
-        for transform in transforms:
+        kinds = [type(transform) for transform in transforms]
+        for transform, kind in zip(transforms, kinds, strict=True):
             if not isinstance(transform, Transform):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
-            if kinds.count(type(transform)) > 1:
-                name = type(transform).__name__
-                raise ValueError(
-                    f"transforms must each be given once; got {name} {kinds.count(type(transform))} times."
-                )
+            if (count := kinds.count(kind)) > 1:
+                raise ValueError(f"transforms must each be given once; got {kind.__name__} {count} times.")
         if quadrature not in get_args(Quadrature):
             names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
@@ -212,7 +154,7 @@ class March(eqx.Module):
         return 2**17 if self.max_samples is None else self.max_samples
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
-        """Where nothing is visible, as the first transform that overrides `empty_space` has it."""
+        """The index of the first transform that has one."""
         indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
         for transform, index in zip(self.transforms, indices, strict=True):
             _check_kind(transform, "empty_space", index, EmptySpaceIndex | None)
@@ -220,7 +162,8 @@ class March(eqx.Module):
 
     def overriding(self, seam: str) -> list[Transform]:
         """The transforms that override a seam."""
-        return [transform for transform in self.transforms if _overrides(transform, seam)]
+        default = getattr(Transform, seam)
+        return [each for each in self.transforms if getattr(type(each), seam) is not default]
 
     @property
     def leaps(self) -> bool:
@@ -251,11 +194,11 @@ class March(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps samples after a ray's first transparent cell move, in [-1, 0]."""
+        """By how many steps samples behind a ray's first transparent cell move, in [-1, 0]."""
         shift = jnp.zeros_like(ray.length)
         for transform in self.transforms:
             shift = shift + _checked(transform, "shift", transform.shift(ray), shift)
-        # beyond that a sample would leave the cell that was found transparent
+        # beyond, a sample would leave the cell that was found transparent
         return jnp.clip(shift, -1, 0)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -301,10 +244,6 @@ def within(ray: Ray, depth: Scalar) -> Scalar:
     # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
     depth = jnp.where(depth > 0, depth, 0)
     return jnp.where(depth < ray.length, depth, ray.length)
-
-
-def _overrides(transform: Transform, seam: str) -> bool:
-    return getattr(type(transform), seam) is not getattr(Transform, seam)
 
 
 def _checked(transform: Transform, seam: str, answer: Any, expected: Array) -> Array:

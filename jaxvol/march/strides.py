@@ -1,12 +1,12 @@
 """How many steps long is each cell of a ray? One, unless a `StrideControl` is among the march's transforms.
 
 Cells then come in runs: RUN in a row that are equally long. A run of stride s begins at a multiple of RUN s
-steps, counted from `Strides.phase` steps before the ray's first cell. Of two runs that overlap, one holds the
-other, so that a leap, which only crosses what is transparent, does not change which runs are taken.
+steps, counted from `Strides.phase` steps before the ray's first cell: of two runs that overlap, one holds the
+other, so that leaps do not change which runs are taken.
 
-Both engines use it by three calls, as a solver of differential equations uses its step-size controller:
-`predicted` prepares the march once for each image, `begin` makes a ray's state, and `Strides.next` decides
-where a run ends. Gradients take strides as given; the image jumps where one changes.
+Both engines make three calls: `predicted` prepares the march, once for each image, `begin` makes a ray's
+state, and `Strides.next` chooses the next run. Gradients take strides as given; the image jumps where one
+changes.
 """
 
 from abc import abstractmethod
@@ -31,11 +31,8 @@ RUN = 4
 
 
 class Run(NamedTuple):
-    """RUN cells of a ray, in a row, each `stride` steps long.
-
-    - `front`: depth at which the first one begins. (What `Transform.shift` adds is not in it.)
-    - `stride`: a power of two, static. `step`: its unit, world length.
-    """
+    """RUN cells in a row from depth `front` on, without `Transform.shift`; each `stride` steps long, a static
+    power of two."""
 
     front: Scalar
     stride: int
@@ -47,14 +44,13 @@ class Run(NamedTuple):
         return self.front + RUN * self.stride / 2 * self.step
 
     def ends_before(self, depth: Scalar) -> Bool[Array, ""]:
-        """Whether the run ends at this depth or before, up to a thousandth of a step: where rays are so many
-        steps long, rounding must not decide."""
+        """Whether the run ends at this depth or before, up to a thousandth of a step, for rounding."""
         return self.front + (RUN * self.stride - 1e-3) * self.step <= depth
 
 
 class StrideControl(Transform):
-    """A transform that says how long cells may be: a run is allowed if its error, times the transmittance in
-    front of it, is at most `tolerance`, and always if its stride is 1. Rays take the longest allowed runs.
+    """A transform that says how long cells may be. Rays take the longest runs whose error, times the
+    transmittance in front of them, is at most `tolerance`, or else of stride 1.
 
     `longest`: the longest stride, a power of two up to 64.
     """
@@ -64,16 +60,13 @@ class StrideControl(Transform):
 
     @abstractmethod
     def prepared(self, march: March, space: Space, windows: Windows, variation: Variation) -> "StrideControl":
-        """With what `error` needs to know of the scene, found once for each image, in arrays of integers,
-        which have no gradient.
-
-        `windows`: how the volume's values vary, block by block; `variation`: how much what is composited
-        changes within their ranges."""
+        """With what `error` needs to know of the scene, in arrays of integers, which have no gradient.
+        `windows`, `variation`: how values, and what is composited, vary in each block."""
 
     @abstractmethod
     def error(self, ray: Ray, run: Run) -> Scalar:
-        """By how much the image is wrong because of these cells, if nothing lies in front of them, as far as
-        can be predicted. It depends on the ray and the run alone."""
+        """Predicted error of the image due to these cells if nothing lies in front of them. It depends on the
+        ray and the run alone."""
 
 
 class Strides(eqx.Module):
@@ -99,8 +92,8 @@ class Strides(eqx.Module):
         leaves: Bool[Array, ""],
         finished: Bool[Array, ""],
     ) -> tuple["Strides", Int[Array, ""]]:
-        """The strides of the run that holds the step `ahead` of `index`, up to which all is transparent; and
-        the steps from `index` to where that run begins, 0 if it is the current one.
+        """Chooses the run that holds the step `ahead` of `index`, up to which all is transparent. Returns the
+        state, and the steps from `index` to that run, 0 if it is the current one.
 
         `leaves`: whether the ray has left the volume there. `finished`: whether it takes no more cells."""
         control = stride_control(march)
@@ -161,8 +154,7 @@ def steps_of(strides: Strides | None) -> Int[Array, "*rays"] | int:
 
 
 def begin(march: March, ray: Ray, *, estimate: bool) -> Strides | None:
-    """The strides of a ray at its entry; None where all cells are one step long. `estimate`: whether the
-    error is summed."""
+    """The state at a ray's entry; None if all cells are one step long. `estimate`: whether to sum errors."""
     control = stride_control(march)
     if control is None:
         return None
@@ -173,7 +165,7 @@ def begin(march: March, ray: Ray, *, estimate: bool) -> Strides | None:
 def predicted(
     march: March, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
 ) -> March:
-    """The march, whose `StrideControl` knows the scene. `windows`: of the volume; None without one."""
+    """The march, whose `StrideControl`, if it has one, knows the scene."""
     control = stride_control(march)
     if control is None:
         return march
@@ -201,8 +193,7 @@ def longest_run(march: March) -> int:
 
 
 def _phase(march: March, ray: Ray, control: StrideControl) -> Int[Array, ""] | None:
-    """At random where `start` or `shift` are. These move samples by less than a step, too little to break the
-    wood grain of longer cells, and of the runs themselves."""
+    """Random where `start` or `shift` are, which move samples too little to break the wood grain of runs."""
     if not march.overriding("start") and not march.may_shift:
         return None
     part = jax.lax.stop_gradient(march.start(ray) - march.shift(ray))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._util.checks import described, flag, integer
-from ..compositing.compositing import Compositing, Over
+from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import along
-from ..compositing.compositing import Compositing
+from ..compositing.blending import Compositing
 from ..engine.image import render_scene
 from ..lighting.shading import Lighting
 from ..march.march import March

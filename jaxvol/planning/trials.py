@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..compositing.compositing import Over
+from ..compositing.blending import Over
 from ..march.march import March, Quadrature, Transform
 from ..march.transforms import AdaptiveSampling
 from ..scene.rendering import Rendering

@@ -1,7 +1,7 @@
 """Which ray belongs to a pixel?
 
-Names and conventions follow VTK and PyVista: `view_angle` and `parallel_scale` measure the height
-of the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
+Names and conventions are those of VTK and PyVista: `view_angle` and `parallel_scale` measure the height of
+the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
 """
 
 from typing import Any
@@ -35,10 +35,10 @@ class Camera(eqx.Module):
       ray origins in the plane through `position`.
     - `size`: (width, height) of the image in pixels.
     - `window`: the part of the image plane that is shown, (left, right, bottom, top) relative to its
-      center, in units of half the height of the whole view. The default is the whole view,
+      center, in units of half the height of the whole view. By default the whole view,
       (-width/height, width/height, -1, 1). Set by `crop` and `zoom`.
     - `corner`: column and row of the first pixel in the image that this one was cropped from, by default
-      (0, 0). Pixels of that image key everything random along a ray. Set by `crop`.
+      (0, 0), which key random numbers. Set by `crop`.
 
     **Raises:** `ValueError` for a camera at its focal point, a `view_up` along the view direction, and an
     angle, scale or size out of range.
@@ -86,14 +86,9 @@ class Camera(eqx.Module):
         self.parallel_scale = (
             None if parallel_scale is None else number("parallel_scale", parallel_scale, above=0)
         )
-        aspect = width / height
-        window = (-aspect, aspect, -1.0, 1.0) if window is None else window
-        self.window = finite_array("window", window, (4,))
-        if corner is None:
-            with jax.ensure_compile_time_eval():
-                self.corner = jnp.zeros(2)
-        else:
-            self.corner = finite_array("corner", corner, (2,))
+        whole = (-width / height, width / height, -1.0, 1.0)
+        self.window = finite_array("window", whole if window is None else window, (4,))
+        self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
 
     @classmethod
     def looking_at(
@@ -113,8 +108,7 @@ class Camera(eqx.Module):
         **Arguments:**
 
         - `direction`: from the center of the volume to the camera, of any length.
-        - `view_up`: as in `Camera`. If it is within 0.06° of `direction`, y is used instead, or -z if y is
-          within 0.06°, too; seen from above, x then runs to the right.
+        - `view_up`: as in `Camera`. Within 0.06° of `direction`, y is used instead, or else -z.
         - `view_angle`: degrees. For an orthographic camera, it only sets the distance.
         - `parallel`: whether the camera is orthographic.
 
@@ -143,33 +137,30 @@ class Camera(eqx.Module):
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """A camera that renders only this rectangle of the image: the same pixels, jitter included.
 
-        `left` and `top` are the column and row of the rectangle's first pixel.
+        `left`, `top`: column and row of the rectangle's first pixel.
 
         **Raises:** `ValueError` for a rectangle that is empty or extends beyond the image.
         """
         left, top = integer("left", left, 0), integer("top", top, 0)
         width, height = integer("width", width, 1), integer("height", height, 1)
         full_width, full_height = self.size
-        fits = 0 <= left < left + width <= full_width and 0 <= top < top + height <= full_height
-        if not fits:
+        if left + width > full_width or top + height > full_height:
             raise ValueError(
                 f"crop must be a rectangle inside the {full_width} x {full_height} image; "
                 f"got left={left}, top={top}, width={width}, height={height}."
             )
         x = [self._column(edge) for edge in (left, left + width)]
         y = [self._row(edge) for edge in (top + height, top)]
-        return self._showing(
-            jnp.stack([*x, *y]), (width, height), self.corner + np.array([left, top], self.corner.dtype)
-        )
+        corner = self.corner + np.array([left, top], self.corner.dtype)
+        return self._showing(jnp.stack([*x, *y]), (width, height), corner)
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
-        """A camera that shows 1/`factor` of the image at the same image size, around `center`.
+        """A camera that shows 1/`factor` of the image at the same image size, in the same perspective.
 
-        `center` is given in fractions of width and height from the top left. Zooming magnifies the image
-        plane, so the perspective does not change.
+        `center`: in fractions of width and height from the top left.
         """
-        factor = number("zoom factor", factor, above=0)
-        return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
+        factor, center = number("zoom factor", factor, above=0), finite_array("center", center, (2,))
+        return self._showing(_zoomed(self.window, factor, center), self.size)
 
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
@@ -196,7 +187,7 @@ class Camera(eqx.Module):
 
     @property
     def first_pixel(self) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """Column and row that key the first pixel: `corner` as integers."""
+        """`corner`, as integers."""
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
@@ -271,10 +262,7 @@ def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
     return camera._showing(jnp.stack([left, right, below, above]), (camera.size[0], count), corner)
 
 
-# Jitted: the first image would have to wait for a program per operation.
-
-
-@jax.jit
+@jax.jit  # or the first image would wait for a program per operation
 def _fitted_view(
     place: tuple[Any, Any, Any, Any],
     direction: Float[Array, "3"],
@@ -282,8 +270,8 @@ def _fitted_view(
     view_angle: Float[Array, ""],
     aspect: Any,
 ) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """Position, focal point, up direction and parallel scale of the view that holds a volume's bounding
-    sphere. `place`: what `corners_of` takes. `aspect` is width over height, at most 1."""
+    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere.
+    `place`: arguments of `corners_of`. `aspect`: width over height, at most 1."""
     low, high = corners_of(*place)
     center, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
     half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
@@ -298,7 +286,7 @@ def _fitted_view(
 def _zoomed(
     window: Float[Array, "4"], factor: Float[Array, ""], center: Float[Array, "2"]
 ) -> Float[Array, "4"]:
-    """1/`factor` of a window, around `center`, given in fractions from its top left."""
+    """1/`factor` of a window."""
     left, right, bottom, top = window
     x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
     half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor

@@ -1,9 +1,8 @@
 """Where may anything be visible? Ranges of values of a volume's blocks, and grids of occupied cells.
 
-Ranges depend on the voxels alone. They are computed once for an array of voxels, and kept as long as that
-array: arrays do not change, so that another array in a volume gets ranges of its own. Which blocks are
-visible depends on the transfer function as well, and is computed in each frame, in the compiled program. Both
-are conservative: what is called empty is proven to be. They carry no gradient.
+Ranges depend on the voxels alone, and are kept as long as their array. Which blocks are visible depends on
+the transfer function, too, and is computed in each image. What is called empty is proven to be. There are no
+gradients.
 """
 
 from collections.abc import Callable
@@ -17,12 +16,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from .._util.axes import XYZ, inverse
-from .._util.vec3 import Vec3
+from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
 from ..xla.memory import gather
 from ..xla.platform import on_gpu, while_loop
 from ..xla.sharding import varying
-from .frame import Frame
 from .volume import Volume
 
 
@@ -30,10 +28,10 @@ BLOCK = 4
 """Cells of the voxel grid along the side of a block."""
 
 LAYERS = 8
-"""Layers of blocks whose extremes are found at a time."""
+"""Layers of blocks whose extremes are found at a time, so that they stay in the cache."""
 
 FARTHEST = 255
-"""Stands for a grid without any occupied cell. Distances in others, in cells, are at most one less."""
+"""Distance in a grid without occupied cells. Other distances, in cells, are at most one less."""
 
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 """By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
@@ -51,12 +49,12 @@ class Blocks(eqx.Module):
     labels: UInt32[Array, "bx by bz"] | None
     """Bit `label % 32` is set for each label of the block's nodes."""
     slopes: "SlopeRanges | None" = None
-    """None: nothing is known about them."""
+    """None where they are unknown."""
 
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
-        """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: with the
-        ranges of slopes, for those who read the gradient."""
+        """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: whether
+        their ranges are needed."""
         labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
         low, high = map(volume.in_grid_order, memoized(volume.data, _ranges))
         if volume.field is not None:  # its values need not lie between those of the voxels
@@ -66,7 +64,7 @@ class Blocks(eqx.Module):
 
     @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
-        """Blocks that hold NaN, also as a slope: nothing is known about them."""
+        """Blocks that hold NaN, also as a slope."""
         unordered = ~(self.low <= self.high)
         if self.slopes is not None:
             for low, high in zip(self.slopes.low, self.slopes.high, strict=True):
@@ -88,12 +86,11 @@ class Blocks(eqx.Module):
 
 
 class SlopeRanges(eqx.Module):
-    """Ranges of slopes along x, y, z in each block, including the nodes on its faces. Slopes between nodes
-    are interpolated, and so within these ranges.
+    """Ranges of slopes in each block, including the nodes on its faces.
 
-    - `low`, `high`: least and greatest slope along each axis, in value units per node.
-    - `steepest`: greatest length of a node's three slopes, per node. Interpolation never exceeds it.
-    - `spacing`: of the volume. Ranges do not depend on it, so that they are kept where it changes.
+    - `low`, `high`: least and greatest slope along x, y, z, in value units per node.
+    - `steepest`: greatest length of a node's three slopes, per node.
+    - `spacing`: of the volume.
     """
 
     low: Float[Array, "3 bx by bz"]
@@ -105,7 +102,7 @@ class SlopeRanges(eqx.Module):
     def of(cls, volume: Volume) -> "SlopeRanges":
         """Those of a volume's voxels, computed once for each array of them."""
         low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
-        if (axes := volume.fetch.axes) != XYZ:  # or ranges would be copied in each image
+        if (axes := volume.fetch.axes) != XYZ:
             low, high = (jnp.stack([part[axis] for axis in inverse(axes)]) for part in (low, high))
         return cls(low, high, steepest, jax.lax.stop_gradient(volume.spacing))
 
@@ -114,7 +111,7 @@ class SlopeRanges(eqx.Module):
         """Least and greatest magnitude of the gradient, in value units per world length."""
         spacing = self.spacing.astype(self.low.dtype)
         least = most = jnp.zeros_like(self.steepest)
-        for axis in range(3):  # one by one: XLA's sum over a leading axis is slow on CPU
+        for axis in range(3):  # XLA's sum over a leading axis is slow on CPU
             low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]
             least += jnp.maximum(jnp.maximum(low, -high), 0) ** 2  # 0 where slopes change sign
             most += jnp.maximum(-low, high) ** 2
@@ -123,7 +120,7 @@ class SlopeRanges(eqx.Module):
 
 
 class Sums(eqx.Module):
-    """Counts the occupied cells of a grid in a box of any size, by eight look-ups (a summed-volume table)."""
+    """A summed-volume table: counts the occupied cells of a grid in any box, by eight look-ups."""
 
     table: Int[Array, " entries"]
     shape: tuple[int, int, int] = eqx.field(static=True)
@@ -157,8 +154,7 @@ class Sums(eqx.Module):
 class Occupancy(eqx.Module):
     """A regular grid of cells in the world. Everything visible lies in an occupied cell of it.
 
-    - `origin`, `size`: position of the grid's corner, and side lengths of a cell, along the axes of `frame`,
-      or, without one, the world's.
+    - `origin`, `size`: corner of the grid and side lengths of a cell, along the axes of `frame` or the world.
     """
 
     occupied: Bool[Array, "cx cy cz"]
@@ -166,21 +162,8 @@ class Occupancy(eqx.Module):
     size: Vec3
     frame: Frame | None = None
 
-    def sums(self) -> Sums:
-        """For queries about boxes."""
-        return Sums.of(self.occupied)
-
     def distance(self) -> UInt8[Array, " cells"]:
-        """Chessboard distance of each cell to the nearest occupied one, in cells: 0 in an occupied cell.
-        In row-major order."""
-
-        def spread(grid: Bool[Array, "cx cy cz"]) -> Bool[Array, "cx cy cz"]:
-            for axis in range(3):
-                padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
-                n = grid.shape[axis]
-                grid = grid | jax.lax.slice_in_dim(padded, 0, n, axis=axis)
-                grid = grid | jax.lax.slice_in_dim(padded, 2, n + 2, axis=axis)
-            return grid
+        """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
 
         def go_on(state: tuple[Array, Array, Array]) -> Array:
             reached, _, rounds = state
@@ -188,7 +171,11 @@ class Occupancy(eqx.Module):
 
         def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             reached, distance, rounds = state
-            return spread(reached), distance + (~reached).astype(distance.dtype), rounds + 1
+            return (
+                with_neighbours(reached, jnp.logical_or),
+                distance + (~reached).astype(distance.dtype),
+                rounds + 1,
+            )
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
@@ -210,6 +197,18 @@ class Occupancy(eqx.Module):
         return direction if self.frame is None else self.frame.components(direction)
 
 
+def with_neighbours(
+    grid: Shaped[Array, "cx cy cz"], combine: Callable[[Array, Array], Array]
+) -> Shaped[Array, "cx cy cz"]:
+    """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
+    for axis in range(3):
+        padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
+        n = grid.shape[axis]
+        grid = combine(grid, jax.lax.slice_in_dim(padded, 0, n, axis=axis))
+        grid = combine(grid, jax.lax.slice_in_dim(padded, 2, n + 2, axis=axis))
+    return grid
+
+
 def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:
     return total + layer, total + layer
 
@@ -229,7 +228,6 @@ def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"]
     whole = (data.shape[0] - 1) // BLOCK
     if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
         return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
-    # some layers of blocks at a time, which stay in the cache of a CPU: of bytes, this is three times as fast
     low, high = jax.lax.map(
         lambda first: of(jax.lax.dynamic_slice_in_dim(data, first, BLOCK + 1)),
         BLOCK * jnp.arange(whole),
@@ -256,8 +254,8 @@ def widened(
 def _slope_ranges(
     data: Shaped[Array, "nx ny nz"],
 ) -> tuple[Float[Array, "3 bx by bz"], Float[Array, "3 bx by bz"], Float[Array, "bx by bz"]]:
-    """What `SlopeRanges` holds of the voxels, one layer of blocks after the other: the slopes of a volume
-    would take several times its memory."""
+    """The fields of `SlopeRanges`, one layer of blocks after the other: all slopes would take several times
+    the volume's memory."""
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
@@ -303,8 +301,7 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
 
 
 def over_blocks(data: Nodes, combine: Callable[[Nodes, Nodes], Nodes], margin: int = 0) -> Nodes:
-    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis; of an array
-    of JAX or NumPy."""
+    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
     xp: Any = jnp if isinstance(data, jax.Array) else np
     values: Any = data
 
@@ -317,7 +314,7 @@ def over_blocks(data: Nodes, combine: Callable[[Nodes, Nodes], Nodes], margin: i
             missing = -cells % BLOCK
             around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
             values, cells = xp.pad(values, around, mode="edge"), cells + missing
-        # The last block may be shorter. To pad the nodes takes seven times as long, and a copy of them.
+        # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, BLOCK)
         found = []
         if whole:

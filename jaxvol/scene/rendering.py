@@ -19,15 +19,12 @@ T = TypeVar("T")
 class BrickReport(NamedTuple):
     """What an image by `render_bricks` took.
 
-    - `counts`: bricks along x, y and z. `needed`: how many of them may hold anything visible, as the ranges
-      of values tell before any ray is marched.
-    - `loads`: how often a brick was read. `reloads`: how many of these were not the first of their brick. It
-      is less than `needed` where bricks lie outside of the view, or behind what is opaque, and more where
-      bricks are read again (`method="reload"`).
+    - `counts`: bricks along x, y and z. `needed`: how many of them may hold anything visible.
+    - `loads`: how often a brick was read: less than `needed` where bricks lie outside of the view, or behind
+      what is opaque. `reloads`: how many of these were not the first of their brick (`method="reload"`).
     - `bytes_read`: of voxels, with what is read around each brick.
-    - `stored`: voxels along x, y and z that are held at a time. `bytes_held`: memory that these take, with
-      what is made of them and with the next ones. Programs are compiled for `stored`: the first image of a
-      budget or split that leads to another shape takes seconds longer.
+    - `stored`: voxels along x, y and z that are held at a time, for which programs are compiled.
+      `bytes_held`: memory that these take, with what is made of them and with the next ones.
     """
 
     counts: tuple[int, int, int]
@@ -68,10 +65,9 @@ class Rendering(eqx.Module):
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
     - `error`: under `AdaptiveSampling`, a cautious estimate of how far a pixel's colour is wrong because of
-      the distance of its samples, without a gradient. In the scenes of `experiments.adaptive_error`, rays
-      that end in `AlphaCorrection`, it is more than the true error in 97 % of the pixels or more, and several
-      times as large. Infinite where nothing can be predicted. What is leapt over adds nothing to it, so that
-      it may be somewhat smaller where rays leap.
+      the distance of its samples, without a gradient; infinite where nothing can be predicted. In the scenes
+      of `experiments.adaptive_error`, it is several times the true error, and less in at most 3 % of the
+      pixels. It may be somewhat smaller where rays leap.
     - `normal`: of a mode that shows surfaces (`Isosurface`), the unit normal in the world; 0 where nothing is
       visible.
 

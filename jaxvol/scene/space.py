@@ -1,21 +1,19 @@
 """Where does a world point lie in the grid, and where does a ray enter and leave the grid?
 
-A `Space` answers both for one volume; this is the seam `locate`. The default, `Affine`, applies
-spacing, origin and direction, so rays stay straight in the grid. A space with curved rays returns a
-different `Path`; the rest of the march is unaffected.
+A `Space` answers both for one volume; this is the seam `locate`. The default, `Affine`, applies spacing,
+origin and direction, so that rays are straight in the grid. A space with curved rays has another `Path`.
 """
 
 from abc import abstractmethod
 from functools import partial
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, Vec3, along, apart
-from .frame import Frame
+from .._util.vec3 import Frame, Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
 from .volume import Volume
 
@@ -37,7 +35,7 @@ class Space(eqx.Module):
 
     @property
     def searches(self) -> bool:
-        """Whether `interval` and `gaps` search, in a loop."""
+        """Whether `interval` and `gaps` are loops."""
         return False
 
     @property
@@ -55,9 +53,8 @@ class Space(eqx.Module):
         """Distances at which a line enters and leaves the grid; on a miss, the first exceeds the second."""
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
-        """Where a line is outside the grid between its entry and its exit, which lies `length` from there:
-        equally many gaps for every line, in any order; they may overlap, and those that it does not have
-        begin at infinity."""
+        """Where a line is outside the grid between its entry and its exit, `length` from there: a static
+        number of gaps, in any order, which may overlap; missing ones begin at infinity."""
         return ()
 
     @abstractmethod
@@ -70,17 +67,16 @@ class Space(eqx.Module):
 
     @abstractmethod
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
-        """Least world distance between neighbouring nodes along each axis, between two grid coordinates,
-        which may lie beyond the grid; 0 where nodes meet."""
+        """Least world distance between neighbouring nodes along each axis, in a box of grid coordinates that
+        may exceed the grid; 0 where nodes meet."""
 
     @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        """World-space cells that may hold anything visible, from the visible blocks of the grid; or of a box
-        of it that begins at the node `first`, where the volume is only a part of the grid."""
+        """World cells that may hold anything visible, from the visible blocks of the grid, or of a part of it
+        that begins at the node `first`."""
 
     def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
-        """For each face at which rays may enter or leave, whether anything visible may lie there, from the
-        visible blocks of the grid."""
+        """For each face at which rays may enter or leave, whether anything visible may lie there."""
         faces = [jax.lax.index_in_dim(visible, end, axis) for axis in range(3) for end in (0, -1)]
         return tuple(jnp.any(face) for face in faces)
 
@@ -102,11 +98,10 @@ class Ray(eqx.Module):
 
     - `entry`, `direction`: world point where the ray enters the volume, and its unit direction.
     - `t_in`: distance from the ray's origin to the entry. `length`: from entry to exit; 0 on a miss.
-      Both carry gradients. Depths `s` along a march are measured from the entry, where float32 resolves
-      them as finely as the volume needs, however far away the camera is.
+      Depths along a march are measured from the entry, so that float32 resolves them for far cameras, too.
     - `path`: the ray in grid coordinates.
     - `pixel`: (column, row); keys everything random along the ray.
-    - `gaps`: depths between entry and exit where the ray is outside the volume; with gradients.
+    - `gaps`: depths between entry and exit where the ray is outside the volume.
     """
 
     entry: Vec3
@@ -129,12 +124,9 @@ class Ray(eqx.Module):
 
 
 def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
-    """Clip a ray to the volume and to what lies ahead of its origin, which may be inside.
-
-    If a number of the ray or the space is NaN or infinite, the ray is `invalid`.
-    """
-    # Rounding the distance of a far camera to float32 errs by too much. So move the origin close to the
-    # volume, where distances are short.
+    """Clip a ray to the volume and to what lies ahead of its origin, which may be inside. It is `invalid` if
+    a number of it, or of the space, is NaN or infinite."""
+    # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
     close = along(origin, direction, base)
@@ -150,10 +142,8 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
-    """Where `fault` is true, replace the ray by one that is never marched and renders as NaN.
-
-    Comparisons with NaN are false, so a march would treat such a ray as a miss or never end.
-    """
+    """Where `fault` is true, a ray that is never marched and renders as NaN: comparisons with NaN are false,
+    and a march might never end."""
     t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
     return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
 
@@ -171,8 +161,7 @@ class Straight(Path):
 class Affine(Space):
     """A grid given by spacing, origin and direction.
 
-    - `low`, `high`: its first and its last node, and `spacing`: all along the grid's own axes, which are
-      those of `frame`, or, without one, the world's.
+    `low`, `high`: its first and its last node, along the axes of `frame`, or, without one, the world's.
     """
 
     low: Vec3
@@ -208,7 +197,7 @@ class Affine(Space):
     def coordinate(self, point: Vec3) -> Vec3:
         if self.frame is not None:
             point = self.frame.coordinates(point)
-        # times the reciprocal, since XLA stores quotients of which there is more than one use
+        # times the reciprocal: XLA stores quotients that are used more than once
         x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
 
@@ -250,8 +239,8 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
 def node_distance(
     space: Space, shape: tuple[int, ...], first: Int[Array, "3"] | None = None
 ) -> Float[Array, "bx by bz"]:
-    """By block, the least world distance between neighbouring nodes, in its middle. `first`: of the blocks,
-    the index of the first one."""
+    """By block, the least world distance between neighbouring nodes, in its middle. `first`: index of the
+    first block."""
     first = jnp.zeros(3, jnp.int32) if first is None else first
     dtype = space.middle[0].dtype
     middle = [
@@ -267,26 +256,22 @@ def node_distance(
 
 @partial(jax.jit, static_argnums=1)  # operation by operation, it takes seconds to compile
 def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
-    """The median of `node_distance` over all blocks: what steps are counted in, as voxels."""
+    """The median of `node_distance` over all blocks: the size of a voxel."""
     return jnp.median(node_distance(space, shape))
 
 
-def world_gradient(
-    volume: Volume, space: Space, point: Vec3, method: Literal["trilinear", "central"] = "central"
-) -> Vec3:
-    """Gradient of the value with respect to a world point, in value units per world length.
-
-    `Volume.gradient`, transformed by the transposed Jacobian of `space.coordinate`.
-    """
+def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:
+    """Gradient of the value by a world point, in value units per world length: `Volume.gradient` times the
+    transposed Jacobian of `space.coordinate`."""
     coordinate, transpose = jax.vjp(space.coordinate, point)
-    slopes = volume.gradient(coordinate, method)
+    slopes = volume.gradient(coordinate)
     per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))
     return transpose(per_node)[0]
 
 
 def _slab(origin: Scalar, direction: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
     """Distances to the nearer and the farther of two parallel planes."""
-    # Smaller components count as parallel to the planes. Not 0: the derivative of 1/d, 1/d², must be finite.
+    # smaller components count as parallel: the derivative of 1/d, 1/d², must be finite
     parallel = jnp.abs(direction) < float(jnp.finfo(direction.dtype).tiny) ** 0.25
     slope = jnp.where(parallel, 1, direction)
     a, b = (low - origin) / slope, (high - origin) / slope

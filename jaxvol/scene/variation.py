@@ -1,7 +1,6 @@
-"""How much does a volume vary, and with it what is composited, in and around each block?
+"""How much do a volume's values, and with them extinction and emission, vary around each block?
 
-From it follows how long cells may be. What depends on the voxels alone is computed once for an array of
-voxels; what depends on the transfer function, in each image.
+From it follows how long cells may be (`AdaptiveSampling`).
 """
 
 from typing import NamedTuple
@@ -17,26 +16,22 @@ from .volume import Volume
 
 
 MARGIN = 2
-"""Nodes by which a window exceeds its block: half a block, so that it holds all cells of BLOCK voxels whose
-middle lies in the block."""
+"""Nodes by which a window exceeds its block: it holds all cells of BLOCK voxels whose middle lies there."""
 
 
 class Windows(eqx.Module):
-    """How values vary in and around each block of a volume: over its nodes, and those up to MARGIN beyond its
-    faces.
+    """How values vary over the nodes of each block of a volume and those up to MARGIN beyond its faces.
 
     - `low`, `high`: least and greatest value.
-    - `bend`: greatest second difference of the value, between nodes along an axis or across two; NaN where a
-      value is.
+    - `bend`: greatest second difference between nodes, along an axis or across two; NaN where a value is.
     """
 
     low: Float[Array, "bx by bz"]
     high: Float[Array, "bx by bz"]
     bend: Float[Array, "bx by bz"]
     first: Int[Array, "3"] | None = None
-    """Where the volume is only a part of its grid, the index of the first block."""
+    """Index of the first block, where the volume is only a part of its grid; `whole`: blocks of that."""
     whole: tuple[int, int, int] | None = eqx.field(static=True, default=None)
-    """Number of blocks of the grid then."""
 
     @classmethod
     def of(cls, volume: Volume) -> "Windows":
@@ -53,16 +48,13 @@ class Windows(eqx.Module):
 
 
 class Variation(NamedTuple):
-    """How much what is composited, the extinction and the emission (extinction × colour), changes within the
-    range of values of each window.
+    """How much extinction and emission (extinction × colour) change within the range of values of each
+    window: of extinction and three channels, the one that changes most.
 
     - `total`: while the value passes through the range once, 1/length.
-    - `turns`: the sum of all changes of slope by the value, 1/length for each unit of the value. Infinite
-      where there is a step.
-    - `colored`: the part of `total` that is due to changes of colour, 1/length; and `hidden`: that, times the
-      extinction, 1/length².
-
-    Of the four, extinction and three channels of emission, the one that changes most counts."""
+    - `turns`: the sum of all changes of slope, 1/length for each unit of the value; infinite at a step.
+    - `colored`: the part of `total` that is due to the colour, 1/length; `hidden`: that times the extinction.
+    """
 
     total: Float[Array, "bx by bz"]
     turns: Float[Array, "bx by bz"]
@@ -78,7 +70,7 @@ class Variation(NamedTuple):
 @jax.jit
 def _windows(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], ...]:
     """Least and greatest value and greatest bend in each window, one layer of blocks after the other: all
-    differences of a volume would take several times its memory."""
+    differences would take several times the volume's memory."""
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Float[Array, "by bz"], ...]:
@@ -97,8 +89,8 @@ def _windows(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"],
 
 
 def _bend(values: Float[Array, "nx ny nz"], inner: Bool[Array, "nx 1 1"]) -> Float[Array, "nx ny nz"]:
-    """The greatest magnitude at each node of ∂²/∂x², ∂²/∂x∂y and their like, in nodes. At the faces of the
-    volume, beyond which values are constant, those across are 0; `inner` tells where that is along x."""
+    """The greatest magnitude at each node of ∂²/∂x², ∂²/∂x∂y and their like, in nodes. Those across a face of
+    the volume are 0; `inner`: nodes that are not at a face along x."""
     greatest = jnp.zeros_like(values)
     for axis in range(3):
         slope, other = jnp.diff(values, axis=axis), (axis + 1) % 3

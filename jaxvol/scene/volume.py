@@ -1,12 +1,11 @@
 """What is a volume's value at a grid coordinate?
 
-Grid coordinates count voxels: node `data[i, j, k]` lies at coordinate (i, j, k), so a grid of
-n nodes spans n - 1 cells along an axis. Values are interpolated trilinearly between nodes;
-a coordinate outside the grid takes the value of the nearest point of the grid.
+Grid coordinates count voxels: node `data[i, j, k]` lies at (i, j, k), so that n nodes span n - 1 cells.
+Values are interpolated trilinearly; outside the grid they are those of its nearest point.
 """
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,15 +18,14 @@ from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.platform import is_traced
-from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by
+from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by, trilinear
 
 
 class Field(eqx.Module):
     """A user-defined scalar field that replaces the interpolation of voxels, for example a formula.
 
-    Every engine and adjoint evaluates it for `Volume(data, field=...)`. Its arrays are differentiable, like
-    all arrays of a volume. `SpaceLeaping` leaps over no part of it, since its range is unknown. The voxel
-    gradient of `"replay"` covers the voxels that the field reads through `volume.interpolated`.
+    Pass it as `Volume(data, field=...)`. Its arrays are differentiable; of voxels, those that it reads by
+    `volume.interpolated`. `SpaceLeaping` leaps over no part of it, since its range is unknown.
     """
 
     @abstractmethod
@@ -47,8 +45,7 @@ class Volume(eqx.Module):
       and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
       int8, uint16, int16 and float32 that holds every value exactly.
       Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
-      evenly spaced, give spacing and origin. For an image stack of scikit-image, [plane, row, column], pass
-      `stack.T`: x then runs along the rows, y from row to row, z from plane to plane.
+      evenly spaced, give spacing and origin. Of an image stack [plane, row, column], pass `stack.T`.
     - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT). By default
       that of the data's coordinates, or 1.
     - `origin`: world position of node (0, 0, 0). By default that of the data's coordinates, or 0.
@@ -63,14 +60,12 @@ class Volume(eqx.Module):
     bfloat16 keeps 8 significant bits, float16 11: values around 1000 are rounded to multiples of 4 and of 0.5
     (`experiments/stability.py`, "voxels of 16-bit floats").
 
-    `direction` is differentiable like `spacing`, as far as it turns: gradients are exact along changes that
-    keep it orthonormal, such as those of the angles that it is computed from.
+    The gradient by `direction` is exact along changes that keep it orthonormal.
 
     **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
-    unsupported type, or hold NaN or infinity, even if only after conversion to float32; for integers that no
-    type holds exactly; for spacing that is not positive; for a direction whose columns are not of length 1
-    and orthogonal to 1e-4; and for labels of another shape or type, or beyond
-    int32.
+    unsupported type, or hold NaN or infinity, also after conversion to float32; for integers that no type
+    holds exactly; for spacing that is not positive; for a direction whose columns are not of length 1 and
+    orthogonal to 1e-4; and for labels of another shape or type, or beyond int32.
     """
 
     data: Shaped[Array, "nx ny nz"]
@@ -113,26 +108,24 @@ class Volume(eqx.Module):
 
     @property
     def first(self) -> Vec3 | None:
-        """Where `data` is only a part of the grid, the node at which it begins, in the type of `spacing`."""
+        """The node at which `data` begins, in the type of `spacing`, where it is only a part of the grid."""
         if self.fetch.window is None:
             return None
         x, y, z = self.fetch.window.first.astype(self.spacing.dtype)
         return x, y, z
 
     def in_grid_order(self, of_data: Array) -> Array:
-        """What was computed of parts of `data`, with its last three axes along x, y, z: `data` may be a part
-        of a grid that is kept in the order of storage (`part_of`). The same array, if they are."""
+        """An array that was computed from `data`, with its last three axes along x, y, z (`part_of`)."""
         if self.fetch.axes == XYZ:
             return of_data
         return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
 
     @property
     def bounds(self) -> Float[Array, "6"]:
-        """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes: a box along the world's
-        axes, in which a volume with a `direction` lies askew."""
+        """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes."""
         low, high = self.corners
         if self.direction is not None:
-            # of each axis of the data, what it adds to the world's, up or down
+            # how far each axis of the data reaches along the world's, up or down
             reach = self.direction * (self._steps * self.spacing)[None, :]
             low = self.origin + jnp.sum(jnp.minimum(reach, 0), axis=1)
             high = self.origin + jnp.sum(jnp.maximum(reach, 0), axis=1)
@@ -160,34 +153,17 @@ class Volume(eqx.Module):
 
     def interpolated(self, coordinate: Vec3) -> Scalar:
         """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type."""
-        cube, (fx, fy, fz) = self.fetch.cube(self.data, coordinate)
-        ((c000, c001), (c010, c011)), ((c100, c101), (c110, c111)) = cube
-        return _mix(
-            fx,
-            _mix(fy, _mix(fz, c000, c001), _mix(fz, c010, c011)),
-            _mix(fy, _mix(fz, c100, c101), _mix(fz, c110, c111)),
-        )
+        return trilinear(*self.fetch.cube(self.data, coordinate), _mix)
 
-    def gradient(self, coordinate: Vec3, method: Literal["trilinear", "central"] = "central") -> Vec3:
+    def gradient(self, coordinate: Vec3) -> Vec3:
         """Gradient of the value along the grid axes, in value units per world length.
 
-        - `"trilinear"`: derivative of the trilinear interpolant within a cell: exact for the rendered
-          field, discontinuous between cells.
-        - `"central"`: trilinear interpolation of central differences at the nodes, which at the border of
-          the grid are one-sided: continuous, with an error of O(spacing²) relative to the gradient of the
-          sampled field. From the second node to the last but one, it equals the difference of the values one
-          node to either side; for a `field`, it is that difference everywhere, over the part inside.
-
-        **Raises:** `ValueError` for another method.
+        Trilinear interpolation of central differences at the nodes, which at the border of the grid are
+        one-sided: continuous, with an error of O(spacing²). Of a `field`, the difference of its values one
+        node to either side, over the part inside the grid.
         """
-        if method == "trilinear":
-            slopes = self._trilinear_slopes(coordinate)
-        elif method == "central":
-            central = self.field is None
-            slopes = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
-        else:
-            raise ValueError(f'method must be "trilinear" or "central"; got {method!r}.')
-        sx, sy, sz = slopes
+        central = self.field is None
+        sx, sy, sz = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
@@ -214,15 +190,6 @@ class Volume(eqx.Module):
             share = share + weight * (fetched(self.labels, index) == label).astype(share.dtype)
         return share
 
-    def _trilinear_slopes(self, coordinate: Vec3) -> Vec3:
-        cube, (fx, fy, fz) = self.fetch.cube(self.data, coordinate)
-        ((c000, c001), (c010, c011)), ((c100, c101), (c110, c111)) = cube
-        return (
-            _mix(fy, _mix(fz, c100 - c000, c101 - c001), _mix(fz, c110 - c010, c111 - c011)),
-            _mix(fx, _mix(fz, c010 - c000, c011 - c001), _mix(fz, c110 - c100, c111 - c101)),
-            _mix(fx, _mix(fy, c001 - c000, c011 - c010), _mix(fy, c101 - c100, c111 - c110)),
-        )
-
     def _field_slopes(self, coordinate: Vec3) -> Vec3:
         def slope(axis: int) -> Scalar:
             last = self.shape[axis] - 1
@@ -237,7 +204,7 @@ class Volume(eqx.Module):
 def corners_of(
     origin: Float[Array, "3"], spacing: Float[Array, "3"], direction: Float[Array, "3 3"] | None, cells: Any
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """World positions of the first and the last node of a grid of so many cells along x, y, z."""
+    """World positions of the first and the last node of a grid of so many `cells` along x, y, z."""
     along = cells.astype(spacing.dtype) * spacing
     if direction is not None:
         # not by a matrix product, which some GPUs round to 10 bits
@@ -246,7 +213,7 @@ def corners_of(
 
 
 def _turn(direction: Arrayable) -> Float[Array, "3 3"] | None:
-    """A direction, checked; None for one that is known to be the identity."""
+    """A checked direction; None for one that is known to be the identity."""
     turn = require(
         finite_array("direction", direction, (3, 3)),
         lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
@@ -268,7 +235,7 @@ def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
 
 
 def without_voxels(volume: Volume) -> Volume:
-    """The volume without `data`, which is too large to pass around."""
+    """The volume without `data`."""
     return eqx.tree_at(lambda v: v.data, volume, None)
 
 
@@ -280,11 +247,10 @@ def with_voxels(volume: Volume, data: Array) -> Volume:
 def part_of(
     volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
-    """The volume as a part of a grid of so many nodes, which begins at the node `first` of that. Its spacing,
-    origin and direction are those of the whole. Beyond the part nothing is known: its faces are read.
+    """The volume as a part of a grid of `whole` nodes that begins at the node `first`. Spacing, origin and
+    direction are those of the whole; beyond the part, its faces are read.
 
-    `axes`: of the array, which is data[z, y, x] for (2, 1, 0); by default as before. All else is along x, y,
-    z."""
+    `axes`: of the array, which is data[z, y, x] for (2, 1, 0); by default as before."""
     window = Window(first, whole, volume.fetch.axes if axes is None else axes)
     fetch = eqx.tree_at(lambda f: f.window, volume.fetch, window, is_leaf=lambda leaf: leaf is None)
     return with_fetch(volume, fetch)

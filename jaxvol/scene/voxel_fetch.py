@@ -29,11 +29,10 @@ SLOPE_BITS = 10
 
 
 class Window(eqx.Module):
-    """The box of a grid that is in memory. Beyond it nothing is known: there its faces are read.
+    """The box of a grid that is in memory. Beyond it, its faces are read.
 
     - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both along x, y, z.
-    - `axes`: of the array in memory, which is data[z, y, x] for (2, 1, 0). All else is along x, y, z, so that
-      what is computed, and how it rounds, does not depend on them.
+    - `axes`: of the array in memory, which is data[z, y, x] for (2, 1, 0). All else is along x, y, z.
     """
 
     first: Int[Array, "3"]
@@ -48,11 +47,11 @@ class Fetch(eqx.Module):
 
     @abstractmethod
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        """The eight voxels that begin with this one of those in memory, along the array's axes."""
+        """The eight voxels from this one of the array on, along its axes."""
 
     @property
     def axes(self) -> Axes:
-        """Of the array in memory (`Window.axes`)."""
+        """Those of `Window`."""
         return XYZ if self.window is None else self.window.axes
 
     def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
@@ -68,8 +67,8 @@ class Fetch(eqx.Module):
         return nx, ny, nz
 
     def split(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Node, Vec3]:
-        """The node below a grid coordinate, among those in memory and along the array's axes; and the
-        fractions past it, along x, y, z."""
+        """The node of the array below a grid coordinate, along its axes, and the fractions past it, along
+        x, y, z."""
         node, fraction = split(coordinate, self.shape(data))
         if self.window is None:
             return node, fraction
@@ -85,28 +84,26 @@ class Fetch(eqx.Module):
         return flat_index(self.split(data, coordinate)[0], data.shape)
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
-        """The same, where slopes are asked for at one coordinate only and its node, as an index into the
-        flattened array, is known. XLA computes an index that several fetches share on one thread, as a kernel
-        of its own, unless it lies in memory."""
+        """The same for `slopes` at one coordinate, whose node has this index into the flattened array. XLA
+        would compute it on one thread, unless it lies in memory."""
         return self
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
         """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
-        the nodes. That of a node is half the difference of the two voxels beside it, or at the border the
-        difference between itself and the one beside it. From six cubes, unless they are stored."""
+        the nodes, which are central differences, one-sided at the border. Fetches six cubes."""
         node, fraction = self.split(data, coordinate)
         slopes = [self._slopes_of_nodes(data, node, axis, coordinate[0].dtype) for axis in range(3)]
         return self._interpolated_slopes(slopes, fraction)
 
     def _interpolated_slopes(self, slopes: list[Cube], fraction: Vec3) -> Vec3:
         """Slopes along x, y and z, from those of eight nodes along the array's axes."""
-        found = [interpolated(transposed(cube, self.axes), fraction) for cube in slopes]
+        found = [trilinear(transposed(cube, self.axes), fraction) for cube in slopes]
         return permuted(found, inverse(self.axes))
 
     def _slopes_of_nodes(self, data: Shaped[Array, "nx ny nz"], node: Node, axis: int, dtype: Any) -> Cube:
-        """Slopes along an axis of the array of the eight nodes that begin with this one."""
+        """Slopes along an axis of the array of the eight nodes from this one on."""
 
-        def beside(offset: int) -> Cube:
+        def neighbours(offset: int) -> Cube:
             i, j, k = (
                 jnp.clip(n + offset, 0, data.shape[a] - 2) if a == axis else n for a, n in enumerate(node)
             )
@@ -117,7 +114,7 @@ class Fetch(eqx.Module):
 
         # A cube does not reach past the border. There it begins with the first node, or ends with the last.
         first, last = node[axis] == 0, node[axis] == data.shape[axis] - 2
-        (a, b), (c, d) = beside(-1), beside(1)
+        (a, b), (c, d) = neighbours(-1), neighbours(1)
         b, c = (
             jax.tree.map(partial(jnp.where, border), outer, inner)
             for border, outer, inner in ((first, a, b), (last, d, c))
@@ -127,7 +124,7 @@ class Fetch(eqx.Module):
 
 
 def read_by(fetch: Fetch, how: Fetch) -> Fetch:
-    """The same voxels as of `fetch`, read as by `how`."""
+    """`how`, with the window of `fetch`."""
     return eqx.tree_at(lambda fetch: fetch.window, how, fetch.window, is_leaf=lambda leaf: leaf is None)
 
 
@@ -146,12 +143,12 @@ def _with_first(axis: int, cube: Cube) -> Cube:
     return transposed(cube, ((0, 1, 2), (1, 0, 2), (2, 1, 0))[axis])
 
 
-def interpolated(cube: Cube, fraction: Vec3) -> Scalar:
+def _lerp(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
+    return a + f * (b - a)
+
+
+def trilinear(cube: Cube, fraction: Vec3, mix: Callable[[Scalar, Scalar, Scalar], Scalar] = _lerp) -> Scalar:
     """Trilinear interpolation."""
-
-    def mix(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
-        return a + f * (b - a)
-
     fx, fy, fz = fraction
     (y0, y1), (y2, y3) = ((mix(fz, *row) for row in plane) for plane in cube)
     return mix(fx, mix(fy, y0, y1), mix(fy, y2, y3))
@@ -167,9 +164,8 @@ class OneByOne(Fetch):
 class Packed(Fetch):
     """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
 
-    - `nodes`: of 8-bit voxels, where they are stored, the slopes of each node. Doubled they are integers of
-      10 bits: that along x in the highest bits of a word, that along y from bit 12 on, that along z in the
-      lowest.
+    - `nodes`: of 8-bit voxels, if stored, the slopes of each node. Doubled, they are integers of 10 bits:
+      along x in the highest bits of a word, along y from bit 12 on, along z in the lowest.
     - `begin`: see `of_slopes_at`.
     """
 
@@ -210,8 +206,7 @@ class Packed(Fetch):
         _, ny, nz = data.shape
         shift = 32 - SLOPE_BITS
 
-        # Parts of the array, so that all eight fetches share one index: XLA adds an offset that is part of
-        # the index 16 times for 16 samples. A slice that is fetched from is not stored.
+        # slices, which are not stored, so that all eight fetches share one index
         last = (ny + 1) * nz + 1
         length = data.size - last
 
@@ -221,7 +216,7 @@ class Packed(Fetch):
         words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
 
         def slopes(bits: int) -> Cube:
-            """The slopes that begin so many bits below the highest one, times a power of two."""
+            """The slopes from so many bits below the highest one on, times a power of two."""
 
             def top(word: Int[Array, ""]) -> Scalar:
                 return ((word << bits) & -(1 << shift)).astype(dtype)
@@ -234,18 +229,15 @@ class Packed(Fetch):
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
         word = gather(self.words, flat)
-        # XLA repeats a fetch for each use of its value, but not for uses of the converted value
+        # converted, or XLA repeats the fetch for each use
         return word.astype(jnp.int32)
 
 
 class Recording(Fetch):
-    """Records which voxels are fetched, and adds a value to each, so that the VJP with respect to these
-    values returns their cotangents.
+    """Records every fetch, so that its VJP returns one cotangent per fetch.
 
-    - `perturbations`: the values, in the order of the fetches; if empty, nothing is added (to count the
-      fetches).
-    - `bases`: of each cube its first voxel, as an index into the flattened array, filled while a program is
-      traced.
+    - `perturbations`: are added to the voxels, in the order of the fetches; if empty, nothing is.
+    - `bases`: first voxel of each cube, as an index into the flattened array, filled while tracing.
     """
 
     perturbations: list[Cube]
@@ -261,7 +253,7 @@ class Recording(Fetch):
 
 
 def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
-    """Values to add to the cubes that begin at these voxels, which may be given by their shapes alone."""
+    """Perturbations for the cubes at these `bases`, of which the shapes count."""
     zeros = (jnp.zeros(base.shape, dtype) for base in bases)
     return [[[[zero, zero], [zero, zero]], [[zero, zero], [zero, zero]]] for zero in zeros]
 
@@ -277,8 +269,7 @@ def scatter_add(
     bases: list[Int[Array, "..."]],
     cubes: list[Cube],
 ) -> Float[Array, " voxels"]:
-    """Add the cotangents of cubes, which begin at these voxels, to the flattened voxels of an array of this
-    shape."""
+    """Adds the cotangents of the cubes at these `bases` to the flattened voxels of an array of this shape."""
     _, ny, nz = shape
     for base, cube in zip(bases, cubes, strict=True):
         for x, y in itertools.product((0, 1), repeat=2):
@@ -294,9 +285,8 @@ def scatter_add(
 def cube_of(
     voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], node: Node, dtype: Any
 ) -> Cube:
-    """The eight voxels that begin with this one, each by its index into the flattened array."""
-    _, ny, nz = shape
-    base = flat_index(node, shape)
+    """The eight voxels from a node on. `voxel`: by its index into the flattened array."""
+    (_, ny, nz), base = shape, flat_index(node, shape)
     return [
         [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
     ]

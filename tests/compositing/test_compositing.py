@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing.compositing import Fragment
+from jaxvol.compositing.blending import Fragment
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import ConstantLight, Deferred, Material, ScattererTemplates
 from jaxvol.march.march import Cell

@@ -32,13 +32,13 @@ def _without_bulge(box_of):
 FAULTS: list[Fault] = [
     Fault(
         "owned bricks: what is behind is not dimmed",
-        "compositing.compositing:Over.joined",
+        "compositing.blending:Over.joined",
         lambda _: lambda self, front, back: jax.tree.map(jnp.add, front, back),
         ("compositing/test_compositing.py::test_weightings_sum_cells_as_numpy_does",),
     ),
     Fault(
         "replay: wrong sign of what is behind a sample",
-        "compositing.compositing:Over.slope",
+        "compositing.blending:Over.slope",
         lambda f: lambda self, alpha, after, worth, behind: f(self, alpha, after, worth, -behind),
         ("compositing/test_compositing.py::test_slopes_are_those_of_jax",),
     ),

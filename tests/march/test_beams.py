@@ -12,7 +12,7 @@ import pytest
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.march.beams import STRETCHES, Box, stretches
-from jaxvol.scene.occupancy import Occupancy
+from jaxvol.scene.occupancy import Occupancy, Sums
 from jaxvol.xla import platform
 
 from ..round_trips import counted
@@ -82,7 +82,7 @@ def test_a_box_holds_every_ray_of_its_beam(parallel):
 @jax.jit
 def known(occupied, boxes):
     seen = occupancy(occupied)
-    return stretches(seen, seen.sums(), boxes, jnp.float32(0.3))
+    return stretches(seen, Sums.of(seen.occupied), boxes, jnp.float32(0.3))
 
 
 def test_stretches_called_empty_contain_nothing_along_any_ray():
@@ -108,7 +108,7 @@ def test_stretches_are_the_same_all_at_once(monkeypatch):
     seen = occupancy(np.random.default_rng(0).random(BLOCKS) < 0.005)
     boxes = [box_of(*corners)[0] for _, corners in beams(False)[-3:]]
     box = jax.tree.map(lambda *leaves: np.stack(leaves), *boxes)
-    arguments = seen, eqx.filter_jit(lambda seen: seen.sums())(seen), box, jnp.float32(0.05)
+    arguments = seen, eqx.filter_jit(Sums.of)(seen.occupied), box, jnp.float32(0.05)
     in_turn, (looks, _) = counted(stretches, *arguments)
     monkeypatch.setattr(platform, "platform", lambda: "gpu")
     at_once, trips = counted(stretches, *arguments)

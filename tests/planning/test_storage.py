@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing.compositing import Over
+from jaxvol.compositing.blending import Over
 from jaxvol.planning.probe import Probe, Setting
 from jaxvol.planning.storage import stored
 from jaxvol.scene.space import Affine

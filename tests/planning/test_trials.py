@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings, strategies
 
 import jaxvol as jv
-from jaxvol.compositing.compositing import Over
+from jaxvol.compositing.blending import Over
 from jaxvol.compositing.projections import Average
 from jaxvol.lighting.shading import Simpler
 from jaxvol.planning import trials

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 
 from ...bricks import BudgetPlan, VoxelSource, plan, render_bricks
-from ...compositing.compositing import Compositing
+from ...compositing.blending import Compositing
 from ...lighting import Lighting
 from ...march.march import March
 from ...march.transforms.alpha_correction import AlphaCorrection

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from ...bricks import VoxelSource
-from ...compositing.compositing import Compositing, Over
+from ...compositing.blending import Compositing, Over
 from ...compositing.isosurface import Isosurface
 from ...compositing.modes import MODES, compositing_of
 from ...compositing.projections import Average

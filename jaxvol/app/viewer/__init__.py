@@ -8,7 +8,7 @@ while it changes and fine at rest) and one description of its controls (`control
 from typing import TYPE_CHECKING, Any
 
 from ..._util.checks import integer
-from ...compositing.compositing import Compositing
+from ...compositing.blending import Compositing
 from ...compositing.modes import Mode
 from ...lighting.shading import Lighting
 from ...march.march import March

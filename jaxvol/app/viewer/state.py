@@ -6,8 +6,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ..._util.checks import described, finite_array
-from ...arguments import check_arguments
-from ...compositing.compositing import Compositing
+from ...compositing.blending import Compositing
 from ...compositing.modes import Mode, compositing_of
 from ...compositing.projections import Average
 from ...lighting import Phong
@@ -21,6 +20,7 @@ from ...march.transforms import (
     Jitter,
     SpaceLeaping,
 )
+from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.occupancy import BLOCK
 from ...scene.space import median_node_distance

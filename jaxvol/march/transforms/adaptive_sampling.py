@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Int32
 
 from ..._util.checks import number, power_of_two
 from ..._util.vec3 import Scalar
-from ...scene.occupancy import BLOCK
+from ...scene.occupancy import BLOCK, with_neighbours
 from ...scene.space import Ray, Space, node_distance
 from ...scene.variation import MARGIN, Variation, Windows
 from ...xla.memory import gather, in_memory
@@ -19,28 +19,26 @@ from ..strides import RUN, Run, StrideControl
 
 
 SHARE = 1 / 20
-"""What a block's predicted error is worth in the image: errors of a ray's cells have either sign, and most
-are much smaller than predicted. Measured: `experiments.adaptive_error`."""
+"""Error of the image by predicted error of a block: errors of a ray's cells have either sign, and most are
+much smaller than predicted. Measured: `experiments.adaptive_error`."""
 
 HIDDEN = 1 / 4
-"""The same of what the front of a cell hides of its back: more, since that has one sign along a ray. With it,
-volumes of linear and of wavy values stay within their tolerance."""
+"""The same of what the front of a cell hides of its back: more, since that has one sign along a ray."""
 
 FARTHEST = 8
-"""Blocks around its own that a run may touch: it is at most 68 voxels long."""
+"""Blocks around its own that a run may touch."""
 
 
 class AdaptiveSampling(StrideControl):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
-    Where the value bends little between nodes, or the transfer function changes little with it, a long cell
-    is as good as several short ones; and so it is behind what hides most of it. Take a block of 4³ voxels, of
-    side ℓ, whose values, with those up to two nodes around it, range over R, with second differences of at
-    most H (per length²). Between the ends of a cell of width w the value leaves the straight line by about
-    δ = H w² / 8 (along a diagonal up to three times as much, and more in cells shorter than a voxel that
-    cross a face between voxels). While the value passes through R once, extinction and emission change by V
-    in total, C of it by the colour, and their slopes by K; C times the extinction is D
-    (`variation.Variation`). Then the optical depth of a stretch as long as the block is wrong by about
+    A long cell is as good as several short ones where the value is nearly linear, or the transfer function
+    nearly constant, or little is seen of it. Take a block of 4³ voxels, of side ℓ, whose values, with those
+    up to two nodes around it, range over R, with second differences of at most H (per length²). Between the
+    ends of a cell of width w the value leaves the straight line by about δ = H w² / 8. While the value passes
+    through R once, extinction and emission change by V in total, C of it by the colour, and their slopes by
+    K; C times the extinction is D (`variation.Variation`). Then the optical depth along the block is wrong by
+    about
 
         e = ℓ V min(1, δ / R) + q
 
@@ -51,35 +49,30 @@ class AdaptiveSampling(StrideControl):
     largest e and h of the blocks that may hold a part of the run, and T the transmittance in front of it.
     Without `AlphaCorrection`, only cells of one step reach past the exit.
 
-    **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes, from
-    outside and inside (`experiments.adaptive_error`). It does not know how light varies along a cell, nor
-    can cells be shorter than the shortest that it is given: an eighth of a voxel suits tolerances of 0.001, a
-    quarter larger ones; `quadrature="left"` may need less (an eighth erred by 0.0017 in a chest).
-    `Rendering.error` is the root of the summed squares of a ray's runs; where cells are too long, it is
+    **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes
+    (`experiments.adaptive_error`). It does not know how light varies along a cell. No cell is shorter than a
+    step: an eighth of a voxel suits tolerances of 0.001, a quarter larger ones; `quadrature="left"` may need
+    less. `Rendering.error` is the root of the summed squares of a ray's runs; where a step is too long, it is
     greater than the tolerance.
 
-    For what it saves, in samples and in time, see `experiments/results/README.md`: on CPU it is faster only
-    where rays take many samples, since each run of four must be looked up. Under light it was not measured.
+    What it saves is in `experiments/results/README.md`: on CPU it is faster only where rays take many
+    samples. Under light it was not measured.
 
-    All cells are one step long, and `Rendering.error` is infinite, where nothing is known: for modes that do
-    not composite "over", and for transfer functions that do not say how they vary, such as
-    `LabelTransferFunction`.
+    All cells are one step long, and `Rendering.error` is infinite, where nothing is known: for modes other
+    than "over", and for transfer functions that do not say how they vary, such as `LabelTransferFunction`.
 
     **Arguments:**
 
-    - `tolerance`: of the image's RMSE, > 0. It may be traced: images of any tolerance are made by one
-      program.
+    - `tolerance`: of the image's RMSE, > 0. It may be traced.
     - `longest`: the most steps of the march that a cell is long, a power of two up to 64.
 
-    Where `Jitter` or `EmptySpaceJitter` move samples, each ray's runs begin at a random depth, too, since
-    otherwise long cells, and runs, would leave a wood grain of their own.
+    Where `Jitter` or `EmptySpaceJitter` move samples, each ray's runs begin at a random depth, too, or long
+    cells would leave a wood grain of their own.
 
-    What is known of the voxels is computed once for each array of them. Which cells may be long follows from
-    the transfer function in each image, inside `jax.jit`, too. Strides are constants to derivatives, and so
-    is `Rendering.error`; the image jumps where one changes. So compare gradients with finite differences
-    without this transform, and search along lines with care.
+    Strides, and `Rendering.error`, are constants to derivatives, and the image jumps where a stride changes:
+    compare gradients with finite differences without this transform, and search along lines with care.
 
-    Where it fails, and where not: `experiments/stability.py`, "tolerances finer than the finest cell",
+    Where it fails: `experiments/stability.py`, "tolerances finer than the finest cell",
     "adaptive strides under light".
 
     **Raises:** `ValueError` for another tolerance or `longest`.
@@ -90,7 +83,8 @@ class AdaptiveSampling(StrideControl):
     tolerance: Float[Array, ""]
     longest: int = eqx.field(static=True)
     errors: Int32[Array, "levels bx by bz"] | None
-    """By stride and block, the predicted error, `_coded`; None before the scene is known."""
+    """Predicted error by stride and block, `_coded` as integers, which have no gradient; None before the
+    scene is known."""
     first: Int[Array, "3"] | None
     """Index of the first block, where only a part of the volume is known."""
 
@@ -102,8 +96,7 @@ class AdaptiveSampling(StrideControl):
     def prepared(
         self, march: March, space: Space, windows: Windows, variation: Variation
     ) -> "AdaptiveSampling":
-        # In a branch of its own, so that it is rounded alike in every program: an error that nearly equals
-        # the tolerance must not make different cells where an image is made in `jax.jit`, or differentiated.
+        # in a branch of its own, so that it is rounded alike in every program, and strides are the same
         predict = partial(_errors, self.longest)
         errors = in_memory(march.step > 0, predict, march, space, windows, variation)
         found = errors, windows.first
@@ -137,7 +130,7 @@ def _decoded(code: Int32[Array, "*blocks"], dtype: Any) -> Float[Array, "*blocks
 def _errors(
     longest: int, march: March, space: Space, windows: Windows, variation: Variation
 ) -> Int32[Array, "levels bx by bz"]:
-    """By stride and block, the coded error of a run with its middle there."""
+    """By stride and block, the coded error of a run whose middle lies there."""
     dtype = march.step.dtype
     low, high, bend, variation = jax.tree.map(
         lambda leaf: leaf.astype(dtype), (windows.low, windows.high, windows.bend, variation)
@@ -162,13 +155,14 @@ def _errors(
         # a cell's front hides its back
         hidden = jnp.minimum(variation.hidden * width, variation.colored) * width / 8
         code = _coded(jnp.maximum(SHARE * error, HIDDEN * hidden))
-        code = jax.lax.fori_loop(0, jnp.minimum(rounds, FARTHEST).astype(jnp.int32), _dilated, code)
+        number = jnp.minimum(rounds, FARTHEST).astype(jnp.int32)
+        code = jax.lax.fori_loop(0, number, lambda _, code: with_neighbours(code, jnp.maximum), code)
         levels.append(jnp.where(rounds <= FARTHEST, code, _coded(jnp.asarray(jnp.inf))))
     return jnp.stack(levels)
 
 
 def _shortest(space: Space, windows: Windows, distance: Float[Array, "bx by bz"]) -> Scalar:
-    """The least distance between nodes in all of the grid, of which the windows may be a part."""
+    """The least distance between nodes in all of the grid, of which the windows may cover a part."""
     if windows.whole is None:
         return jnp.min(distance)
     bx, by, bz = windows.whole
@@ -177,13 +171,3 @@ def _shortest(space: Space, windows: Windows, distance: Float[Array, "bx by bz"]
         lambda x: jnp.min(node_distance(space, (1, by, bz), jnp.stack([x, zero, zero]))), jnp.arange(bx)
     )
     return jnp.min(layers).astype(distance.dtype)
-
-
-def _dilated(_: Any, codes: Int32[Array, "bx by bz"]) -> Int32[Array, "bx by bz"]:
-    """The largest of each block and all around it."""
-    for axis in range(3):
-        ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
-        padded, n = jnp.pad(codes, ends, mode="edge"), codes.shape[axis]
-        for first in (0, 2):
-            codes = jnp.maximum(codes, jax.lax.slice_in_dim(padded, first, first + n, axis=axis))
-    return codes

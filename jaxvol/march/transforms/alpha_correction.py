@@ -1,5 +1,4 @@
-"""How wide is a cell that crosses a face? Sampling alignment, also called alpha correction (Kye 2013), at the
-exit; the same idea at faces of labels and gaps."""
+"""How wide is a cell that crosses a face? Sampling alignment, also called alpha correction (Kye 2013)."""
 
 from typing import Any, ClassVar, TypeAlias
 
@@ -16,52 +15,49 @@ from ..march import Cell, Transform
 
 
 Bracket: TypeAlias = tuple[Scalar, Scalar, Bool[Array, ""]]
-"""Inner end, outer end, and whether the region at the outer end differs from the inner one."""
+"""Two depths, and whether the region at the second differs from that at the first."""
 
 PROBES = 4
-"""Depths per cell, besides its front, at which the region is looked up: a region that lasts a quarter of a
-step or more is not missed."""
+"""Depths of a cell, besides its front, at which the region is looked up."""
 
 BISECTIONS = 14
-"""Bisections per face: it is located to 2⁻¹⁶ of a step, below what float32 resolves along most rays."""
+"""Bisections of a face, which is found to 2⁻¹⁶ of a step."""
 
 
 class AlphaCorrection(Transform):
     """Cut the cells of a ray at the faces that they cross.
 
-    The last sample's cell extends past the exit, by a different fraction of a step in every pixel, which
-    makes the back face of a non-transparent volume bumpy. With this transform, that sample stands only for
-    the width e up to the exact exit: its opacity becomes `1 - exp(-extinction e)`, which is the paper's
-    `1 - (1 - α)^(e/d)`. A volume of constant extinction is rendered exactly at any step.
+    The cell of a ray's last sample reaches past the exit, by a different fraction of a step in every pixel,
+    which makes back faces bumpy. With this transform, that sample stands only for the width e up to the exit:
+    its opacity is `1 - exp(-extinction e)`, which is the paper's `1 - (1 - α)^(e/d)`. A volume of constant
+    extinction is rendered exactly at any step.
 
-    Where a ray leaves the volume and re-enters it, as under `ToroidalMap` or where `Clip` cuts something out,
-    cells are cut at both ends of such a gap, too. Of a cell that holds several gaps, only the first and the
-    last end of them are cut.
+    Where a ray leaves the volume and re-enters it, as under `ToroidalMap` or `Clip`, cells are cut at both
+    ends of such a gap, too. Of a cell that holds several gaps, only the first and the last end are cut.
 
-    With this transform, the image is continuous in the camera and in everything else that moves the exit,
-    and its gradient is complete. Without it, the image jumps when a sample crosses the exit, and the
-    gradient with respect to the camera misses these jumps.
+    With this transform, the image is continuous in the camera and in all else that moves the exit, and its
+    gradient is complete. Without it, the image jumps when a sample crosses the exit, and the gradient misses
+    these jumps.
 
     **Arguments:**
 
-    - `labels`: also cut cells where the volume's label changes between two samples; the face is found by
-      bisection. The part before it is classified at the sample, the part behind it at the face: each by
-      its own label, so that the faces of a segmentation stay smooth under jitter. A label that lasts less
-      than a cell may be missed. Costs a label fetch per bisection, and a second sample per cell. The ends of
-      gaps are then found by bisection, too.
+    - `labels`: also cut cells where the volume's label changes between two samples; the face, and the ends
+      of gaps, are found by bisection. The part before it is classified at the sample, the part behind it at
+      the face: each by its own label, so that the faces of a segmentation stay smooth under jitter. A label
+      that lasts less than a quarter of a cell may be missed. Costs a label fetch per bisection, and two more
+      samples per cell.
 
-    Gradients treat the faces of labels as fixed in space: with respect to the camera, they miss how such a
-    face moves along a ray; with `labels=True`, those of gaps, too. The motion of the exit is included.
+    Gradients take the faces of labels, and with `labels=True` the ends of gaps, as fixed in space: they miss
+    how these move along a ray. The motion of the exit is included.
 
-    Where it fails, and where not: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
+    Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
 
     **Raises:** `ValueError` for `labels` that are not true or false, and when a volume without labels is
     rendered with `labels=True`.
 
-    Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit. The cuts at faces
-    of labels and gaps are not in the paper, which names the noise of jitter at the faces of a segmentation
-    as future work.
+    Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit; labels are its
+    future work.
     """
 
     joins: ClassVar[bool] = True
@@ -75,10 +71,9 @@ class AlphaCorrection(Transform):
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         back = cell.front + cell.width
         reaches_past = back > ray.length
-        # A cell entirely past the exit is not sampled; its width only has to be ≥ 0.
-        # Not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10).
+        # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
         left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
-        # A cell that ends at the exit is not cut, but its width is the exit's to change.
+        # of a cell that ends at the exit, too, the exit changes the width
         cell = Cell(cell.front, jnp.where(back >= ray.length, left, cell.width), cell.cut | reaches_past)
         if self.labels:
             return _divided(cell, *_label_faces(cell, ray, volume))
@@ -86,8 +81,7 @@ class AlphaCorrection(Transform):
 
 
 def _divided(cell: Cell, first: Scalar, last: Scalar, changes: Bool[Array, ""]) -> tuple[Cell, Cell, Cell]:
-    """Split a cell at its first and last face: three pieces, front to back. If it has none, the last two have
-    width 0."""
+    """Split a cell at its first and last face if it `changes`; else the last two pieces have width 0."""
     end = cell.front + cell.width
     first = jnp.where(changes, first, end)
     last = jnp.where(changes, last, end)
@@ -112,7 +106,7 @@ def _gap_faces(cell: Cell, ray: Ray) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
 
 
 def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
-    """Where a cell's label first and last changes, a gap having one of its own; and whether it does."""
+    """Where a cell's label first and last changes, and whether it does. Gaps have a label of their own."""
 
     def region(s: Scalar) -> Int[Array, ""]:
         return jnp.where(ray.in_gap(s), -1, volume.label(ray.path(s)))
@@ -122,8 +116,7 @@ def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, 
     regions = [region(depth) for depth in depths]
 
     def face(inner: Int[Array, ""], brackets: list[Bracket]) -> tuple[Scalar, Scalar]:
-        """Both sides of the face where the region stops being `inner`, in the first bracket whose outer end
-        lies in another region."""
+        """Both sides of the face where the region stops being `inner`, in the first bracket that changes."""
         near, far = brackets[0][0], brackets[0][0]
         for start, stop, changed in reversed(brackets):
             near, far = jnp.where(changed, start, near), jnp.where(changed, stop, far)

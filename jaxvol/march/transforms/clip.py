@@ -1,4 +1,4 @@
-"""Which part of the volume is seen? What lies inside a box and planes, or what lies outside of them."""
+"""Which part of the volume is seen? What lies inside a box and planes, or outside of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, described, finite_array, flag, require
-from ..._util.vec3 import Scalar, Vec3, apart, dot
-from ...scene.frame import Frame
+from ..._util.vec3 import Frame, Scalar, Vec3, apart, dot
 from ...scene.occupancy import Occupancy
 from ...scene.space import Gap, Path, Space
 from ..march import Transform
@@ -23,17 +22,14 @@ class Clip(Transform):
     """Show only what lies inside a box, and on the side of each plane to which its normal points; or, inside
     out, cut this away and show the rest.
 
-    Cut faces are faces like those of the volume. A ray enters and leaves the volume at them, so that its
-    first sample lies on the face, which `EmptySpaceJitter` keeps smooth, and `AlphaCorrection` cuts its last
-    cell there. With `inside_out`, a ray that enters or leaves the volume in what is cut away begins or ends
-    at the cut. Any other ray that meets it has a gap. There, samples are transparent, `EmptySpaceJitter`
-    shifts them, and `AlphaCorrection` cuts cells at both ends, for which it takes three samples of each
-    cell. Without `AlphaCorrection`, a face behind a gap lies where the next sample happens to be, and is as
-    noisy under jitter as any surface in the volume.
+    A ray enters and leaves the volume at the cuts: its first sample lies on the cut face, and
+    `AlphaCorrection` cuts its last cell there. With `inside_out`, a ray that passes through what is cut away
+    has a gap there, in which samples are transparent, and at whose ends `AlphaCorrection` cuts cells, for
+    which it takes three samples of each cell. Without `AlphaCorrection`, faces behind a gap are as noisy
+    under jitter as any surface in the volume.
 
-    What is sampled stays the same: values and light are those of the whole volume, as if nothing were cut
-    away. The place among other transforms does not matter. Box and planes are in world coordinates, also
-    under a `ToroidalMap`.
+    Values and light stay those of the whole volume. The place among other transforms does not matter. Box and
+    planes are in world coordinates, also under a `ToroidalMap`.
 
     **Arguments:**
 
@@ -46,14 +42,13 @@ class Clip(Transform):
     `box`, `origins` and `normals` are differentiable: gradients include how ends of rays and gaps move.
     Where a face of the box coincides with one of the volume, the derivative is that of moving it inwards.
     Without `AlphaCorrection` the image jumps when a sample crosses a cut, and gradients miss these jumps.
-    With `AlphaCorrection(labels=True)`, they take the ends of gaps as fixed. Where a gap comes to reach the
-    ray's entry, the samples behind it move, and the image jumps by the error of the step.
+    With `AlphaCorrection(labels=True)`, they take the ends of gaps as fixed. The image also jumps, by the
+    error of the step, where a gap comes to reach the ray's entry.
 
-    A ray within a plane is inside; rounding decides of rays that nearly are. Inside out, a film of less than
-    2e-6 of the volume's diagonal between its face and the cut is not seen: it is rounding, where the two
-    should coincide.
+    A ray within a plane is inside. Inside out, a film of less than 2e-6 of the volume's diagonal between its
+    face and the cut is not seen: it is taken for rounding.
 
-    Where it fails, and where not: `experiments/stability.py`, "jitter behind cuts".
+    Where it fails: `experiments/stability.py`, "jitter behind cuts".
 
     **Raises:** `ValueError` without a box or a plane, for numbers that are not finite, a box whose ends do
     not increase, and a normal of length 0.
@@ -84,7 +79,7 @@ class Clip(Transform):
 
 
 class HalfSpace(NamedTuple):
-    """What lies on one side of a plane: that of its unit `normal`, through `point`."""
+    """What lies on the side of a plane through `point` to which its unit `normal` points."""
 
     point: Vec3
     normal: Vec3
@@ -101,8 +96,8 @@ class HalfSpace(NamedTuple):
         return dot(self.normal, (x - px, y - py, z - pz))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which a line enters and leaves; infinite where it does not. Of a line that is outside
-        everywhere, the first exceeds the second."""
+        """Distances at which a line enters and leaves, infinite where it does not; of a line that is outside,
+        the first exceeds the second."""
         height, rate = self.height(origin), dot(self.normal, direction)
         # Smaller rates count as parallel. Not 0: the derivative of 1/x, 1/x², must be finite.
         parallel = jnp.abs(rate) < float(jnp.finfo(rate.dtype).tiny) ** 0.25
@@ -113,15 +108,15 @@ class HalfSpace(NamedTuple):
         return near, far
 
     def over(self, grid: Occupancy) -> tuple[Float[Array, "cx cy cz"], Scalar]:
-        """Heights of the middles of a grid's cells, and how far cells reach from there along the normal; a
-        little more, for rounding."""
+        """Heights of the middles of a grid's cells, and how far cells reach from there along the normal, with
+        a margin for rounding."""
         shape = grid.occupied.shape
         x, y, z = (
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
             for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
         )
         a, b, c = map(jnp.abs, grid.own_direction(self.normal))
-        # as far as coordinates go: what rounds most
+        # the greatest coordinate, which rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
         if isinstance(grid.frame, Frame):
             ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.origin))
@@ -162,8 +157,8 @@ class _Clipped(Space):
         return self.inner.path(entry, direction)
 
     def _inside(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which a line enters and leaves what is inside all sides; on a miss, the first is at
-        least the second."""
+        """Distances at which a line enters and leaves what is inside all sides; the first is at least the
+        second if it does not."""
         nears, fars = zip(*(side.interval(origin, direction) for side in self.sides), strict=True)
         return reduce(_later, nears), reduce(_earlier, fars)
 
@@ -180,7 +175,7 @@ class _Clipped(Space):
         return first, last
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
-        # Up to the exit of the whole: where a cut lies in a gap, the other end of that lies behind it.
+        # searched up to the exit of the whole: where a cut lies in a gap, that ends behind it
         _, far = self.inner.interval(entry, direction)
         gaps = self.inner.gaps(entry, direction, _later(length, far))
         if not self.inside_out:
@@ -190,7 +185,6 @@ class _Clipped(Space):
         return *gaps, (jnp.where(between, enters, jnp.inf), jnp.where(between, leaves, jnp.inf))
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        """Without the cells of which nothing is seen."""
         grid = self.inner.occupancy(visible, first)
         over = [side.over(grid) for side in self.sides]
         if self.inside_out:
@@ -237,12 +231,10 @@ def _box(box: Arrayable) -> Float[Array, "6"]:
 
 
 def _is_sequence(value: Any) -> bool:
-    """Whether a value has a length and entries in order."""
     return isinstance(value, Sequence) or (isinstance(value, np.ndarray | jax.Array) and value.ndim > 0)
 
 
 def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes 3"]]:
-    """Origins and normals."""
     if not _is_sequence(planes):
         raise ValueError(f"planes must be a list of pairs (origin, normal); got {described(planes)}.")
     origins, normals = [], []

@@ -1,8 +1,8 @@
 """Where are samples placed, so that steps do not show as rings? Jittered sampling, and empty-space jittering.
 
-Samples at the same depths in all pixels render the distance to a surface as rings over the image: wood
-grain. Both transforms shift the samples of each pixel by a random fraction ξ of a step, which turns the
-rings into noise. Neither makes the image more accurate: the energy of its error stays the same.
+Samples at the same depths in all pixels show rings around surfaces: wood grain. Both transforms shift the
+samples of each pixel by a random fraction ξ of a step, which turns the rings into noise. Neither makes the
+image more accurate: the energy of its error stays the same.
 """
 
 from typing import Any, ClassVar, Literal
@@ -25,9 +25,8 @@ Pattern = Literal["white", "blue"]
 class Noise(eqx.Module):
     """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel.
 
-    `pattern`: `"white"`: independent from pixel to pixel. `"blue"`: low frequencies suppressed, so that
-    the noise is less visible; a tile of 128 x 128 distinct numbers, repeated over the image from an
-    origin that the seed chooses.
+    `pattern`: `"white"`: independent from pixel to pixel. `"blue"`: a tile of 128 x 128 numbers without low
+    frequencies, repeated over the image from an origin that the seed chooses.
     """
 
     seed: UInt32[Array, ""]
@@ -35,10 +34,9 @@ class Noise(eqx.Module):
     stream: int = eqx.field(static=True)
 
     def __init__(self, seed: int | Any, pattern: Pattern | Any, stream: int):
-        seed = seed_word(seed)
+        self.seed = seed_word(seed)
         if pattern not in ("white", "blue"):
             raise ValueError(f'pattern must be "white" or "blue"; got {pattern!r}.')
-        self.seed = seed
         self.tile = blue_tile() if pattern == "blue" else None
         self.stream = stream
 
@@ -47,7 +45,6 @@ class Noise(eqx.Module):
         if self.tile is None:
             return hashed_uniforms(column, row, self.seed, dtype)[self.stream]
         side = self.tile.shape[0]
-        # origin of the tile: the same for all pixels, different for each seed and stream
         here = jnp.full_like(column, self.stream)
         shift_x, shift_y, _ = hashed_uniforms(here, here, self.seed, jnp.float32)
         x = (column + (shift_x * side).astype(column.dtype)) % side
@@ -59,7 +56,7 @@ class Jitter(Transform):
     """Start each ray a random fraction ξ of a step past its entry.
 
     Turns wood grain into noise. Where the volume's bounds cut through material it adds noise, since each
-    ray leaves out the first ξ d of the material.
+    ray leaves out the first ξ d of it.
 
     **Arguments:**
 
@@ -69,7 +66,7 @@ class Jitter(Transform):
     - `front_residual`: give the part that is left out a narrow cell of its own, from the entry to ξ d,
       sampled at the entry. The noise on cut faces then falls to that of the sample's value.
 
-    Where it fails, and where not: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
+    Where it fails: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
 
     **Raises:** `ValueError` for an invalid seed, pattern or `front_residual`.
 
@@ -96,7 +93,7 @@ class Jitter(Transform):
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         if not self.front_residual:
             return (cell,)
-        # Not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10).
+        # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
         front = jnp.where(cell.front > 0, cell.front, 0)
         left = cell.width - (front - cell.front)
         return (Cell(front, jnp.where(left > 0, left, 0), cell.cut),)  # a piece may end before the entry
@@ -105,16 +102,15 @@ class Jitter(Transform):
 class EmptySpaceJitter(Transform):
     """At a ray's first transparent sample, advance by a random fraction ξ of a step instead of a whole one.
 
-    A ray starts at its entry without an offset, so faces where the volume's bounds cut material stay
-    smooth; samples behind empty space are jittered, so wood grain still turns into noise. ξ < 1 keeps the
-    shifted sample within the cell that is known to be empty. This happens once per ray, since every
-    shortened step costs a sample. Transparent means an extinction of exactly 0.
+    A ray starts at its entry, so that faces where the volume's bounds cut material stay smooth; samples
+    behind empty space are jittered, so that wood grain still turns into noise. This happens once per ray.
+    Transparent means an extinction of exactly 0.
 
     The image jumps where a ray's first transparent sample changes; gradients do not include these jumps.
 
     **Arguments:** `seed`, `pattern`: as in `Jitter`; the random numbers are independent of `Jitter`'s.
 
-    Where it fails, and where not: `experiments/stability.py`, "wood grain without empty samples".
+    Where it fails: `experiments/stability.py`, "wood grain without empty samples".
 
     **Raises:** `ValueError` for an invalid seed or pattern.
 

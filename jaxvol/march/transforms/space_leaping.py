@@ -1,12 +1,4 @@
-"""How far ahead is nothing visible? Space leaping (Chae and Shin; KISTI report 2005).
-
-All methods query the same grid of occupied cells (`Occupancy`), which depends on the transfer function.
-They differ in the query, and in the rays that share its result:
-
-- `"hierarchy"`: for each stretch of a beam of 8 x 8 pixels, whether its bounding box is empty;
-- `"distance"`: for each ray, the distance to the nearest occupied cell;
-- `"min_distance"`, `"beam"`: the same, from a start distance that cells of R x R pixels share.
-"""
+"""How far ahead is nothing visible? Space leaping (Chae and Shin; KISTI report 2005)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,54 +14,49 @@ from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
 from ...xla.memory import gather
-from ..beams import Box, Stretches, stretches
-from ..march import EmptySpaceIndex, Transform, View
+from ..beams import Box, EmptySpaceIndex, Stretches, View, stretches
+from ..march import Transform
 
 
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
 
 LEAPS = 4
-"""Leaps from cell to cell before the next samples. Rays that have arrived wait for those that have not."""
+"""Leaps from cell to cell between two segments."""
 
 
 class SpaceLeaping(Transform):
     """Leap over regions in which the transfer function shows nothing.
 
-    Leaps are whole steps, so every sample taken is also one of the march without leaping: the image stays
-    the same, except under `"min_distance"`. `EmptySpaceJitter` treats what is leapt over as transparent.
+    Leaps are whole steps, so that every sample is also one of the march without leaps: the image stays the
+    same, except under `"min_distance"`. `EmptySpaceJitter` treats what is leapt over as transparent.
 
     **Arguments:**
 
     - `method`:
         - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
-          bounding box holds no visible block of 4³ voxels. Summed-volume tables answer for boxes of any
-          size at once, where an octree would be traversed from coarse to fine.
-        - `"distance"`: each ray leaps as far as a map of (chessboard) distances to the nearest visible
-          block proves empty. Leaps are short where a ray runs along a surface.
-        - `"min_distance"`: as `"distance"`, from a start distance that each cell of `cell` x `cell` pixels
-          shares: the nearest of the first hits of its four corner rays. **It is not a bound**: whatever is
-          thinner than a cell, and nearer than what its corners hit, is leapt over. The image is wrong
-          there, more so the larger the cells.
-        - `"beam"`: as `"min_distance"`, but the start is proven for everything in the cell's beam.
-    - `cell`: side of a cell of the last two methods, in pixels; at least 2.
+          bounding box holds no visible block of 4³ voxels.
+        - `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
+          proves empty. Leaps are short where a ray runs along a surface.
+        - `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
+          the first hits of their four corner rays. **It is not a bound**: what is thinner than these pixels,
+          and nearer than what their corners hit, is leapt over, and missing in the image.
+        - `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
+    - `cell`: side of the square of pixels of the last two methods; at least 2.
 
-    Visible blocks are determined for every image, from its transfer function. Regions that are leapt over
-    have extinction 0, so the image loses nothing. Yet an extinction of 0 has a gradient. `adjoint="direct"`,
-    which marches without leaps, includes it; `"forward"` takes it as 0 wherever rays leap, and `"replay"`
-    also in front of and behind everything that a ray sees. A fit that should make invisible regions visible
-    must start above 0, or not leap.
+    Visible blocks are determined for every image, from its transfer function. What is leapt over has
+    extinction 0, which changes no image, but has a gradient: `adjoint="direct"`, which does not leap,
+    includes it; `"forward"` takes it as 0 where rays leap, `"replay"` also in front of and behind everything
+    that a ray sees. A fit that should make invisible regions visible must start above 0, or not leap.
 
-    Where it fails, and where not: `experiments/stability.py`, "sheets thinner than a cell of rays",
+    Where it fails: `experiments/stability.py`, "sheets thinner than a cell of rays",
     "occupancy under steep transfer functions", "gradients of what is leapt over".
 
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
     rendering rays of one's own (`render_rays`).
 
-    Source: `"min_distance"` is the grid of Chae and Shin, over the distance map that they start from
-    (`"distance"`). Their map holds a distance per voxel, ours a chessboard distance per block of 4³ voxels;
-    they do not march the rays at the corners of cells again, we do. `"hierarchy"` replaces the octree of the
-    KISTI report 2005, which designs one and does not get it to work. `"beam"` is unpublished: it is the
-    bound that `"min_distance"` is not.
+    Source: Chae and Shin for `"distance"` and `"min_distance"`; they have distances of voxels, not of blocks,
+    and do not march the corner rays again. `"hierarchy"` stands for the octree of the KISTI report 2005;
+    `"beam"` is unpublished.
     """
 
     method: Method = eqx.field(static=True)
@@ -84,7 +71,7 @@ class SpaceLeaping(Transform):
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
         occupancy = jax.lax.stop_gradient(occupancy)
         if self.method == "hierarchy":
-            return _Beams(occupancy, occupancy.sums())
+            return _Beams(occupancy, Sums.of(occupancy.occupied))
         distances = _Distances(occupancy, occupancy.distance(), None, None, self.cell)
         if self.method == "distance":
             return distances
@@ -93,37 +80,27 @@ class SpaceLeaping(Transform):
                 f'SpaceLeaping("{self.method}") needs the neighbouring pixels of a camera; for rays of your '
                 'own use "hierarchy" or "distance".'
             )
-        published = self.method == "min_distance"
-        starts = self._nearest_hits(distances, view) if published else self._beam_starts(occupancy, view)
+        columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in view.size)
+        if self.method == "beam":
+            starts = self._beam_starts(occupancy, view, *jnp.meshgrid(columns[:-1], rows[:-1]))
+        else:
+            hits = view.first_hit(distances, *jnp.meshgrid(columns, rows))
+            across = jnp.minimum(hits[:, 1:], hits[:, :-1])
+            starts = jnp.minimum(across[1:], across[:-1])
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
-    def _corners(self, view: View) -> tuple[Int[Array, "cols"], Int[Array, "rows"]]:
-        width, height = view.size
-        columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in (width, height))
-        return columns, rows
-
-    def _nearest_hits(self, distances: EmptySpaceIndex, view: View) -> Float[Array, "rows cols"]:
-        """The nearest of the first hits of each cell's four corner rays."""
-        columns, rows = self._corners(view)
-        hits = view.first_hit(distances, *jnp.meshgrid(columns, rows))
-        across = jnp.minimum(hits[:, 1:], hits[:, :-1])
-        return jnp.minimum(across[1:], across[:-1])
-
-    def _beam_starts(self, occupancy: Occupancy, view: View) -> Float[Array, "rows cols"]:
-        """The distance up to which each cell's beam meets no occupied cell of the grid."""
-        columns, rows = self._corners(view)
+    def _beam_starts(
+        self, occupancy: Occupancy, view: View, column: Int[Array, "rows cols"], row: Int[Array, "rows cols"]
+    ) -> Float[Array, "rows cols"]:
+        """Up to which distances the beams of the cells that begin at these pixels meet nothing visible."""
         last = self.cell - 1
-        column = jnp.stack([columns[:-1], columns[:-1] + last])[None, :, None, :]
-        row = jnp.stack([rows[:-1], rows[:-1] + last])[:, None, :, None]
-        # (rows, cols, 4): the corner rays of each cell
-        column, row = (
-            jnp.moveaxis(i.reshape(4, *i.shape[2:]), 0, -1) for i in jnp.broadcast_arrays(column, row)
-        )
+        column = jnp.stack([column, column + last, column, column + last], axis=-1)
+        row = jnp.stack([row, row, row + last, row + last], axis=-1)
         cast = jnp.vectorize(lambda x, y: tuple(part for end in view.ray(x, y) for part in end))
         x, y, z, *direction = cast(column, row)
         box = Box.within(occupancy, (x, y, z), tuple(direction))
         box = jax.tree.map(jnp.ravel, box)
-        beams = stretches(occupancy, occupancy.sums(), box, jnp.min(jnp.stack(occupancy.size)))
+        beams = stretches(occupancy, Sums.of(occupancy.occupied), box, jnp.min(jnp.stack(occupancy.size)))
         first = beams.following[0].astype(beams.near.dtype)
         start = jnp.where(first < beams.following.shape[0], beams.near + first * beams.length, jnp.inf)
         return start.reshape(column.shape[:-1])
@@ -155,7 +132,7 @@ class _Beams(EmptySpaceIndex):
 
 
 class _Distances(EmptySpaceIndex):
-    """Skips, ray by ray, as far as the distance from the ray's cell to the nearest occupied one allows."""
+    """Skips, ray by ray, as far as the nearest occupied cell allows."""
 
     occupancy: Occupancy
     distance: UInt8[Array, " cells"]
@@ -172,7 +149,6 @@ class _Distances(EmptySpaceIndex):
         return jnp.ones((), bool)
 
     def within_ranges(self) -> EmptySpaceIndex:
-        # A ray's own range is tighter than a start that it shares with its neighbours.
         return replace(self, starts=None, corner=None)
 
     def skip_to(
@@ -201,7 +177,7 @@ class _Distances(EmptySpaceIndex):
         i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))
         flat = (i * ny + j) * nz + k
         away = gather(self.distance, flat).astype(depth.dtype)
-        # all cells nearer than that are empty: advance to where the ray leaves their cube
+        # all cells nearer than `away` are empty: advance to where the ray leaves their cube
         ahead = jnp.inf
         for p, r, corner in zip(point, rate, (x, y, z), strict=True):
             face = jnp.where(r > 0, corner + away, corner + 1 - away)

@@ -37,36 +37,31 @@ class ToroidalMap(Transform):
 
     The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
     coordinates are the probe's, with the origin on the motor axis. The world is empty outside the swept
-    sector. A ray may leave the sector and re-enter it, as through its hollow near side. Of such gaps two are
-    found; what a third one hides is taken for material. A ray that is nowhere farther outside than 2e-6 of
-    the probe's size counts as inside, and so may one that runs along a face at less than 1e-5 of it.
-    `AlphaCorrection` cuts cells at both ends of gaps.
+    sector. A ray may leave the sector and re-enter it, as through its hollow near side: two such gaps are
+    found. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside, and so may
+    one that runs along a face at less than 1e-5 of it.
 
     **Arguments:**
 
     - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
-      behind the axis, as in probes whose array turns about a near axis. Samples that then lie behind the
-      axis, where ρ would be negative (`nearest_to_axis`), are not shown: the world has such points at
-      another β.
+      behind the axis. Samples behind the axis, where ρ would be negative (`nearest_to_axis`), are not shown.
     - `b`: distance from the apex to depth γ = 0, world length.
     - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
       [0, π], increasing.
     - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
       b + first > 0.
 
-    All are differentiable, once: second derivatives miss how entries, exits and gaps curve. Values and
-    gradients are finite everywhere; where an angle has no gradient, on the motor axis (y = z = 0) and at the
-    apex (x = R = 0), it is taken as 0, and so is that of an entry or exit whose ray meets its face at less
-    than 0.06 degrees.
+    All are differentiable, once: second derivatives miss how entries, exits and gaps curve. The gradient of
+    an angle is taken as 0 on the motor axis (y = z = 0) and at the apex (x = R = 0), and so is that of an
+    entry or exit whose ray meets its face at less than 0.06 degrees.
 
-    Where it fails, and where not: `experiments/stability.py`, "gaps of rays under a toroidal map",
+    Where it fails: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".
 
     **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
 
-    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), which print `atan`; `atan2` is the same where
-    z > 0 and R > 0, and elsewhere gives angles outside every sector. The paper has two misprints: (2.4) has
-    τ for γ, and the derivation of (2.2) has y/2 for y/z. ρ is our name for R + a.
+    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), with `atan2` for `atan`, which differs only
+    outside every sector, γ for τ in (2.4), and ρ for R + a.
     """
 
     a: Float[Array, ""]
@@ -93,6 +88,11 @@ class ToroidalMap(Transform):
             "gamma_range must begin beyond the apex, b + gamma_range[0] > 0; got {got}.",
             self.b,
         )
+
+    @property
+    def ranges(self) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"]]:
+        """Those of β, σ and γ."""
+        return self.beta_range, self.sigma_range, self.gamma_range
 
     def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
         """(β, σ, γ) of world points (*points, 3)."""
@@ -135,8 +135,7 @@ class ToroidalMap(Transform):
 
     @property
     def nearest_to_axis(self) -> Float[Array, ""]:
-        """Distance from the motor axis at which the outermost beams begin: ρ of the sample nearest to the
-        axis; negative if it lies behind the axis, world length."""
+        """ρ of the sample nearest to the motor axis, world length; negative if it lies behind the axis."""
         depth = self.b + self.gamma_range[0]
         return self.a + depth * jnp.min(jnp.sin(self.sigma_range))
 
@@ -174,30 +173,25 @@ class _Sector(Space):
         return apart(self.probe.center)
 
     def coordinate(self, point: Vec3) -> Vec3:
-        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
+        toroidal, ranges = self.probe._forward(point), self.probe.ranges
         beta, sigma, gamma = (
             (value - ends[0]) / (ends[1] - ends[0]) * (n - 1)
-            for value, ends, n in zip(self.probe._forward(point), ranges, self.shape, strict=True)
+            for value, ends, n in zip(toroidal, ranges, self.shape, strict=True)
         )
         return beta, sigma, gamma
 
     def point(self, coordinate: Vec3) -> Vec3:
-        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
         toroidal = [
             ends[0] + c / (n - 1) * (ends[1] - ends[0])
-            for c, ends, n in zip(coordinate, ranges, self.shape, strict=True)
+            for c, ends, n in zip(coordinate, self.probe.ranges, self.shape, strict=True)
         ]
         return apart(self.probe.to_world(jnp.stack(toroidal)))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
-        # about the motor's axis ρ = a + (b + γ) sin σ, and about the apex b + γ: the sine is concave where it
-        # is positive, and linear in γ it is least at an end, so that a corner has the least ρ
+        # ρ = a + (b + γ) sin σ is concave in σ and linear in γ, so that it is least in a corner
         probe = self.probe
         beta, sigma, gamma = (
-            (ends[1] - ends[0]) / (n - 1)
-            for ends, n in zip(
-                (probe.beta_range, probe.sigma_range, probe.gamma_range), self.shape, strict=True
-            )
+            (ends[1] - ends[0]) / (n - 1) for ends, n in zip(probe.ranges, self.shape, strict=True)
         )
         depth = [jnp.maximum(probe.b + probe.gamma_range[0] + end[2] * gamma, 0) for end in (low, high)]
         angle = [jnp.clip(probe.sigma_range[0] + end[1] * sigma, 0, math.pi) for end in (low, high)]
@@ -205,8 +199,7 @@ class _Sector(Space):
         return jnp.maximum(reduce(jnp.minimum, rho), 0) * beta, depth[0] * sigma, gamma
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        """World cells around the sector. A cell is occupied if the sphere around it reaches a visible block:
-        along a path, an angle changes by no more than the path's length over the distance to its axis."""
+        """World cells around the sector, occupied where the sphere around one reaches a visible block."""
         low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
         x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
         middle = jnp.arange(CUBES, dtype=x.dtype) + 0.5
@@ -216,12 +209,11 @@ class _Sector(Space):
         off = hypot(point[0], rho - self.probe.a)
 
         def angle(axis_distance: Scalar) -> Scalar:
-            """Upper bound on the change of an angle about an axis within the sphere."""
+            """Most that an angle about an axis changes within the sphere."""
             away = axis_distance > radius
             return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
 
-        ranges = self.probe.beta_range, self.probe.sigma_range, self.probe.gamma_range
-        changes = angle(rho), angle(off), radius
+        changes, ranges = (angle(rho), angle(off), radius), self.probe.ranges
         begin, end, reached = [], [], jnp.ones(rho.shape, bool)
         coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
         if first is not None:
@@ -241,9 +233,7 @@ class _Sector(Space):
 
     @property
     def _faces(self) -> SectorFaces:
-        probe, (low, high) = self.probe, map(apart, self.probe.corners)
-        ranges = probe.beta_range, probe.sigma_range, probe.gamma_range
-        return SectorFaces(probe.a, probe.b, *ranges, low, high)
+        return SectorFaces(self.probe.a, self.probe.b, *self.probe.ranges, *map(apart, self.probe.corners))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         return self._faces.interval(origin, direction)

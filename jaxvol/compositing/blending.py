@@ -1,8 +1,8 @@
 """How do the cells of a ray become a pixel?
 
-There are two kinds of compositing modes. A `Weighting` gives each cell a weight; the pixel is the sum of the
-cells' colours times their weights, and of the weights themselves, which is its opacity. A `Selection`
-(`selection.py`) compares the samples of a ray and chooses one depth, at which the pixel is then computed.
+There are two kinds of modes. A `Weighting` gives each cell a weight: the pixel is the weighted sum of the
+cells' colours, and the sum of the weights is its opacity. A `Selection` (`selection.py`) picks one depth on
+the ray, such as that of the greatest value, and the pixel is what is there.
 """
 
 from abc import abstractmethod
@@ -24,7 +24,7 @@ from ..scene.volume import Volume
 State = TypeVar("State")
 
 Outputs: TypeAlias = Literal["all", "depth", "rgba"]
-"""What is computed beside the image and `Rendering.exhausted`: everything, the depth, or nothing."""
+"""What is computed besides the image and `Rendering.exhausted`: everything, the depth, or nothing."""
 
 
 class Fragment(NamedTuple):
@@ -32,9 +32,9 @@ class Fragment(NamedTuple):
 
     - `alpha`: opacity of its cell; 0 past the ray's end.
     - `depth`: of the sample, past the ray's entry. `cell`: the piece of the ray that it stands for.
-    - `measured`: what was read from the volume; for a weighting, the value alone.
-    - `color`: as shaded; None for a selection, or where nobody asks for it.
-    - `valid`: False for what is no sample: past the ray's end, in a gap of the volume, or of width 0.
+    - `measured`: what was read from the volume; for a `Weighting`, the value alone.
+    - `color`: as shaded; None for a `Selection`, or where only opacities are computed.
+    - `valid`: False past the ray's end, in gaps of the volume, and for cells of width 0.
     """
 
     alpha: Scalar
@@ -51,46 +51,45 @@ class Fragment(NamedTuple):
 
 
 class Compositing(eqx.Module, Generic[State]):
-    """A compositing mode: a `Weighting` or a `Selection`. All methods see one ray; engines batch them.
+    """A compositing mode: a `Weighting` or a `Selection`. All methods see one ray.
 
-    `State`: a tree of arrays, what a mode knows of the fragments so far.
+    `State`: a tree of arrays that the fragments are added to, front to back.
     """
 
     @abstractmethod
     def begin(self, zero: Scalar, outputs: Outputs | None) -> State:
-        """The state before the first fragment. `zero`: of the shape and type of a ray's numbers. `outputs`:
-        what is computed; None for the opacity alone."""
+        """The state before the first fragment. `zero`: a 0 of the ray's type. `outputs`: what is computed;
+        None for the opacity alone."""
 
     @abstractmethod
     def add(self, state: State, fragment: Fragment) -> State:
-        """The state with one more fragment, the next one from the front."""
+        """The state with the next fragment."""
 
     @abstractmethod
     def end(self, state: State) -> tuple[Float[Array, "4"], Scalar | None]:
-        """Premultiplied colour and opacity; and the depth past the entry, if it is computed: infinite where
+        """Premultiplied colour and opacity; and the depth past the entry, if it is computed, infinite where
         nothing is visible."""
 
     @property
     def resolves(self) -> bool:
-        """Whether the pixel is computed after the march, from what that found."""
+        """Whether the pixel is computed after the march, from its final state."""
         return False
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
-        """The transfer function and the march by which rays are marched where the mode `resolves`: what its
-        cells show need not be what its pixels show. By default those that are given."""
+        """For a mode that `resolves`: the transfer function and the march for its cells, which need not be
+        those for its pixels. By default those that are given."""
         return transfer, march
 
     @abstractmethod
     def transmittance(self, state: State) -> Scalar:
-        """Of all cells so far: `Transform.stop` decides by it, and it is what shading is told."""
+        """Of all cells so far, for `Transform.stop` and for shading."""
 
     def finished(self, state: State) -> Bool[Array, ""]:
-        """Whether what follows cannot change the pixel, so that the ray is finished."""
+        """Whether further fragments cannot change the pixel."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
     def joined(self, front: State, back: State) -> State:
-        """The state after the fragments of `front` and then those of `back`, where both were begun anew. By
-        default states do not tell, and `render_bricks` refuses to join them.
+        """Combines the states of a front and a back part of a ray that were marched independently.
 
         **Raises:** `NotImplementedError` by default."""
         raise NotImplementedError(f"{type(self).__name__} does not join the states of two parts of a ray.")
@@ -102,26 +101,26 @@ class Compositing(eqx.Module, Generic[State]):
         return type(self).joined is not Compositing.joined and not self.resolves
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap
-        over the others, except those that hold NaN. `transfer`: as `marched`."""
+        """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap over the
+        others. `transfer`: that of `marched`."""
         return transfer.visible(blocks)
 
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:
-        """How much what cells are composited from changes within the range of each window. By default nothing
-        is known, and cells are one step long."""
+        """How much extinction and emission change within the range of each window, for `AdaptiveSampling`. By
+        default nothing is known."""
         return Variation.unknown(windows)
 
 
 class Composite(eqx.Module):
-    """The cells of a ray so far: Σ w, Σ w × colour and Σ w × depth past the entry, where w are the cells'
-    weights. What is not asked for is None."""
+    """The cells of a ray so far, of weights w: Σ w, Σ w × colour and Σ w × depth past the entry. What is not
+    computed is None."""
 
     opacity: Scalar
     color: Vec3 | None = None
     moment: Scalar | None = None
 
     def add(self, weight: Scalar, color: Vec3 | None = None, depth: Scalar | None = None) -> "Composite":
-        """With one more cell; its colour and depth are left out where they are not given."""
+        """With one more cell."""
         sums = moment = None
         if self.color is not None and color is not None:
             r, g, b = (sum_ + weight * part for sum_, part in zip(self.color, color, strict=True))
@@ -136,37 +135,35 @@ class Composite(eqx.Module):
         return jnp.stack([*self.color, self.opacity])
 
     def mean_depth(self) -> Scalar:
-        """Mean depth past the entry of what is visible, weighted by what each cell adds to the opacity;
-        infinite where nothing is visible."""
+        """Mean depth past the entry, weighted as colours are; infinite where nothing is visible."""
         assert self.moment is not None
         # not `> 0`, which is false for NaN: NaN is to be passed on
         visible = ~(self.opacity <= 0)
-        # Both are divided by the opacity first, so that the quotient's denominator is 1: its derivative
-        # divides by the square of that, which underflows to 0 in float32 where the opacity is very small.
+        # Both are first divided by a constant, so that the denominator is 1: its square, by which the
+        # derivative divides, would underflow where the opacity is very small.
         whole = jax.lax.stop_gradient(jnp.where(visible, self.opacity, 1))
         mean = (self.moment / whole) / jnp.where(visible, self.opacity / whole, 1)
         return jnp.where(visible, mean, jnp.inf)
 
 
 class Weighting(Compositing[Composite]):
-    """A mode that gives each cell a weight. The pixel is Σ w c, its opacity Σ w. Subclasses override
-    `weight`, `slope` and `transmittance` alone.
+    """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
+    override `weight`, `slope` and `transmittance` alone, which work elementwise.
 
-    Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. A cell here is a piece
-    of one where transforms divide cells. `weight`, `slope` and `transmittance` work elementwise, on the
-    numbers of one ray or of many. Parameters are static fields, which have no gradient; or arrays, which have
-    one, if nothing but `resolved` depends on them.
+    Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. Where transforms
+    divide cells, each piece has a weight. Parameters are static fields, or, if only `resolved` depends on
+    them, arrays, which have gradients.
     """
 
     @abstractmethod
     def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
-        """Weight of the next cell, of opacity `alpha`, where the weights of the cells in front sum to
-        `before`. It is 0 where `alpha` is, since engines leave such cells out."""
+        """Weight of a cell of opacity `alpha` behind cells whose weights sum to `before`. It must be 0 where
+        `alpha` is, since engines leave such cells out."""
 
     @abstractmethod
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        """Derivative of a loss by the optical depth τ of a cell, for the second march. What it is given
-        suffices for weights that do not depend on `before`, and for (c - `before`) f(`alpha`).
+        """Derivative of a loss by the optical depth τ of a cell, for the second march. The arguments suffice
+        for weights that do not depend on `before`, and for (constant - `before`) f(`alpha`).
 
         **Arguments:**
 
@@ -181,9 +178,9 @@ class Weighting(Compositing[Composite]):
         return jnp.ones_like(state.opacity)
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
-        """The premultiplied colour and opacity of a ray that is not transparent, from its Σ w c and Σ w, once
-        for each ray after the march. It is differentiated by JAX, also of sums that are 0, which must not be
-        NaN. Not called unless overridden. `classification`: of what was given, not of what was `marched`."""
+        """The pixel of a ray that is not transparent, from its Σ w c and Σ w, where it is computed after the
+        march. JAX differentiates it, also of sums that are 0, which must not give NaN. `classification`: of
+        the transfer function that was given, not of that of `marched`."""
         return sums
 
     @property
@@ -213,8 +210,7 @@ class Over(Weighting):
         w = (1 - A) α        C ← C + w c        A ← A + w
 
     so that the weights of a ray and the remaining transmittance 1 - A sum to 1. A is stored rather than the
-    transmittance: in float32, subtracting thousands of small equal weights from a number near 1 would round
-    the same way each time.
+    transmittance, from which thousands of small weights could not be subtracted exactly.
 
     Source: Porter and Duff 1984; Max 1995.
     """
@@ -225,8 +221,7 @@ class Over(Weighting):
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
         """More of the cell, and less of all that lies behind it."""
         transmittance = 1 - after
-        # Below this transmittance `behind` is nothing but the sums' rounding, which the extinction of an
-        # opaque sample would amplify.
+        # below this transmittance `behind` is rounding alone, which a high extinction would amplify
         nothing = 2 * float(jnp.finfo(behind.dtype).eps)
         return jnp.where(transmittance <= nothing, 0, transmittance * worth - behind)
 
@@ -234,7 +229,7 @@ class Over(Weighting):
         return 1 - state.opacity
 
     def joined(self, front: Composite, back: Composite) -> Composite:
-        """The operator is associative: what is behind has the transmittance in front as its weight."""
+        """The operator is associative: what is behind is weighted by the transmittance in front."""
         return jax.tree.map(lambda a, b: a + (1 - front.opacity) * b, front, back)
 
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:
