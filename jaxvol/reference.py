@@ -21,6 +21,7 @@ from .arguments import check_arguments
 from .compositing.compositing import Compositing, Fragment, Outputs, Weighting
 from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
+from .lighting.deferred import Deferred
 from .lighting.shading import Lighting, lit_classification
 from .march.march import Cell, March
 from .scene.rendering import Details, Rendering
@@ -260,7 +261,7 @@ def end(pipeline: Pipeline, ray: Ray, at: Progress) -> Rendering:
 
 def resolves(compositing: Compositing[Any], lighting: Lighting | None) -> bool:
     """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
-    return compositing.resolves or (lighting is not None and lighting.shades_pixels)
+    return compositing.resolves or isinstance(lighting, Deferred)
 
 
 class Pixel(NamedTuple):
@@ -291,7 +292,7 @@ def resolve(
         found = compositing.resolved(pipeline.classification, rgba)
         check_answer(compositing, "resolved", found, rgba)
         return Pixel(found, depth)
-    assert lighting is not None
+    assert isinstance(lighting, Deferred)
     return Pixel(lighting.shade_pixel(pipeline.classification, space, line, rgba, depth), depth)
 
 

@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 import jax
 
 from ..compositing.selection import Selection
+from ..lighting.template_lighting import with_baked_light
 from ..reference import resolves
 from ..scene.rendering import Rendering
 from ..xla.sharding import varying
@@ -39,7 +40,7 @@ def render_scene(
     volume, transfer, _, march, _, lighting = scene
     how = adjoint_of(adjoint, volume, march)
     if lighting is not None:
-        lighting = lighting.prepared(volume, transfer, march)
+        lighting = with_baked_light(lighting, volume, transfer, march)
     options = RenderOptions(outputs, tiling)
     acceleration = VolumeAcceleration.of(volume, transfer, march, lighting)
     scene, acceleration = varying((scene._replace(lighting=lighting), acceleration))

@@ -107,7 +107,7 @@ class Pull(NamedTuple):
         if scene.lighting is not None:
             shader, pull_shader = _shader_of(scene, packed.volume, voxels=_of_voxels(scene, perturbed))
         lit = pipeline
-        if shader is not None and shader.shading.inline:
+        if shader is not None and shader.inline:
             lit = pipeline._replace(classification=pipeline.classification._replace(light=shader))
         tiles, fetch = RayTiles.of(scene.source, tiling), packed.volume.fetch
         faulty = fault_of(scene)
@@ -239,7 +239,7 @@ def _shader_of(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Shader, C
         # the packed copy serves fetching only
         whole = moved if voxels else with_voxels(moved, volume.data)
         around = Surroundings(whole, transfer, march.locate(whole))
-        shader = Shader(lighting.shading(around), around)
+        shader = Shader.of(lighting, around)
         return floats(shader.leaves), shader
 
     _, pull, shader = jax.vjp(made, moving, has_aux=True)

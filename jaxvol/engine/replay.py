@@ -37,12 +37,11 @@ from ..scene.transfer import Transfer, classification_of
 from ..scene.volume import Volume, with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import Cube, Fetch, Recording, cubes_of_zeros, scatter_add
 from ..xla.trees import PyTree, added, floats, zeros_of
-from .inline_shading import lit_colors
 from .scene import Scene
 from .segment import Samples, SampleVisitor, vmap_cells
+from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
 from .tiling import Tiling
-from .visible_samples import Weights, weights_of
 
 
 class Cotangents(NamedTuple):
@@ -167,7 +166,8 @@ class Replay(SampleVisitor):
             if samples.light is None:
                 colors = [part.color for part in shaded]
             else:  # also of invisible samples, which are worth something: they would become visible
-                colors = lit_colors(self.shader, self.pipeline, ray, samples.cells, colors, samples.light)
+                parts = samples.cells, samples.measured, colors, samples.light
+                colors = lit_colors(self.shader, self.pipeline, ray, *parts)
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [

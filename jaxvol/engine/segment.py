@@ -25,9 +25,8 @@ from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.trees import PyTree
 from ..xla.xla import in_memory
-from .inline_shading import inline_shader, light_terms, lit_colors
+from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
-from .visible_samples import shaded_colors
 
 
 def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
@@ -111,7 +110,7 @@ def march_segment(
         colors = _colors(pipeline, at, every.measured)
     elif (shader := inline_shader(pipeline)) is not None:
         assert every.light is not None
-        parts = every.cells, _colors(pipeline, at, every.measured), every.light
+        parts = every.cells, every.measured, _colors(pipeline, at, every.measured), every.light
         colors = lit_colors(shader, pipeline, ray, *parts)
     else:
         colors = shaded_colors(
@@ -176,7 +175,7 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
     shader = inline_shader(pipeline)
-    light = None if shader is None else light_terms(shader, pipeline, live, ray, partial(cells, at, given))
+    light = shader and light_terms(shader, pipeline, live, ray, partial(cells, at, given), values)
     return Samples(list(cells(at, given)), values, alphas, light)
 
 

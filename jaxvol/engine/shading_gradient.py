@@ -1,6 +1,6 @@
 """VJP of shading the visible samples of a segment: `replay` calls it for scenes with lighting.
 
-Shades each sample again, as `visible_samples.shaded_colors` did in the first march.
+Shades each sample again, as `shading.shaded_colors` did in the first march.
 """
 
 from functools import partial
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
+from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_needed
 from ..reference import Pipeline
 from ..scene.space import Ray
 from ..scene.volume import read_as
@@ -20,7 +20,7 @@ from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added
 from .segment import Samples
-from .visible_samples import Weights, samples_of, visible
+from .shading import Weights, samples_of, visible
 
 
 class ShadingTotal(NamedTuple):
@@ -103,7 +103,7 @@ def _chunk_vjp(
 
     def about(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
         (shading, around), each = made(_Parts(leaves, samples))
-        return eqx.partition(jax.vmap(partial(shading.about, around))(each), eqx.is_inexact_array)
+        return eqx.partition(jax.vmap(partial(shading.begin, around))(each), eqx.is_inexact_array)
 
     shared, pull_about, fixed_shared = jax.vjp(about, leaves, moving, has_aux=True)
     parts = _Parts(leaves, moving, shared)
@@ -144,7 +144,7 @@ def _chunk_vjp(
         if voxels is not None:
             _, bases = jax.eval_shape(term, parts, [], jnp.zeros((), jnp.int32))
             perturbations = cubes_of_zeros(bases, cotangent[0].dtype)
-        needed = terms_above(shading.thresholds(derivative=True), samples.transmittance)
+        needed = terms_needed(shading, samples.transmittance)
         start = varying((of_parts, voxels), samples)
         of_parts, voxels = jax.lax.fori_loop(0, needed, add, start)
     more_of_leaves, more_of_samples = pull_about(of_parts.shared)

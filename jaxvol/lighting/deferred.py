@@ -10,11 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._util.vec3 import Scalar, along
-from ..march.march import March
 from ..scene.space import Line, Space
-from ..scene.transfer import Classification, Transfer
-from ..scene.volume import Volume
-from .shading import Lighting, Sample, Shading, Simpler, Surroundings
+from ..scene.transfer import Classification
+from .shading import Lighting, Sample, Shading, Surroundings
 
 
 class Deferred(Lighting):
@@ -52,23 +50,8 @@ class Deferred(Lighting):
     def reads_gradient(self) -> bool:
         return self.lighting.reads_gradient
 
-    @property
-    def smooth(self) -> Lighting:
-        return self.lighting.smooth
-
-    @property
-    def simpler(self) -> tuple[Simpler, ...]:
-        return tuple(each for each in self.lighting.simpler if isinstance(each.lighting, Deferred))
-
-    @property
-    def farthest_read(self) -> float | None:
-        return self.lighting.farthest_read
-
-    def shading(self, around: Surroundings) -> Shading:
-        return self.lighting.shading(around)
-
-    def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
-        return Deferred(self.lighting.prepared(volume, transfer, march))
+    def for_image(self, around: Surroundings) -> Shading:
+        return self.lighting.for_image(around)
 
     def shade_pixel(
         self,
@@ -78,6 +61,8 @@ class Deferred(Lighting):
         rgba: Float[Array, "4"],
         depth: Scalar,
     ) -> Float[Array, "4"]:
+        """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
+        depth. `classification.light` shades samples."""
         light = classification.light
         assert light is not None
         opacity = rgba[3]

@@ -21,11 +21,6 @@ class Optics(NamedTuple):
     refractive_index: Float[Array, "..."]
 
     @property
-    def optics(self) -> "Optics":
-        """Itself, so that it can be used in place of a `Material`."""
-        return self
-
-    @property
     def reflectance(self) -> Float[Array, "..."]:
         """Reflectance R of a half-space of the material under light from all sides, if its colour is white:
         isotropic scattering with single-scattering albedo ω = 1 - opacity.

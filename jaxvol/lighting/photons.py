@@ -71,7 +71,7 @@ class _Photon(NamedTuple):
     there: _There | None
 
 
-class TemplateShading(Shading):
+class PhotonShading(Shading):
     """Templates prepared for one image.
 
     - `templates`: (materials, templates, photons). Where there are several for a material, each pixel uses
@@ -102,28 +102,24 @@ class TemplateShading(Shading):
     def _soft(self) -> bool:
         return self.occlusion == "soft"
 
-    def thresholds(self, *, derivative: bool = False) -> Float[Array, " photons"]:
+    def thresholds(self) -> Float[Array, " photons"]:
         intensity = jax.lax.stop_gradient(self.templates.intensity)
         brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
         least = jnp.zeros_like(brightest)
         if self.cutoff is not None:
             # a little less, so that rounding leaves out no photon that `_photon` does not skip
             least = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
-        return least if derivative and self.given else jnp.where(brightest <= 0, jnp.inf, least)
+        return least if self.given else jnp.where(brightest <= 0, jnp.inf, least)
 
     @property
-    def has_dark_samples(self) -> bool:
+    def skips_hidden(self) -> bool:
         return self.cutoff is not None
-
-    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
-        material = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
-        return scaled(sample.color, 1 - _matter(material))
 
     def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
         edge = EDGE if self._soft else 0.0
         return shares(self.materials, around.volume, coordinate, value, edge=edge)
 
-    def about(self, around: Surroundings, sample: Sample) -> _Shared:
+    def begin(self, around: Surroundings, sample: Sample) -> _Shared:
         material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
         template = None
         if (count := self.templates.intensity.shape[1]) > 1:
@@ -150,9 +146,9 @@ class TemplateShading(Shading):
         photon = placed if shared.template is None and len(self.materials) == 1 else _known(around, placed)
         if len(self.materials) > 1:
             first = photon()
-            [there] = around.stored(lambda: around.fetched([_beside(sample, first.offset)]))
+            there = around.stored(lambda: around.measured(_beside(sample, first.offset)))
             photon = _known(around, lambda: self._refracted(around, sample, shared, first, there))
-        read = around.stored(lambda: around.fetched(self._places(sample, photon())))
+        read = around.stored(lambda: [around.measured(each) for each in self._places(sample, photon())])
         seen, shows = around.stored(lambda: self._weights(around, sample, shared, photon(), read))
         offset = photon().offset
         brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)

@@ -1,0 +1,208 @@
+"""Shades the samples of a segment: those of positive weight, gathered in chunks; or all, inline.
+
+Shading a sample costs many times as much as fetching it, and few samples are visible. Inline, the light's one
+term is computed for all samples in a branch of its own; colours are then elementwise.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from .._util.vec3 import Scalar, Vec3, along
+from ..compositing.compositing import Composite, Weighting
+from ..compositing.selection import Selection
+from ..lighting.shading import Sample, Shader, no_terms
+from ..march.march import Cell
+from ..reference import Pipeline, Progress, stopped
+from ..scene.space import Ray
+from ..scene.transfer import Measured
+from ..scene.volume import with_fetch
+from ..xla.compaction import Chosen
+from ..xla.trees import PyTree
+from ..xla.xla import in_memory
+
+
+def _sample(pipeline: Pipeline, ray: Ray, depth: Scalar, measured: Measured, transmittance: Scalar) -> Sample:
+    """The sample of a ray at this depth."""
+    color, extinction = pipeline.classification.of_cells(measured)
+    point = along(ray.entry, ray.direction, depth)
+    return Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
+
+
+# ---------------------------------------------------------------- inline
+
+
+def inline_shader(pipeline: Pipeline) -> Shader | None:
+    """What shades all samples of a march where they are, if anything does."""
+    light = pipeline.classification.light
+    if not isinstance(light, Shader) or isinstance(pipeline.compositing, Selection):
+        return None
+    return light if light.inline else None
+
+
+def light_terms(
+    shader: Shader,
+    pipeline: Pipeline,
+    live: Bool[Array, ""],
+    ray: Ray,
+    cells: Callable[[], tuple[Cell, ...]],
+    measured: list[Measured],
+) -> list[PyTree]:
+    """The terms of all samples of cells, arrays (cells, rays), in memory. `live`: see `in_memory`."""
+    shading, around = shader
+    volume = around.volume
+
+    def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
+        point = along(ray.entry, ray.direction, pipeline.march.sample(cell))
+        return volume.fetch.base(volume.data, around.space.coordinate(point))
+
+    def term(ray: Ray, cell: Cell, begin: Int[Array, ""], measured: Measured) -> PyTree:
+        sample = _inline_sample(pipeline, ray, cell, measured)
+        here = replace(around, volume=with_fetch(volume, volume.fetch.of_slopes_at(begin)))
+        return shading.term(here, sample, shading.begin(here, sample), jnp.zeros((), jnp.int32))
+
+    def all_(f: Callable[..., PyTree], *more: list[PyTree]) -> list[PyTree]:
+        over_rays = jax.vmap(f, in_axes=(0,) * (2 + len(more)))
+        mapped = jax.vmap(over_rays, in_axes=(None, *(0,) * (1 + len(more))))
+        return [mapped(ray, *piece) for piece in zip(cells(), *more, strict=True)]
+
+    begins = in_memory(live, partial(all_, begin))
+    return in_memory(live, partial(all_, term), begins, measured)
+
+
+def lit_colors(
+    shader: Shader,
+    pipeline: Pipeline,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    colors: list[Vec3],
+    terms: list[PyTree],
+) -> list[Vec3]:
+    """The shaded colours of all samples of cells, arrays (cells, rays), from their colours and terms."""
+    shading, around = shader
+
+    def one(ray: Ray, cell: Cell, measured: Measured, color: Vec3, term: PyTree) -> Vec3:
+        sample = _inline_sample(pipeline, ray, cell, measured)._replace(color=color)
+        return shading.color(sample, shading.begin(around, sample), term)
+
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0, 0))
+    return [each(ray, *piece) for piece in zip(cells, measured, colors, terms, strict=True)]
+
+
+def _inline_sample(pipeline: Pipeline, ray: Ray, cell: Cell, measured: Measured) -> Sample:
+    return _sample(pipeline, ray, pipeline.march.sample(cell), measured, jnp.ones_like(cell.front))
+
+
+# ---------------------------------------------------------------- visible samples
+
+
+class Weights(NamedTuple):
+    """Of samples, arrays (cells, rays), one for each piece of a cell: the weight of each, the opacity
+    composited before it and with it, and whether the ray was finished before."""
+
+    weight: list[Scalar]
+    before: list[Scalar]
+    after: list[Scalar]
+    finished: list[Bool[Array, "cells rays"]]
+
+
+def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weights:
+    """The weights of consecutive cells, from the opacities of their pieces."""
+    compositing = pipeline.compositing
+    assert isinstance(compositing, Weighting)
+    composite, finished = Composite(at.composite.opacity), at.finished
+    found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
+    for k in range(alphas[0].shape[0]):
+        for i, alpha in enumerate(alphas):
+            before = composite.opacity
+            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
+            composite = composite.add(weight)
+            found[i].append((weight, before, composite.opacity, finished))
+        finished |= jax.vmap(partial(stopped, pipeline))(composite)
+    each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
+    return Weights(*(list(parts) for parts in zip(*each, strict=True)))
+
+
+def visible(weights: Weights, chunk: int) -> Chosen:
+    """The samples of positive weight."""
+    return Chosen.of([weight > 0 for weight in weights.weight], chunk)
+
+
+def samples_of(
+    chosen: Chosen,
+    indices: Int[Array, " chunk"],
+    pipeline: Pipeline,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    weights: Weights,
+) -> Sample:
+    """The samples at these flat indices of a segment."""
+    entry, direction, pixel = jax.tree.map(
+        lambda leaf: leaf.at[indices % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
+    )
+    depths = [pipeline.march.sample(cell) for cell in cells]
+    depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), indices)
+    color, extinction = jax.vmap(pipeline.classification.of_cells)(read)
+    transmittance = pipeline.compositing.transmittance(Composite(before))
+    return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
+
+
+def shaded_colors(
+    pipeline: Pipeline,
+    chunk: int,
+    ray: Ray,
+    at: Progress,
+    cells: list[Cell],
+    measured: list[Measured],
+    alphas: list[Scalar],
+) -> list[Vec3]:
+    """Shaded colours of a segment's samples; any finite ones for invisible samples."""
+    weights, light = weights_of(pipeline, at, alphas), pipeline.classification.light
+    assert isinstance(light, Shader)
+    none = jnp.zeros_like(alphas[0])
+    start, shown = [(none, none, none)] * len(alphas), [weight > 0 for weight in weights.weight]
+    if light.shading.skips_hidden:
+        start, dark = _without_terms(pipeline, light, ray, cells, measured, weights)
+        shown = [each & ~unlit for each, unlit in zip(shown, dark, strict=True)]
+    chosen = Chosen.of(shown, chunk)
+
+    def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
+        samples = samples_of(chosen, indices, pipeline, ray, cells, measured, weights)
+        return chosen.put(colors, indices, light(samples))
+
+    flat = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *start)
+    return chosen.split(chosen.fold(one, flat), len(alphas))
+
+
+def _without_terms(
+    pipeline: Pipeline,
+    light: Shader,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    weights: Weights,
+) -> tuple[list[Vec3], list[Bool[Array, "cells rays"]]]:
+    """The colours of a segment's samples without any term of light, and which of them need none: behind the
+    first few samples most do not, and cost much less here than gathered."""
+    shading, around = light
+    thresholds = shading.thresholds()
+    assert thresholds is not None
+
+    def one(ray: Ray, cell: Cell, measured: Measured, before: Scalar) -> tuple[Vec3, Bool[Array, ""]]:
+        transmittance = pipeline.compositing.transmittance(Composite(before))
+        sample = _sample(pipeline, ray, pipeline.march.sample(cell), measured, transmittance)
+        shared = shading.begin(around, sample)
+        color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
+        return color, transmittance < thresholds[0]
+
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
+    found = [each(ray, *piece) for piece in zip(cells, measured, weights.before, strict=True)]
+    colors, dark = zip(*found, strict=True)
+    return list(colors), list(dark)
