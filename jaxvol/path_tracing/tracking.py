@@ -11,14 +11,15 @@ Sources: Woodcock et al. 1965; Novák et al., "Monte Carlo Methods for Volumetri
 Simulation", 2018; Amanatides and Woo 1987 (from block to block).
 """
 
-import equinox as eqx
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import BLOCK
-from .majorants import Block, Majorants
+from .medium import Block, Majorants
 
 
 CROSSINGS = 2
@@ -29,7 +30,7 @@ TINY = 1e-20
 """Rates below this (grid coordinates per world length) count as 0."""
 
 
-class Flight(eqx.Module):
+class Flight(NamedTuple):
     """A straight segment through the grid, travelled up to `depth`.
 
     - `start`: grid coordinate. `rate`: its change per world length; no component is 0.
@@ -58,7 +59,7 @@ class Flight(eqx.Module):
         return cls(start, (x, y, z), jnp.zeros_like(end), end, block, majorants.at(block))
 
 
-class Candidate(eqx.Module):
+class Candidate(NamedTuple):
     """Where a flight has stopped.
 
     - `found`: at a collision candidate, at the grid coordinate `coordinate`, under this `majorant`.
