@@ -42,8 +42,8 @@ class Material(eqx.Module):
     - `opacity`: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
       Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
       tracing. Scatterer templates need an opacity above 0, see their `threshold`.
-    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0.
-      `from_scatterers` computes it.
+    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0. Of n scatterers per volume,
+      each of the effective area σ, it is 1 / (√2 n σ), as between the particles of a Maxwell–Boltzmann gas.
     - `refractive_index`: > 0; 1 in air.
     - `values`: (low, high), the range of volume values that are this material, low < high; or
     - `label`: the volume's label for this material. Give one of the two to say where the material is;
@@ -87,29 +87,6 @@ class Material(eqx.Module):
     def optics(self) -> Optics:
         """Opacity, mean free path and refractive index."""
         return Optics(self.opacity, self.mean_free_path, self.refractive_index)
-
-    @classmethod
-    def from_scatterers(
-        cls,
-        opacity: Arrayable,
-        density: Arrayable,
-        cross_section: Arrayable,
-        *rest: Arrayable,
-        **where: Arrayable,
-    ) -> "Material":
-        """A material whose mean free path follows from the density and size of its scatterers.
-
-        **Arguments:**
-
-        - `density`: n, scatterers per volume, > 0. `cross_section`: σ, the effective area of each, > 0.
-          The mean free path is `1 / (√2 n σ)`, as between the particles of a Maxwell–Boltzmann gas.
-        - All other arguments: as for the class.
-        """
-        density, cross_section = (
-            number("density", density, above=0),
-            number("cross_section", cross_section, above=0),
-        )
-        return cls(opacity, 1 / (jnp.sqrt(2.0) * density * cross_section), *rest, **where)
 
 
 PRESETS = {"skin": (0.5, 0.7, 1.39), "muscle": (0.6, 1.4, 1.37), "bone": (0.8, 0.6, 1.55)}

@@ -93,7 +93,7 @@ class Phong(Shading):
         return True
 
     @property
-    def farthest_read(self) -> float:
+    def farthest_read(self) -> float | None:
         return 0.0
 
     @property

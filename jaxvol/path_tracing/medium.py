@@ -1,7 +1,8 @@
-"""The medium that a volume is: its extinction and albedo at a point, and bounds of its extinction.
+"""The medium that a volume is: extinction and albedo at a point, and bounds of the extinction.
 
-Woodcock tracking is unbiased only if its majorant is nowhere below the extinction. So the bounds are proven: interpolation never leaves the range of a block's nodes, and a piecewise linear function is greatest
-at an end of a range of values, or at a control point inside. A margin for rounding is added.
+Woodcock tracking is unbiased only if its majorant is nowhere below the extinction. So the bounds are proven:
+interpolation never leaves the range of a block's nodes, and a piecewise linear function is greatest at an end
+of a range of values, or at a control point inside. A margin for rounding is added.
 """
 
 from collections.abc import Callable
