@@ -42,8 +42,9 @@ class Material(eqx.Module):
     - `opacity`: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
       Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
       tracing. Scatterer templates need an opacity above 0, see their `threshold`.
-    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0. Of n scatterers per volume,
-      each of the effective area σ, it is 1 / (√2 n σ), as between the particles of a Maxwell–Boltzmann gas.
+    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0. Of n scatterers per
+      volume, each of effective area σ, it is 1 / (√2 n σ), as between the particles of a Maxwell–Boltzmann
+      gas.
     - `refractive_index`: > 0; 1 in air.
     - `values`: (low, high), the range of volume values that are this material, low < high; or
     - `label`: the volume's label for this material. Give one of the two to say where the material is;
