@@ -25,9 +25,8 @@ class Deferred(Lighting):
     sees several, one through the other, the mean depth lies between them, perhaps where there is no material
     at all, and then the pixel stays unlit. Baked light shows its grid as faint rings, which are not averaged
     over the samples of a ray. `experiments/lighting.py` measures the error on an opaque and on a translucent
-    head. There two templates blended, of eight photons each, come as near to many of them as one does with
-    all its photons on all samples, in a sixth of the time:
-    `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))`.
+    head: `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))` is the cheapest that is as
+    near as all photons of a template on all samples.
 
     Gradients are those of the image that it makes. The gradient of voxels takes an array of their size for
     each place where light is looked up, for each chunk of 2048 pixels: slow for large volumes.

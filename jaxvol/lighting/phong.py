@@ -37,7 +37,6 @@ class Phong(Shading):
       length. It is turned to the viewer, so that both sides of a surface are lit, as by VTK.
     - Where the gradient is 0 there is no normal, and only ambient light, as in VTK; the same where the square
       of its length leaves the range of floats: in float32, below 1e-19 and above 1e19 value units per length.
-      (To scale each gradient first would take 3 % of a frame.)
     - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: a white surface
       that scatters the irradiance E diffusely has the radiance E / π, and here, with `diffuse=1`, the
       colour E. So lights of irradiance π E here are those of irradiance E for `ScattererTemplates` and

@@ -49,9 +49,7 @@ class ScattererTemplates(Lighting):
     5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
        times its intensity. Here n is the refractive index, α the opacity, and primes mark the photon's
        material.
-    6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`. As they are
-       sorted, the loop over them ends where all that remain are skipped, of all samples that are shaded
-       together.
+    6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
     inwards, a sample is lit entirely as that material, and keeps nothing of its own colour.
@@ -62,17 +60,10 @@ class ScattererTemplates(Lighting):
     material, which falls from 1 to 0 as its opacity rises. So ratios between pixels of one material are the
     paper's if its template held all energy before it was scaled; if the threshold cut some off, s weighs more
     here. To get the paper's sum, divide by k R. A flat face of white matter, of which only the surface is
-    visible, has a radiance of R L under a `ConstantLight` of radiance L.
-
-    Measured relative to the exact radiance of multiple scattering, on white half-spaces of opacities from
-    0.05 to 0.9, seen along the normal: 0.91 to 1.13 in constant light, 0.88 to 1.27 in parallel light along
-    the normal, and 1.05 to 1.55 at an incidence of 60°, where light from beside the face is not yet hidden.
-    The lower half of each range is for an extinction of 1/λ, the upper for 10/λ.
-    For a white sphere of opacities 0.1 to 0.7, seen whole, 0.67 to 0.76 of the radiance in constant light,
-    and 0.67 to 0.92 in parallel light (with steps of optical depth 2; a fifth of the step turned 0.72 into
-    0.74).
-    For colours darker than white, templates are too bright: in path tracing the colour darkens each of many
-    scatterings, in templates it darkens the sum once.
+    visible, has a radiance of R L under a `ConstantLight` of radiance L. White half-spaces have 0.9 to 1.6
+    times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For
+    darker colours, templates are too bright: in path tracing the colour darkens each of many scatterings, in
+    templates it darkens the sum once.
 
     **Arguments:**
 
@@ -95,22 +86,17 @@ class ScattererTemplates(Lighting):
       misses the photons that are skipped.
     - `seed`: of the templates, and of their choice for each pixel.
     - `packets`, `threshold`, `threshold_on`: of the templates, see `scatterer_template`.
-    - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light is
-      computed once and then fetched, as long as volume, transfer function and lighting stay the same. All
-      templates are blended there, and no photon is skipped for the ray's transmittance. It carries no
-      gradient. If lighting, volume or transfer function is traced, it is computed for each image.
+    - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light of
+      all templates is computed once and then fetched, as long as volume, transfer function and lighting stay
+      the same; if any of them is traced, it is computed for each image. It carries no gradient.
     - `levels`: of the templates' trees; required if an opacity is traced.
     - `given`: templates to use instead of simulated ones, with leading axes (materials, templates). Their
       lengths and intensities are used as they are, so that nothing depends on the materials' mean free paths.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
-    gradients.
-
-    At points of extinction 0, the gradient of the extinction lacks the light that the points would show,
-    since invisible points are not lit.
-
-    Where it fails, and where not: `experiments/stability.py`, "long mean free paths",
-    "short mean free paths".
+    gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
+    show, since invisible points are not lit. Where it fails, and where not: `experiments/stability.py`, "long
+    mean free paths", "short mean free paths".
 
     **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
     which no photon is above the threshold (if its opacity is traced, the image is NaN), and for templates or

@@ -58,8 +58,7 @@ def scatterer_template(
     half-space it came from. A packet whose photon would be fainter than the threshold ends.
 
     So all parts add up to I, and a template's energy falls short of 1 only by what the threshold cuts off.
-    The paper's tables were made in this way: its photons of the second level hold α (1 - α) cos θ' /
-    `packets`. Its equations (1) to (3) as printed hand on αI, and are misprints
+    The paper's tables were made in this way; its equations (1) to (3) as printed hand on αI
     (`experiments/printed_templates.py`).
 
     **Arguments:**
@@ -72,14 +71,13 @@ def scatterer_template(
       `"photon"`: of each one's own. A photon fades out between this and 0.8 times this, instead of vanishing
       at once. `"level"`: of the brightest possible photon of a level: levels in which that is below the
       threshold are left out, others are kept whole, with photons fainter than the threshold. It gives the
-      paper's counts: at an opacity of ½ and a threshold of 0.01, one packet leaves 63 photons, a full tree of
-      six levels, before any are merged; the paper counts 56 to 63, and lists fainter ones.
-      The first photons are the brightest, of α / `packets` each: with a threshold above that (on photons,
-      above 1.25 times that), a template is empty.
-    - `merge`: photons closer than this fraction of λ are merged, and their intensities added. The photons in
-      the paper's tables that are brighter than a packet could leave are merged ones.
-    - `levels`: of the tree. By default as many as leave photons above the threshold, which requires an
-      opacity known at compile time; required if the opacity is traced.
+      paper's counts of 56 to 63 photons for one packet at an opacity of ½. The first photons are the
+      brightest, of α / `packets` each: with a threshold above that (on photons, above 1.25 times that), a
+      template is empty.
+    - `merge`: photons closer than this fraction of λ are merged, and their intensities added, as in the
+      paper's tables.
+    - `levels`: of the tree; required if the opacity is traced. By default as many as leave photons above the
+      threshold.
 
     **Returns:** a `ScattererTemplate` with room for the photons of the tree, or for as many above the
     threshold as energy 1 could fill; differentiable in the material's mean free path, opacity and refractive
@@ -142,8 +140,7 @@ class _Packets(NamedTuple):
 
 @dataclass(frozen=True)
 class PacketTree:
-    """The tree of packets of a template: where it ends, and what a packet leaves and hands on. Arguments are
-    those of `scatterer_template`."""
+    """The tree of packets of a template. Fields are as for `scatterer_template`."""
 
     packets: int = 4
     threshold: float = 0.01
@@ -183,9 +180,8 @@ class PacketTree:
         return int(min(self.size(levels), self.max_width))
 
     def levels_of(self, materials: Sequence[Material], levels: int | None) -> int:
-        """The given number of levels; or by default as many as may hold a photon above the threshold, in the
-        tree of any material. **Raises** `ValueError` for other numbers, if the default depends on an opacity
-        that is traced, and if an opacity leaves no photon."""
+        """The given number of levels, by default the most of any material. **Raises** `ValueError` for an
+        opacity that leaves no photon, and for one that is traced, if no number is given."""
         for material in materials:
             self.require_photons(material)
         return max(map(self.levels, materials)) if levels is None else integer("levels", levels, 1)
@@ -203,8 +199,7 @@ class PacketTree:
         return 1 + math.floor(math.log(self.faintest * self.packets / alpha) / math.log(1 - alpha) + 1e-9)
 
     def most_photons(self, material: Material) -> int:
-        """Upper bound of a template's photons above 0: in each level, no more than its energy allows. Often
-        far fewer than its `capacity`, which follows from the tree alone."""
+        """Upper bound of a template's photons above 0: in each level, no more than its energy allows."""
         levels = self.levels(material)
         if not self.fades:
             return self.size(levels)
@@ -213,8 +208,8 @@ class PacketTree:
         return max(1, sum(min(self.packets * 2 ** min(k, 32), most) for k, most in enumerate(by_energy)))
 
     def require_photons(self, material: Material) -> None:
-        """**Raises** `ValueError` for a material whose templates would hold no light: its brightest photons,
-        the first ones, are below the threshold. Traced opacities are not checked."""
+        """**Raises** `ValueError` if the first photons, the brightest, are below the threshold. Traced
+        opacities are not checked."""
         if is_traced(material.opacity):
             return
         alpha = float(np.asarray(material.opacity))
