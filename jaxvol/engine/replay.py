@@ -166,8 +166,7 @@ class Replay(SampleVisitor):
             if samples.light is None:
                 colors = [part.color for part in shaded]
             else:  # also of invisible samples, which are worth something: they would become visible
-                parts = samples.cells, samples.measured, colors, samples.light
-                colors = lit_colors(self.shader, self.pipeline, ray, *parts)
+                colors = lit_colors(self.shader, self.pipeline, ray, samples.cells, colors, samples.light)
         worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
         if each.depth is not None:
             worth = [

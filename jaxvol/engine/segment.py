@@ -110,7 +110,7 @@ def march_segment(
         colors = _colors(pipeline, at, every.measured)
     elif (shader := inline_shader(pipeline)) is not None:
         assert every.light is not None
-        parts = every.cells, every.measured, _colors(pipeline, at, every.measured), every.light
+        parts = every.cells, _colors(pipeline, at, every.measured), every.light
         colors = lit_colors(shader, pipeline, ray, *parts)
     else:
         colors = shaded_colors(
@@ -175,7 +175,7 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
     shader = inline_shader(pipeline)
-    light = shader and light_terms(shader, pipeline, live, ray, partial(cells, at, given), values)
+    light = shader and light_terms(shader, pipeline, live, ray, partial(cells, at, given))
     return Samples(list(cells(at, given)), values, alphas, light)
 
 

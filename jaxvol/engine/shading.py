@@ -27,13 +27,6 @@ from ..xla.trees import PyTree
 from ..xla.xla import in_memory
 
 
-def _sample(pipeline: Pipeline, ray: Ray, depth: Scalar, measured: Measured, transmittance: Scalar) -> Sample:
-    """The sample of a ray at this depth."""
-    color, extinction = pipeline.classification.of_cells(measured)
-    point = along(ray.entry, ray.direction, depth)
-    return Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
-
-
 # ---------------------------------------------------------------- inline
 
 
@@ -46,23 +39,18 @@ def inline_shader(pipeline: Pipeline) -> Shader | None:
 
 
 def light_terms(
-    shader: Shader,
-    pipeline: Pipeline,
-    live: Bool[Array, ""],
-    ray: Ray,
-    cells: Callable[[], tuple[Cell, ...]],
-    measured: list[Measured],
+    shader: Shader, pipeline: Pipeline, live: Bool[Array, ""], ray: Ray, cells: Callable[[], tuple[Cell, ...]]
 ) -> list[PyTree]:
     """The terms of all samples of cells, arrays (cells, rays), in memory. `live`: see `in_memory`."""
     shading, around = shader
     volume = around.volume
 
     def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
-        point = along(ray.entry, ray.direction, pipeline.march.sample(cell))
-        return volume.fetch.base(volume.data, around.space.coordinate(point))
+        coordinate = around.space.coordinate(_inline_sample(pipeline, ray, cell).point)
+        return volume.fetch.base(volume.data, coordinate)
 
-    def term(ray: Ray, cell: Cell, begin: Int[Array, ""], measured: Measured) -> PyTree:
-        sample = _inline_sample(pipeline, ray, cell, measured)
+    def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
+        sample = _inline_sample(pipeline, ray, cell)
         here = replace(around, volume=with_fetch(volume, volume.fetch.of_slopes_at(begin)))
         return shading.term(here, sample, shading.begin(here, sample), jnp.zeros((), jnp.int32))
 
@@ -72,31 +60,28 @@ def light_terms(
         return [mapped(ray, *piece) for piece in zip(cells(), *more, strict=True)]
 
     begins = in_memory(live, partial(all_, begin))
-    return in_memory(live, partial(all_, term), begins, measured)
+    return in_memory(live, partial(all_, term), begins)
 
 
 def lit_colors(
-    shader: Shader,
-    pipeline: Pipeline,
-    ray: Ray,
-    cells: list[Cell],
-    measured: list[Measured],
-    colors: list[Vec3],
-    terms: list[PyTree],
+    shader: Shader, pipeline: Pipeline, ray: Ray, cells: list[Cell], colors: list[Vec3], terms: list[PyTree]
 ) -> list[Vec3]:
     """The shaded colours of all samples of cells, arrays (cells, rays), from their colours and terms."""
     shading, around = shader
 
-    def one(ray: Ray, cell: Cell, measured: Measured, color: Vec3, term: PyTree) -> Vec3:
-        sample = _inline_sample(pipeline, ray, cell, measured)._replace(color=color)
+    def one(ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
+        sample = _inline_sample(pipeline, ray, cell)._replace(color=color)
         return shading.color(sample, shading.begin(around, sample), term)
 
-    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0, 0))
-    return [each(ray, *piece) for piece in zip(cells, measured, colors, terms, strict=True)]
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
+    return [each(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
 
 
-def _inline_sample(pipeline: Pipeline, ray: Ray, cell: Cell, measured: Measured) -> Sample:
-    return _sample(pipeline, ray, pipeline.march.sample(cell), measured, jnp.ones_like(cell.front))
+def _inline_sample(pipeline: Pipeline, ray: Ray, cell: Cell) -> Sample:
+    """Where a sample is. What it shows is not told (to pass it on took 13 % of a frame): NaN."""
+    depth, unknown = pipeline.march.sample(cell), jnp.full_like(cell.front, jnp.nan)
+    point, color = along(ray.entry, ray.direction, depth), (unknown, unknown, unknown)
+    return Sample(point, ray.direction, (), color, unknown, jnp.ones_like(unknown), ray.pixel)
 
 
 # ---------------------------------------------------------------- visible samples
@@ -196,8 +181,10 @@ def _without_terms(
     assert thresholds is not None
 
     def one(ray: Ray, cell: Cell, measured: Measured, before: Scalar) -> tuple[Vec3, Bool[Array, ""]]:
+        point = along(ray.entry, ray.direction, pipeline.march.sample(cell))
+        color, extinction = pipeline.classification.of_cells(measured)
         transmittance = pipeline.compositing.transmittance(Composite(before))
-        sample = _sample(pipeline, ray, pipeline.march.sample(cell), measured, transmittance)
+        sample = Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
         shared = shading.begin(around, sample)
         color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
         return color, transmittance < thresholds[0]

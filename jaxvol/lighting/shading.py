@@ -140,7 +140,8 @@ class Shading(Lighting):
 
     If there is one term and all it reads is the gradient at the sample (`reads_gradient` is true and
     `farthest_read` is 0), all samples are shaded where they are, since gathering the visible ones would cost
-    more. The `transmittance` of each is then 1.
+    more. Of a sample, `begin` and `term` are then told where it is, and `color` also its colour; its
+    transmittance is 1, and all else NaN.
     """
 
     @property
