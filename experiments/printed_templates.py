@@ -1,9 +1,9 @@
 """Scatterer templates by equations (1) to (3) of Lee, Kwon and Shin (2016) as printed.
 
-The energy I of a packet that arrives after a flight of length Δx is multiplied by exp(-Δx / λ) cos θ, where the
-cosine of the angle of incidence θ is drawn uniformly; then αI is handed on where (1 - α) I is left. So a
-template does not hold the energy that it was given: without the factors of flight it holds α / (1 - α), above 1
-for α > ½. The paper's tables were not made in this way (`jaxvol.scatterer_template`).
+The energy I of a packet that arrives after a flight of length Δx is multiplied by exp(-Δx / λ) cos θ, where
+the cosine of the angle of incidence θ is drawn uniformly; then αI is handed on where (1 - α) I is left. So a
+template does not hold the energy that it was given: without the factors of flight it holds α / (1 - α), more
+than 1 for α > ½. The paper's tables were not made in this way (`jaxvol.scatterer_template`).
 """
 
 import math

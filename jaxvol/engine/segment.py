@@ -175,7 +175,7 @@ def _sampled(pipeline: Pipeline, number: int, ray: Ray, at: Progress) -> Samples
         values = _searched(classification, live, in_memory(live, measured, at, given))
     alphas = in_memory(live, opacities, at, given, values)
     shader = inline_shader(pipeline)
-    light = shader and light_terms(shader, pipeline, live, ray, partial(cells, at, given))
+    light = None if shader is None else light_terms(shader, pipeline, live, ray, partial(cells, at, given))
     return Samples(list(cells(at, given)), values, alphas, light)
 
 

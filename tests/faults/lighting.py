@@ -55,11 +55,7 @@ FAULTS: list[Fault] = [
     Fault(
         "Phong: samples are shaded where their cells begin",
         "engine.shading:_inline_sample",
-        lambda f: (
-            lambda pipeline, ray, cell, measured: f(
-                pipeline, ray, replace(cell, width=0 * cell.width), measured
-            )
-        ),
+        lambda f: lambda pipeline, ray, cell: f(pipeline, ray, replace(cell, width=0 * cell.width)),
         (f"{PHONG}test_images_are_those_of_the_reference",),
     ),
     Fault(
