@@ -29,7 +29,6 @@ DARKEST = 1 / 64
 DILATION = 2
 """Nodes by which the ratios are extended around the visible nodes, since samples lie between nodes."""
 
-
 BYTES_PER_NODE = 96
 """Memory per node while its light is computed: its ratios, whether they are known, and the sums over the
 neighbouring nodes."""
@@ -48,13 +47,6 @@ class BakedLighting(Shading):
     words: UInt32[Array, " nodes"]
     highest: Float[Array, "3"]
     shape: tuple[int, int, int] = eqx.field(static=True)
-
-    @property
-    def ratio(self) -> Float[Array, "nx ny nz 3"]:
-        """The ratios at the nodes."""
-        shifts = jnp.arange(3, dtype=jnp.uint32) * 10
-        steps = (self.words[:, None] >> shifts[None]) & jnp.uint32(LEVELS)
-        return (steps.astype(self.highest.dtype) * (self.highest / LEVELS)[None]).reshape(*self.shape, 3)
 
     def for_image(self, around: Surroundings) -> "BakedLighting":
         return jax.lax.stop_gradient(self)

@@ -126,6 +126,11 @@ def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
     return several
 
 
+def optics_of(materials: Sequence[Material]) -> Optics:
+    """The optics of several materials, stacked."""
+    return jax.tree.map(lambda *each: jnp.stack(each), *(material.optics for material in materials))
+
+
 def shares(
     materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
 ) -> tuple[Scalar, ...]:

@@ -144,7 +144,7 @@ class PhotonShading(Shading):
             photon = self._refracted(around, sample, shared, photon)
 
         def places() -> list[Vec3]:
-            return [along(sample.point, photon.offset, times) for times in (1.0, *self.reach)]
+            return [_beside(sample, photon.offset, times) for times in (1.0, *self.reach)]
 
         read = around.stored(lambda: [around.measured(place) for place in places()])
         seen, shows = around.stored(lambda: self._weights(around, shared, photon, places(), read))
@@ -191,7 +191,7 @@ class PhotonShading(Shading):
 
     def _refracted(self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon) -> _Photon:
         """The photon, moved by refraction into the material at its place."""
-        place, own = along(sample.point, photon.offset, 1.0), shared.optics
+        place, own = _beside(sample, photon.offset), shared.optics
         read = around.stored(lambda: around.measured(place))
 
         def moved() -> _Photon:
@@ -255,6 +255,10 @@ class PhotonShading(Shading):
 
 def _sum(parts: Sequence[Scalar]) -> Scalar:
     return functools.reduce(jnp.add, parts)
+
+
+def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
+    return along(sample.point, offset, jnp.full_like(offset[0], times))
 
 
 def _matter(shares: tuple[Scalar, ...]) -> Scalar:

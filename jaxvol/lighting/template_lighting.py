@@ -11,7 +11,6 @@ from typing import Any, get_args
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -25,7 +24,7 @@ from ..xla.xla import computed_now
 from .baked import BakedLighting, bake, nodes_for
 from .deferred import Deferred
 from .lights import Light, lights_of
-from .materials import Material, Optics, materials_of
+from .materials import Material, materials_of, optics_of
 from .photons import Occlusion, PhotonShading
 from .shading import Lighting, Shading, Surroundings
 from .template import ScattererTemplate
@@ -199,12 +198,11 @@ class ScattererTemplates(Lighting):
         return blended.brightest(self.photons * self.templates)
 
     def _by_photons(self, *, blend: bool, cutoff: Float[Array, ""] | None) -> PhotonShading:
-        optics: Optics = jax.tree.map(lambda *each: jnp.stack(each), *(m.optics for m in self.materials))
         return PhotonShading(
             self.materials,
             self.lights,
             self.simulated(blend=blend),
-            optics,
+            optics_of(self.materials),
             cutoff,
             blended=self.templates if blend else 1,
             given=self.given is not None,

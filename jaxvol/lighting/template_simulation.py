@@ -22,7 +22,7 @@ from .._util.checks import integer, number
 from .._util.memory import require_room
 from .._util.vec3 import Scalar, golden_spiral, turned
 from ..xla.platform import is_traced
-from .materials import Material, Optics, materials_of, smoothstep
+from .materials import Material, Optics, materials_of, optics_of, smoothstep
 from .template import ScattererTemplate
 
 
@@ -120,14 +120,13 @@ def scatterer_templates(
     tree = PacketTree.checked(packets, threshold, threshold_on)
     levels = tree.levels_of(materials, levels)
     tree.require_room(levels, merge, count * len(materials))
-    optics = jax.tree.map(lambda *each: jnp.stack(each), *(each.optics for each in materials))
 
     def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
         return tree.template(optics, draws, levels, merge)
 
     several = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)), in_axes=(0, 0, None))
-    return several(optics, jnp.arange(len(materials)), jnp.arange(count))
+    return several(optics_of(materials), jnp.arange(len(materials)), jnp.arange(count))
 
 
 class _Packets(NamedTuple):
@@ -231,7 +230,7 @@ class PacketTree:
         size = self.size(levels)
         require_room(
             templates * size * (BYTES_PER_PHOTON + (BYTES_PER_PAIR * size if merge > 0 else 0)),
-            f"{templates} templates, grown from {size} photons each (packets={self.packets}, "
+            f"{templates} templates, simulated by {size} photons each (packets={self.packets}, "
             f"threshold={self.threshold:g}, levels={levels}); use fewer templates or levels, or a "
             "higher threshold",
         )
