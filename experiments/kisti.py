@@ -88,6 +88,9 @@ class VisiblePhong(Phong):
     """Gathers visible samples to shade them, as lightings do that cost more: the report's empty-space
     skipping."""
 
+    def __init__(self):
+        super().__init__()
+
     @property
     def farthest_read(self) -> None:
         return None

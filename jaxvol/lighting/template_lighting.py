@@ -213,13 +213,13 @@ class ScattererTemplates(Lighting):
 
 
 def _checked_reach(reach: Any) -> tuple[float, ...]:
+    fault = ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
     try:
         multiples = tuple(float(each) for each in reach)
-        increase = all(b > a for a, b in zip((1.0, *multiples), (*multiples, math.inf), strict=True))
-    except TypeError:
-        increase = False
-    if not increase:
-        raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
+    except TypeError as other:
+        raise fault from other
+    if not all(b > a for a, b in zip((1.0, *multiples), (*multiples, math.inf), strict=True)):
+        raise fault
     return multiples
 
 
