@@ -110,8 +110,8 @@ def weights_of(pipeline: Pipeline, at: Progress, alphas: list[Scalar]) -> Weight
             composite = composite.add(weight)
             found[i].append((weight, before, composite.opacity, finished))
         finished |= jax.vmap(partial(stopped, pipeline))(composite)
-    each = [[jnp.stack(parts) for parts in zip(*pieces, strict=True)] for pieces in found]
-    return Weights(*(list(parts) for parts in zip(*each, strict=True)))
+    each = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in found]
+    return Weights(*(list(values) for values in zip(*each, strict=True)))
 
 
 def visible(weights: Weights, chunk: int) -> Chosen:

@@ -46,13 +46,13 @@ radiance L."""
 class _Shared(NamedTuple):
     """What is common to all photons of a sample.
 
-    - `shares`: of the materials. `parts`: the same, normalized to sum to 1 if any is above 0.
+    - `shares`: of the materials. `mixture`: the same, normalized to sum to 1 if any is above 0.
     - `optics`: of the sample's material. `template`: which of its templates; None if there is only one.
     - `lights`: for each, the direction to it, its distance and irradiance. Direction None: from all sides.
     """
 
     shares: tuple[Scalar, ...]
-    parts: tuple[Scalar, ...]
+    mixture: tuple[Scalar, ...]
     optics: Optics
     template: Int[Array, ""] | None
     lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
@@ -130,9 +130,10 @@ class PhotonShading(Shading):
             elif isinstance(light, LocatedLight):
                 lights.append(tuple(light.at(sample.point)))
         total = sum(material_shares)
-        parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
+        mixture = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
         default = Optics(*(jnp.ones_like(total),) * 3)
-        return _Shared(material_shares, parts, _blend(self.optics, parts, default), template, tuple(lights))
+        optics = _blend(self.optics, mixture, default)
+        return _Shared(material_shares, mixture, optics, template, tuple(lights))
 
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
         # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
@@ -144,7 +145,7 @@ class PhotonShading(Shading):
             photon = self._refracted(around, sample, shared, photon)
 
         def places() -> list[Vec3]:
-            return [_beside(sample, photon.offset, times) for times in (1.0, *self.reach)]
+            return [_displaced(sample, photon.offset, times) for times in (1.0, *self.reach)]
 
         read = around.stored(lambda: [around.measured(place) for place in places()])
         seen, shows = around.stored(lambda: self._weights(around, shared, photon, places(), read))
@@ -167,7 +168,7 @@ class PhotonShading(Shading):
         return red, green, blue
 
     def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
-        """A photon of the sample's material, or of several blended by their parts; of intensity 0 if it is
+        """A photon of the sample's material, or of several blended by their shares; of intensity 0 if it is
         skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
@@ -181,7 +182,7 @@ class PhotonShading(Shading):
             x, y, z, intensity = each[0]
         else:
             x, y, z, intensity = (
-                _sum([part * one for part, one in zip(shared.parts, several, strict=True)])
+                _sum([share * one for share, one in zip(shared.mixture, several, strict=True)])
                 for several in zip(*each, strict=True)
             )
         if self.cutoff is not None:
@@ -191,7 +192,7 @@ class PhotonShading(Shading):
 
     def _refracted(self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon) -> _Photon:
         """The photon, moved by refraction into the material at its place."""
-        place, own = _beside(sample, photon.offset), shared.optics
+        place, own = _displaced(sample, photon.offset), shared.optics
         read = around.stored(lambda: around.measured(place))
 
         def moved() -> _Photon:
@@ -253,11 +254,11 @@ class PhotonShading(Shading):
         return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
 
 
-def _sum(parts: Sequence[Scalar]) -> Scalar:
-    return functools.reduce(jnp.add, parts)
+def _sum(terms: Sequence[Scalar]) -> Scalar:
+    return functools.reduce(jnp.add, terms)
 
 
-def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
+def _displaced(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
     return along(sample.point, offset, jnp.full_like(offset[0], times))
 
 

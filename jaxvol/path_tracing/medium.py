@@ -158,12 +158,12 @@ class Medium(NamedTuple):
             return (*shares(materials, volume, coordinate, measured[0]), *measured)
 
         def classify(measured: Measured) -> tuple[Scalar, Vec3]:
-            share, measured = measured[: len(materials)], measured[len(materials) :]
+            fractions, measured = measured[: len(materials)], measured[len(materials) :]
             color, extinction = classification.classify(classification.searched(measured))
             kept = jnp.ones_like(extinction)
             visible = extinction > 0
-            for part, material in zip(share, materials, strict=True):
-                here = visible & (part > 0)
+            for share, material in zip(fractions, materials, strict=True):
+                here = visible & (share > 0)
                 extinction = jnp.where(here, 1 / material.mean_free_path, extinction)
                 kept = jnp.where(here, 1 - material.opacity, kept)
             r, g, b = (jnp.clip(c, 0, 1) * kept for c in color)
