@@ -78,8 +78,8 @@ def shading_vjp(
 
 
 class _ShadingInputs(NamedTuple):
-    """What a sample's colour depends on, and has a gradient; or the cotangents of that: of what shades it and
-    of the transfer function, of the samples, and of what all terms of a sample share."""
+    """What shaded colours are differentiated by, or the cotangents of that: shader and transfer function; the
+    samples; and what all terms of a sample share."""
 
     leaves: PyTree
     samples: PyTree
@@ -99,15 +99,14 @@ def _chunk_vjp(
     )
 
     def rebuilt(inputs: _ShadingInputs) -> tuple[Shader, Sample]:
-        return shader.with_leaves(*eqx.combine(inputs.leaves, fixed_leaves)), eqx.combine(
-            inputs.samples, fixed
-        )
+        leaves, transfer = eqx.combine(inputs.leaves, fixed_leaves)
+        return shader.with_leaves(leaves, transfer), eqx.combine(inputs.samples, fixed)
 
-    def about(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
+    def begin(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
         (shading, around), each = rebuilt(_ShadingInputs(leaves, samples))
         return eqx.partition(jax.vmap(partial(shading.begin, around))(each), eqx.is_inexact_array)
 
-    shared, pull_about, fixed_shared = jax.vjp(about, leaves, moving, has_aux=True)
+    shared, pull_begin, fixed_shared = jax.vjp(begin, leaves, moving, has_aux=True)
     inputs = _ShadingInputs(leaves, moving, shared)
 
     def color(inputs: _ShadingInputs, sums: PyTree) -> Vec3:
@@ -149,7 +148,7 @@ def _chunk_vjp(
         needed = terms_needed(shading, samples.transmittance)
         start = varying((of_inputs, voxels), samples)
         of_inputs, voxels = jax.lax.fori_loop(0, needed, add, start)
-    more_of_leaves, more_of_samples = pull_about(of_inputs.shared)
+    more_of_leaves, more_of_samples = pull_begin(of_inputs.shared)
     of_shader, of_transfer = added(of_inputs.leaves, more_of_leaves)
     total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
     return colors, added(of_inputs.samples, more_of_samples), total

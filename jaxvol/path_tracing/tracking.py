@@ -4,8 +4,8 @@ Within a block, collision candidates lie at exponentially distributed distances 
 The caller decides what to do with a candidate: to accept it with probability extinction / majorant, which
 samples a path (delta tracking); or to pass it with the weight 1 - extinction / majorant, and the product of
 these weights is an unbiased estimate of the transmittance (ratio tracking). At the border of a block the
-distance is drawn again, since the exponential distribution is memoryless. Blocks have integer indices, so that
-a flight always arrives, however its coordinates are rounded.
+distance is drawn again, since the exponential distribution is memoryless. Blocks have integer indices, so
+that a flight always arrives, however its coordinates are rounded.
 
 Sources: Woodcock et al. 1965; Novák et al., "Monte Carlo Methods for Volumetric Light Transport
 Simulation", 2018; Amanatides and Woo 1987 (from block to block).
