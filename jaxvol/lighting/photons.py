@@ -138,8 +138,9 @@ class PhotonShading(Shading):
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
         # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
         # photon of a single template costs nothing, as it is the same for all samples.
-        photon = self._photon(sample, shared, number)
-        if shared.template is not None or not self._one_material:
+        if self._one_material and shared.template is None:
+            photon = self._photon(sample, shared, number)
+        else:
             photon = around.stored(lambda: self._photon(sample, shared, number))
         if not self._one_material:
             photon = self._refracted(around, sample, shared, photon)
@@ -174,9 +175,10 @@ class PhotonShading(Shading):
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
 
+        offset, light = self.templates.offset, self.templates.intensity
         each = [
-            [of_sample(leaf) for leaf in (*self.templates.offset[m, :, number].T, intensities[:, number])]
-            for m, intensities in enumerate(self.templates.intensity)
+            [*(of_sample(offset[m, :, number, i]) for i in range(3)), of_sample(light[m, :, number])]
+            for m in range(len(self.materials))
         ]
         if self._one_material:
             x, y, z, intensity = each[0]
@@ -192,11 +194,12 @@ class PhotonShading(Shading):
 
     def _refracted(self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon) -> _Photon:
         """The photon, moved by refraction into the material at its place."""
-        place, own = _displaced(sample, photon.offset), shared.optics
-        read = around.stored(lambda: around.measured(place))
+        own = shared.optics
+        read = around.stored(lambda: around.measured(_displaced(sample, photon.offset)))
 
         def moved() -> _Photon:
-            shares = self._shares_at(around, around.classified(place, read))
+            there = around.classified(_displaced(sample, photon.offset), read)
+            shares = self._shares_at(around, there)
             optics = _blend(self.optics, shares, own)
             # the template is stretched by the ratio of the speeds of light
             offset = scaled(photon.offset, own.refractive_index / optics.refractive_index)
