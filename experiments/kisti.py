@@ -32,8 +32,6 @@ import jaxvol as jv
 from jaxvol.engine.image import render_scene
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import Lighting, Phong
-from jaxvol.lighting.phong import PhongShading
-from jaxvol.lighting.shading import Shading, Surroundings
 from jaxvol.metrics import rmse
 from jaxvol.ray import Scene as EngineScene
 
@@ -86,31 +84,22 @@ def opaque(scene: Scene) -> Scene:
     return scene._replace(transfer=jv.TransferFunction(values, colors, jnp.where(extinction > 0, solid, 0)))
 
 
-class VisiblePhongShading(PhongShading):
-    """Gathers visible samples to shade them, as lightings do that cost more."""
+class VisiblePhong(Phong):
+    """Gathers visible samples to shade them, as lightings do that cost more: the report's empty-space
+    skipping."""
+
+    def __init__(self):
+        super().__init__()
 
     @property
-    def inline(self) -> bool:
-        return False
-
-
-class VisiblePhong(Lighting):
-    """Shades visible samples only: the report's empty-space skipping."""
-
-    how: Phong
-
-    @property
-    def reads_gradient(self) -> bool:
-        return self.how.reads_gradient
-
-    def shading(self, around: Surroundings) -> Shading:
-        return VisiblePhongShading(self.how)
+    def farthest_read(self) -> None:
+        return None
 
 
 SHADED: dict[str, tuple[tuple[jv.Transform, ...], Lighting]] = {
     **{name: (transforms, Phong()) for name, transforms in METHODS.items()},
-    SKIPPED: (METHODS[NEITHER], VisiblePhong(Phong())),
-    BOTH_SKIPPED: (METHODS[ERT], VisiblePhong(Phong())),
+    SKIPPED: (METHODS[NEITHER], VisiblePhong()),
+    BOTH_SKIPPED: (METHODS[ERT], VisiblePhong()),
 }
 
 

@@ -18,7 +18,7 @@ the material's opacity, for the conserving form and the printed one.
 
 import time
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ from jaxvol.metrics import rmse
 from . import common, timing
 from .common import plt
 from .light_filter import filtered
+from .printed_templates import printed_templates
 from .scenes import SKIN, Scene, skin_head
 
 
@@ -71,10 +72,10 @@ STYLES = {
     BLENDED_ONCE: "C6s--",
     BAKED_ONCE: "C5^--",
 }
-ENERGIES: dict[str, dict[str, Any]] = {
-    "conserving": {"energy": "conserving"},
-    "printed": {"energy": "printed"},
-    "printed, without its factors of flight": {"energy": "printed", "flights": False},
+ENERGIES: dict[str, Callable[..., ScattererTemplate]] = {
+    "conserving": scatterer_templates,
+    "printed": printed_templates,
+    "printed, without its factors of flight": partial(printed_templates, flights=False),
 }
 
 
@@ -92,10 +93,10 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
     return {
         PHONG: [(0, Phong())],
         PHOTONS: [(n, of(photons=n)) for n in photons],
-        MATERIAL: [(whole, of(choice="material"))],
+        MATERIAL: [(whole, of(templates=1))],
         BLENDED: [(n, of(templates=n, blend=True)) for n in blended],
         HARD: [(whole, of(occlusion="hard"))],
-        HARD_MATERIAL: [(whole, of(occlusion="hard", choice="material"))],
+        HARD_MATERIAL: [(whole, of(occlusion="hard", templates=1))],
         BAKED: [(n, of(baked=n)) for n in baked],
         ONCE: [(n, Deferred(of(photons=n))) for n in photons],
         BLENDED_ONCE: [(n, Deferred(of(templates=n, blend=True, photons=FEW))) for n in blended],
@@ -151,7 +152,7 @@ def filtering(scene: Scene, image: Any, truth: Any, seed: int) -> dict[str, floa
 def held() -> dict[str, Any]:
     """Number of photons that the templates hold, and that their arrays have room for."""
     lighting = ScattererTemplates(FLESH, LIGHTS)
-    intensity = np.asarray(jax.jit(lambda: lighting.grown(blend=False))().intensity)
+    intensity = np.asarray(jax.jit(lambda: lighting.simulated(blend=False))().intensity)
     each = np.sum(intensity > 0, axis=-1)
     return {"fewest": int(each.min()), "most": int(each.max()), "room": intensity.shape[-1]}
 
@@ -206,8 +207,8 @@ def noise(counts: Sequence[int], trials: int, seed: int) -> dict[str, Any]:
 def energies(opacities: Sequence[float], seed: int, count: int = 8) -> dict[str, list[float]]:
     """Mean energy of templates, for each form and opacity."""
     found: dict[str, list[float]] = {}
-    for name, how in ENERGIES.items():
-        several = (scatterer_templates(jv.Material(a, 1.0, 1.4), seed, count=count, **how) for a in opacities)
+    for name, simulate in ENERGIES.items():
+        several = (simulate(jv.Material(a, 1.0, 1.4), seed, count=count) for a in opacities)
         found[name] = [float(t.intensity.sum(-1).mean()) for t in several]
     return found
 

@@ -51,7 +51,7 @@ def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dic
     fine, coarse = (march(case, n, row.quadrature) for n in (row.finer, row.finer / 2))
     if row.noisy:
         # grown once: in float64, random numbers are others
-        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).grown(blend=False)
+        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).simulated(blend=False)
         few = lighting_of(case, given=grown)
         image = program(case, fine, few).image()
     pixels = visible_pixels(image)

@@ -19,6 +19,7 @@ from ._util.checks import all_finite, check_answer, described
 from ._util.vec3 import Scalar, Vec3
 from .compositing.blending import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
+from .lighting.deferred import Deferred
 from .lighting.shading import Lighting, lit_classification
 from .march import strides
 from .march.march import Cell, March
@@ -75,7 +76,7 @@ class Scene(NamedTuple):
     @property
     def resolves(self) -> bool:
         """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
-        return self.compositing.resolves or (self.lighting is not None and self.lighting.shades_pixels)
+        return self.compositing.resolves or isinstance(self.lighting, Deferred)
 
     @property
     def marched(self) -> "Scene":
@@ -346,7 +347,7 @@ def resolve(scene: Scene, line: Line, rgba: Float[Array, "4"], depth: Scalar, se
         found = compositing.resolved(scene.classification, rgba)
         check_answer(compositing, "resolved", found, rgba)
         return Pixel(found, depth)
-    assert scene.lighting is not None
+    assert isinstance(scene.lighting, Deferred)
     pixel = scene.lighting.shade_pixel(scene.classification, scene.space, line, rgba, depth)
     return Pixel(pixel, depth)
 

@@ -50,7 +50,7 @@ FAR_TOO: dict[str, Any] = {"reach": (2, 4, 8)}
 COLUMNS: dict[str, Any] = {
     "unlit": None,
     "Phong": PHONG,
-    "hard, one template for each material": {"occlusion": "hard", "choice": "material", **FAR_TOO},
+    "hard, one template for each material": {"occlusion": "hard", "templates": 1, **FAR_TOO},
     "soft, 4 templates blended": {
         "templates": 4,
         "blend": True,

@@ -8,6 +8,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates, scatterer_templates
 
+from ..printed_templates import printed_templates
 from .entry import Entry, colors
 
 
@@ -35,21 +36,19 @@ def splats(templates: jv.lighting.ScattererTemplate, size: int, reach: float) ->
 
 
 def energy(opacity: float, size: int) -> dict[str, float]:
+    material = jv.Material(opacity, 1.0)
     forms = {
-        "printed, without flights": {"energy": "printed", "flights": False},
-        "printed": {"energy": "printed"},
-        "conserving": {},
+        "printed, without flights": printed_templates(material, 0, count=COUNT, merge=0.0, flights=False),
+        "printed": printed_templates(material, 0, count=COUNT, merge=0.0),
+        "conserving": scatterer_templates(material, 0, count=COUNT, merge=0.0),
     }
-    found = {}
-    for name, form in forms.items():
-        templates = scatterer_templates(jv.Material(opacity, 1.0), 0, count=COUNT, merge=0.0, **form)
-        found[name] = float(jnp.mean(jnp.sum(templates.intensity, axis=-1)))
+    found = {name: float(jnp.mean(jnp.sum(each.intensity, axis=-1))) for name, each in forms.items()}
     return {**found, "α / (1 - α)": opacity / (1 - opacity)}
 
 
 def energy_picture(opacity: float, size: int) -> np.ndarray:
-    form = {"energy": "printed", "flights": False}
-    return splats(scatterer_templates(jv.Material(opacity, 1.0), 0, count=1, merge=0.0, **form), size, 4.0)
+    printed = printed_templates(jv.Material(opacity, 1.0), 0, count=1, merge=0.0, flights=False)
+    return splats(printed, size, 4.0)
 
 
 ENERGY = Entry(
@@ -64,7 +63,7 @@ ENERGY = Entry(
     limit=1.0,
     outcome="documented",
     does="Equations (1) to (3) of the paper, to the letter, pass on α I where (1 - α) I is left: without the "
-    "factors of flight, energy grows as α / (1 - α). The default form, conserving, never exceeds 1.",
+    "factors of flight, energy grows as α / (1 - α). jaxvol's form, conserving, never exceeds 1.",
     picture=energy_picture,
     shows="photons of a template of the printed form, by intensity, ± 4 mean free paths",
     pictured=(0.45, 0.8),

@@ -432,7 +432,7 @@ def _check(
             'SpaceLeaping("min_distance") starts rays at what is visible first in the whole volume; use '
             '"hierarchy", "distance" or "beam" with bricks.'
         )
-    if lighting is not None and (lighting.shades_pixels or lighting.farthest_read is None):
+    if lighting is not None and lighting.farthest_read is None:
         raise ValueError(
             "lighting must say how far around a sample it reads (Lighting.farthest_read), and light samples; "
             f"{type(lighting).__name__} needs the whole volume here. Phong does not, and neither do "

@@ -100,7 +100,7 @@ class ImageVjp(NamedTuple):
         shader, pull_shader = None, None
         if scene.lighting is not None:
             shader, pull_shader = _shader_of(scene, prepared.volume, voxels=_of_voxels(scene, perturbed))
-            if shader.shading.inline:
+            if shader.inline:
                 lit = prepared._replace(classification=prepared.classification._replace(light=shader))
         tiles = RayTiles.of(scene.source, options.tiling)
         return cls(scene, prepared, lit, index, shader, pull_shader, scene.has_fault, tiles)
@@ -231,7 +231,7 @@ def _shader_of(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Shader, C
         # the packed copy serves fetching only
         whole = moved if voxels else with_voxels(moved, volume.data)
         around = Surroundings(whole, transfer, march.locate(whole))
-        shader = Shader(lighting.shading(around), around)
+        shader = Shader.of(lighting, around)
         return floats(shader.leaves), shader
 
     _, pull, shader = jax.vjp(made, moving, has_aux=True)

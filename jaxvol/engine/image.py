@@ -13,6 +13,7 @@ import jax
 from jaxtyping import Array, Int
 
 from ..compositing.selection import Selection
+from ..lighting.template_lighting import with_baked_light
 from ..ray import Scene, begin, end
 from ..reference import step, steps_across
 from ..scene.rendering import Rendering
@@ -62,7 +63,7 @@ def render_scene(
         # rounded up to one of few lengths, so that a change of step rarely compiles the program again
         steps = min(-(-steps_across(volume, march) // 64) * 64, march.most_samples)
     if lighting is not None:
-        scene = scene._replace(lighting=lighting.prepared(volume, scene.transfer, march))
+        scene = scene._replace(lighting=with_baked_light(lighting, volume, scene.transfer, march))
     options = RenderOptions(outputs, tiling, adjoint, steps)
     acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting)
     scene, acceleration = on_all(tiling.devices, varying((scene, acceleration)))

@@ -37,10 +37,9 @@ from ..scene.transfer import classification_of
 from ..scene.volume import with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..xla.trees import PyTree, added, floats, zeros_of
-from .inline_shading import lit_colors
 from .segment import Samples, SampleVisitor, vmap_cells
+from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
-from .visible_samples import Weights, weights_of
 
 
 class Cotangents(NamedTuple):

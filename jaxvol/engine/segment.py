@@ -26,9 +26,8 @@ from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree
-from .inline_shading import inline_shader, light_terms, lit_colors
+from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
-from .visible_samples import shaded_colors
 
 
 def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:

@@ -1,6 +1,6 @@
 """VJP of shading the visible samples of a segment: `replay` calls it for scenes with lighting.
 
-Shades each sample again, as `visible_samples.shaded_colors` did in the first march.
+Shades each sample again, as `shading.shaded_colors` did in the first march.
 """
 
 from functools import partial
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_above
+from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_needed
 from ..ray import Scene
 from ..scene.space import Ray
 from ..scene.volume import read_as
@@ -20,7 +20,7 @@ from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added
 from .segment import Samples
-from .visible_samples import Weights, samples_of, visible
+from .shading import Weights, samples_of, visible
 
 
 class ShadingTotal(NamedTuple):
@@ -64,11 +64,11 @@ def shading_vjp(
         found, total = carry
         some = samples_of(chosen, indices, scene, ray, samples.cells, samples.measured, weights)
         real = indices < size
-        red, green, blue = (jnp.where(real, part, 0) for part in chosen.take(cotangents, indices))
+        red, green, blue = (jnp.where(real, each, 0) for each in chosen.take(cotangents, indices))
         color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
         place = of_sample.point, of_sample.direction
-        part = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured[0], place)
-        return chosen.put(found, indices, part), total
+        vjp = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured[0], place)
+        return chosen.put(found, indices, vjp), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     zeros = zero, zero, zero
@@ -77,9 +77,9 @@ def shading_vjp(
     return chosen.split(found, len(weights.weight)), total
 
 
-class _Parts(NamedTuple):
-    """What a sample's colour depends on, and has a gradient; or the cotangents of that: of what shades it and
-    of the transfer function, of the samples, and of what all terms of a sample share."""
+class _ShadingInputs(NamedTuple):
+    """What shaded colours are differentiated by, or the cotangents of that: shader and transfer function; the
+    samples; and what all terms of a sample share."""
 
     leaves: PyTree
     samples: PyTree
@@ -98,29 +98,30 @@ def _chunk_vjp(
         for tree in ((shader.leaves, shader.around.transfer), samples)
     )
 
-    def made(parts: _Parts) -> tuple[Shader, Sample]:
-        return shader.with_leaves(*eqx.combine(parts.leaves, fixed_leaves)), eqx.combine(parts.samples, fixed)
+    def rebuilt(inputs: _ShadingInputs) -> tuple[Shader, Sample]:
+        leaves, transfer = eqx.combine(inputs.leaves, fixed_leaves)
+        return shader.with_leaves(leaves, transfer), eqx.combine(inputs.samples, fixed)
 
-    def about(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
-        (shading, around), each = made(_Parts(leaves, samples))
-        return eqx.partition(jax.vmap(partial(shading.about, around))(each), eqx.is_inexact_array)
+    def begin(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
+        (shading, around), each = rebuilt(_ShadingInputs(leaves, samples))
+        return eqx.partition(jax.vmap(partial(shading.begin, around))(each), eqx.is_inexact_array)
 
-    shared, pull_about, fixed_shared = jax.vjp(about, leaves, moving, has_aux=True)
-    parts = _Parts(leaves, moving, shared)
+    shared, pull_begin, fixed_shared = jax.vjp(begin, leaves, moving, has_aux=True)
+    inputs = _ShadingInputs(leaves, moving, shared)
 
-    def color(parts: _Parts, sums: PyTree) -> Vec3:
-        (shading, _), each = made(parts)
-        return jax.vmap(shading.color)(each, eqx.combine(parts.shared, fixed_shared), sums)
+    def color(inputs: _ShadingInputs, sums: PyTree) -> Vec3:
+        (shading, _), each = rebuilt(inputs)
+        return jax.vmap(shading.color)(each, eqx.combine(inputs.shared, fixed_shared), sums)
 
     shading, around = shader
     sums = needed_terms(shading, around, samples, eqx.combine(shared, fixed_shared))
-    colors, pull_color = jax.vjp(color, parts, sums)
-    of_parts, of_sums = pull_color(cotangent)
+    colors, pull_color = jax.vjp(color, inputs, sums)
+    of_inputs, of_sums = pull_color(cotangent)
 
     def term(
-        parts: _Parts, perturbations: list[Cube] | None, number: Int[Array, ""]
+        inputs: _ShadingInputs, perturbations: list[Cube] | None, number: Int[Array, ""]
     ) -> tuple[PyTree, list[Array]]:
-        (shading, around), each = made(parts)
+        (shading, around), each = rebuilt(inputs)
 
         def one(sample: Sample, shared: PyTree, perturbations: list[Cube] | None) -> tuple[PyTree, Any]:
             if perturbations is None:
@@ -129,25 +130,25 @@ def _chunk_vjp(
             here = Surroundings(read_as(around.volume, record), around.transfer, around.space)
             return shading.term(here, sample, shared, number), record.bases
 
-        return jax.vmap(one)(each, eqx.combine(parts.shared, fixed_shared), perturbations)
+        return jax.vmap(one)(each, eqx.combine(inputs.shared, fixed_shared), perturbations)
 
-    def add(number: Int[Array, ""], carry: tuple[_Parts, PyTree]) -> tuple[_Parts, PyTree]:
-        of_parts, voxels = carry
-        _, pull, bases = jax.vjp(partial(term, number=number), parts, perturbations, has_aux=True)
+    def add(number: Int[Array, ""], carry: tuple[_ShadingInputs, PyTree]) -> tuple[_ShadingInputs, PyTree]:
+        of_inputs, voxels = carry
+        _, pull, bases = jax.vjp(partial(term, number=number), inputs, perturbations, has_aux=True)
         more, of_cubes = pull(of_sums)
         if voxels is not None:
             voxels = scatter_add(voxels, shader.around.volume.shape, bases, of_cubes)
-        return added(of_parts, more), voxels
+        return added(of_inputs, more), voxels
 
     perturbations, voxels = None, total.voxels
     if shading.terms > 0:
         if voxels is not None:
-            _, bases = jax.eval_shape(term, parts, [], jnp.zeros((), jnp.int32))
+            _, bases = jax.eval_shape(term, inputs, [], jnp.zeros((), jnp.int32))
             perturbations = cubes_of_zeros(bases, cotangent[0].dtype)
-        needed = terms_above(shading.thresholds(derivative=True), samples.transmittance)
-        start = varying((of_parts, voxels), samples)
-        of_parts, voxels = jax.lax.fori_loop(0, needed, add, start)
-    more_of_leaves, more_of_samples = pull_about(of_parts.shared)
-    of_shader, of_transfer = added(of_parts.leaves, more_of_leaves)
+        needed = terms_needed(shading, samples.transmittance)
+        start = varying((of_inputs, voxels), samples)
+        of_inputs, voxels = jax.lax.fori_loop(0, needed, add, start)
+    more_of_leaves, more_of_samples = pull_begin(of_inputs.shared)
+    of_shader, of_transfer = added(of_inputs.leaves, more_of_leaves)
     total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
-    return colors, added(of_parts.samples, more_of_samples), total
+    return colors, added(of_inputs.samples, more_of_samples), total

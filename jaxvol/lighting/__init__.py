@@ -1,7 +1,6 @@
 """Lighting of samples: light sources, and the materials that scatter their light."""
 
 from .deferred import Deferred as Deferred
-from .growth import scatterer_template as scatterer_template, scatterer_templates as scatterer_templates
 from .lights import (
     ConstantLight as ConstantLight,
     DirectionalLight as DirectionalLight,
@@ -11,7 +10,10 @@ from .lights import (
 )
 from .materials import Material as Material, material as material
 from .phong import Phong as Phong
-from .scatterers import ScattererTemplates as ScattererTemplates
-from .shading import Lighting as Lighting
+from .shading import Lighting as Lighting, Shading as Shading
 from .template import ScattererTemplate as ScattererTemplate
-from .threshold import template_capacity as template_capacity
+from .template_lighting import ScattererTemplates as ScattererTemplates
+from .template_simulation import (
+    scatterer_template as scatterer_template,
+    scatterer_templates as scatterer_templates,
+)

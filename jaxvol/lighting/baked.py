@@ -17,7 +17,7 @@ from ..scene.volume import Volume
 from ..scene.voxel_fetch import corners
 from ..xla.compaction import Chosen
 from ..xla.memory import gather
-from .shading import Lighting, Sample, Shader, Shading, Surroundings
+from .shading import Sample, Shader, Shading, Surroundings
 
 
 LEVELS = 2**10 - 1
@@ -29,13 +29,12 @@ DARKEST = 1 / 64
 DILATION = 2
 """Nodes by which the ratios are extended around the visible nodes, since samples lie between nodes."""
 
-
 BYTES_PER_NODE = 96
 """Memory per node while its light is computed: its ratios, whether they are known, and the sums over the
 neighbouring nodes."""
 
 
-class BakedLighting(Lighting):
+class BakedLighting(Shading):
     """Lighting computed in advance by `bake`.
 
     - `words`: the ratios of lit colour to colour, 10 bits for each of red, green and blue, at each node of a
@@ -49,36 +48,23 @@ class BakedLighting(Lighting):
     highest: Float[Array, "3"]
     shape: tuple[int, int, int] = eqx.field(static=True)
 
-    @property
-    def ratio(self) -> Float[Array, "nx ny nz 3"]:
-        """The ratios at the nodes."""
-        shifts = jnp.arange(3, dtype=jnp.uint32) * 10
-        steps = (self.words[:, None] >> shifts[None]) & jnp.uint32(LEVELS)
-        return (steps.astype(self.highest.dtype) * (self.highest / LEVELS)[None]).reshape(*self.shape, 3)
+    def for_image(self, around: Surroundings) -> "BakedLighting":
+        return jax.lax.stop_gradient(self)
 
-    def shading(self, around: Surroundings) -> "BakedShading":
-        return BakedShading(jax.lax.stop_gradient(self))
-
-
-class BakedShading(Shading):
-    """Baked lighting prepared for one image."""
-
-    light: BakedLighting
-
-    def about(self, around: Surroundings, sample: Sample) -> Vec3:
+    def begin(self, around: Surroundings, sample: Sample) -> Vec3:
         """Ratios at the sample, by trilinear interpolation."""
         coordinate = around.space.coordinate(sample.point)
-        ends = zip(coordinate, self.light.shape, around.volume.shape, strict=True)
+        ends = zip(coordinate, self.shape, around.volume.shape, strict=True)
         x, y, z = (c * ((n - 1) / (whole - 1)) for c, n, whole in ends)
         r = g = b = jnp.zeros_like(x)
-        for index, weight in corners((x, y, z), self.light.shape):
+        for index, weight in corners((x, y, z), self.shape):
             # int32, since signed integers are converted to float in one instruction
-            word = gather(self.light.words, index).astype(jnp.int32)
+            word = gather(self.words, index).astype(jnp.int32)
             r, g, b = (
                 total + weight * (word >> shift & LEVELS).astype(x.dtype)
                 for total, shift in zip((r, g, b), (0, 10, 20), strict=True)
             )
-        red, green, blue = (c * high / LEVELS for c, high in zip((r, g, b), self.light.highest, strict=True))
+        red, green, blue = (c * high / LEVELS for c, high in zip((r, g, b), self.highest, strict=True))
         return red, green, blue
 
     def color(self, sample: Sample, shared: Vec3, sums: Any) -> Vec3:

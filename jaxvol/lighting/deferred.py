@@ -10,11 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._util.vec3 import Scalar, along
-from ..march.march import March
 from ..scene.space import Line, Space
-from ..scene.transfer import Classification, Transfer
-from ..scene.volume import Volume
-from .shading import Lighting, Sample, Shading, Simpler, Surroundings
+from ..scene.transfer import Classification
+from .shading import Lighting, Sample, Shading, Surroundings
 
 
 class Deferred(Lighting):
@@ -27,9 +25,8 @@ class Deferred(Lighting):
     sees several, one through the other, the mean depth lies between them, perhaps where there is no material
     at all, and then the pixel stays unlit. Baked light shows its grid as faint rings, which are not averaged
     over the samples of a ray. `experiments/lighting.py` measures the error on an opaque and on a translucent
-    head. There two templates blended, of eight photons each, come as near to many of them as one does with
-    all its photons on all samples, in a sixth of the time:
-    `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))`.
+    head: `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))` is the cheapest that is as
+    near as all photons of a template on all samples.
 
     Gradients are those of the image that it makes. The gradient of voxels takes an array of their size for
     each place where light is looked up, for each chunk of 2048 pixels: slow for large volumes.
@@ -52,23 +49,8 @@ class Deferred(Lighting):
     def reads_gradient(self) -> bool:
         return self.lighting.reads_gradient
 
-    @property
-    def smooth(self) -> Lighting:
-        return self.lighting.smooth
-
-    @property
-    def simpler(self) -> tuple[Simpler, ...]:
-        return tuple(each for each in self.lighting.simpler if isinstance(each.lighting, Deferred))
-
-    @property
-    def farthest_read(self) -> float | None:
-        return self.lighting.farthest_read
-
-    def shading(self, around: Surroundings) -> Shading:
-        return self.lighting.shading(around)
-
-    def prepared(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
-        return Deferred(self.lighting.prepared(volume, transfer, march))
+    def for_image(self, around: Surroundings) -> Shading:
+        return self.lighting.for_image(around)
 
     def shade_pixel(
         self,
@@ -78,6 +60,8 @@ class Deferred(Lighting):
         rgba: Float[Array, "4"],
         depth: Scalar,
     ) -> Float[Array, "4"]:
+        """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
+        depth. `classification.light` shades samples."""
         light = classification.light
         assert light is not None
         opacity = rgba[3]

@@ -21,11 +21,6 @@ class Optics(NamedTuple):
     refractive_index: Float[Array, "..."]
 
     @property
-    def optics(self) -> "Optics":
-        """Itself, so that it can be used in place of a `Material`."""
-        return self
-
-    @property
     def reflectance(self) -> Float[Array, "..."]:
         """Reflectance R of a half-space of the material under light from all sides, if its colour is white:
         isotropic scattering with single-scattering albedo ω = 1 - opacity.
@@ -47,8 +42,9 @@ class Material(eqx.Module):
     - `opacity`: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
       Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
       tracing. Scatterer templates need an opacity above 0, see their `threshold`.
-    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0.
-      `from_scatterers` computes it.
+    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0. Of n scatterers per
+      volume, each of effective area σ, it is 1 / (√2 n σ), as between the particles of a Maxwell–Boltzmann
+      gas.
     - `refractive_index`: > 0; 1 in air.
     - `values`: (low, high), the range of volume values that are this material, low < high; or
     - `label`: the volume's label for this material. Give one of the two to say where the material is;
@@ -93,29 +89,6 @@ class Material(eqx.Module):
         """Opacity, mean free path and refractive index."""
         return Optics(self.opacity, self.mean_free_path, self.refractive_index)
 
-    @classmethod
-    def from_scatterers(
-        cls,
-        opacity: Arrayable,
-        density: Arrayable,
-        cross_section: Arrayable,
-        *rest: Arrayable,
-        **where: Arrayable,
-    ) -> "Material":
-        """A material whose mean free path follows from the density and size of its scatterers.
-
-        **Arguments:**
-
-        - `density`: n, scatterers per volume, > 0. `cross_section`: σ, the effective area of each, > 0.
-          The mean free path is `1 / (√2 n σ)`, as between the particles of a Maxwell–Boltzmann gas.
-        - All other arguments: as for the class.
-        """
-        density, cross_section = (
-            number("density", density, above=0),
-            number("cross_section", cross_section, above=0),
-        )
-        return cls(opacity, 1 / (jnp.sqrt(2.0) * density * cross_section), *rest, **where)
-
 
 PRESETS = {"skin": (0.5, 0.7, 1.39), "muscle": (0.6, 1.4, 1.37), "bone": (0.8, 0.6, 1.55)}
 """Opacity, mean free path in mm, refractive index. The lengths are transport mean free paths, after which
@@ -151,6 +124,11 @@ def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
         if not isinstance(each, Material):
             raise ValueError(f"materials must hold jaxvol materials; got {each!r}.")
     return several
+
+
+def optics_of(materials: Sequence[Material]) -> Optics:
+    """The optics of several materials, stacked."""
+    return jax.tree.map(lambda *each: jnp.stack(each), *(material.optics for material in materials))
 
 
 def shares(

@@ -2,18 +2,29 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
 from .._util.checks import Arrayable, finite_array, require
 from .._util.vec3 import Vec3, apart, dot, plus, scaled, times
 from ..scene.space import world_gradient
+from ..xla.memory import packed_pair, unpacked_pair
 from .lights import HeadLight, Light, LocatedLight, lights_of
-from .shading import Lighting, Sample, Shading, Surroundings
+from .shading import Sample, Shading, Surroundings
 
 
-class Phong(Lighting):
+class _Lit(NamedTuple):
+    """Light that arrives at a sample: the direction to it, and its irradiance."""
+
+    toward: Vec3
+    irradiance: Vec3
+
+
+Angles: TypeAlias = Float[Array, "..."] | Complex[Array, "..."]
+"""How a light falls on a sample: of a head light n·v; of others the pair n·l and n·v, packed in one array."""
+
+
+class Phong(Shading):
     """Local illumination by the volume's gradient. With the normal n, the direction v to the viewer, and of
     each light the direction l to it and the irradiance E, a sample of colour c gets the colour
 
@@ -26,7 +37,6 @@ class Phong(Lighting):
       length. It is turned to the viewer, so that both sides of a surface are lit, as by VTK.
     - Where the gradient is 0 there is no normal, and only ambient light, as in VTK; the same where the square
       of its length leaves the range of floats: in float32, below 1e-19 and above 1e19 value units per length.
-      (To scale each gradient first would take 3 % of a frame.)
     - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: a white surface
       that scatters the irradiance E diffusely has the radiance E / π, and here, with `diffuse=1`, the
       colour E. So lights of irradiance π E here are those of irradiance E for `ScattererTemplates` and
@@ -82,46 +92,15 @@ class Phong(Lighting):
         return True
 
     @property
-    def farthest_read(self) -> float:
+    def farthest_read(self) -> float | None:
         return 0.0
-
-    def shading(self, around: Surroundings) -> Shading:
-        return PhongShading(self)
-
-
-def _coefficient(name: str, value: Arrayable) -> Float[Array, ""]:
-    return require(
-        finite_array(name, value, ()), lambda v: v >= 0, f"{name} must not be negative; got {{got}}."
-    )
-
-
-class _Lit(NamedTuple):
-    """Light that arrives at a sample: the direction to it, and its irradiance."""
-
-    toward: Vec3
-    irradiance: Vec3
-
-
-Angles: TypeAlias = Float[Array, "..."] | Complex[Array, "..."]
-"""How a light falls on a sample: of a head light n·v; of others n·l and, as the imaginary part, n·v. One
-array, so that one kernel fetches what both depend on."""
-
-
-class PhongShading(Shading):
-    """Phong's lighting of one image. All lights' `Angles` are its one term."""
-
-    how: Phong
 
     @property
     def terms(self) -> int:
         return 1
 
-    @property
-    def inline(self) -> bool:
-        return True
-
-    def about(self, around: Surroundings, sample: Sample) -> tuple[_Lit, ...]:
-        return tuple(_arriving(light, sample) for light in self.how.lights)
+    def begin(self, around: Surroundings, sample: Sample) -> tuple[_Lit, ...]:
+        return tuple(_arriving(light, sample) for light in self.lights)
 
     def term(
         self, around: Surroundings, sample: Sample, shared: tuple[_Lit, ...], number: Int[Array, ""]
@@ -138,27 +117,32 @@ class PhongShading(Shading):
         def angles(light: Light, lit: _Lit) -> Angles:
             if isinstance(light, HeadLight):
                 return side * toward_viewer * scale
-            both = jax.lax.complex(side * dot(gradient, lit.toward), side * toward_viewer)
-            return both * jax.lax.complex(scale, jnp.zeros_like(scale))
+            return packed_pair(side * dot(gradient, lit.toward), side * toward_viewer, scale)
 
-        return tuple(angles(*each) for each in zip(self.how.lights, shared, strict=True))
+        return tuple(angles(*each) for each in zip(self.lights, shared, strict=True))
 
     def color(self, sample: Sample, shared: tuple[_Lit, ...], sums: tuple[Angles, ...]) -> Vec3:
         zero = jnp.zeros_like(sample.extinction)
         diffuse, specular = (zero, zero, zero), (zero, zero, zero)
         for lit, angles in zip(shared, sums, strict=True):
             if jnp.iscomplexobj(angles):
-                facing, mirrored = jnp.real(angles), 2 * jnp.real(angles) * jnp.imag(angles)
-                mirrored = mirrored + dot(lit.toward, sample.direction)
+                facing, viewed = unpacked_pair(angles)
+                mirrored = 2 * facing * viewed + dot(lit.toward, sample.direction)
             else:
                 facing, mirrored = angles, 2 * angles * angles - 1
             shines = (facing > 0) & (mirrored > 0)
-            highlight = jnp.exp(self.how.specular_power * jnp.log(jnp.where(shines, mirrored, 1)))
+            highlight = jnp.exp(self.specular_power * jnp.log(jnp.where(shines, mirrored, 1)))
             diffuse = plus(diffuse, scaled(lit.irradiance, jnp.where(facing <= 0, 0, facing)))
             specular = plus(specular, scaled(lit.irradiance, jnp.where(shines, highlight, 0)))
-        ambient = self.how.ambient
-        factor = plus(scaled(diffuse, self.how.diffuse), (ambient, ambient, ambient))
-        return plus(times(sample.color, factor), scaled(specular, self.how.specular))
+        ambient = self.ambient
+        factor = plus(scaled(diffuse, self.diffuse), (ambient, ambient, ambient))
+        return plus(times(sample.color, factor), scaled(specular, self.specular))
+
+
+def _coefficient(name: str, value: Arrayable) -> Float[Array, ""]:
+    return require(
+        finite_array(name, value, ()), lambda v: v >= 0, f"{name} must not be negative; got {{got}}."
+    )
 
 
 def _arriving(light: Light, sample: Sample) -> _Lit:

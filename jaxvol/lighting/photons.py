@@ -9,7 +9,7 @@ volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._util.noise import hashed_uniforms
-from .._util.vec3 import Scalar, Vec3, along, scaled
+from .._util.vec3 import Scalar, Vec3, along, dot, scaled
 from ..scene.transfer import Measured
 from ..xla.memory import gather
 from .lights import ConstantLight, Light, LocatedLight
 from .materials import Material, Optics, shares, smoothstep, step
-from .shading import Sample, Shading, Surroundings
+from .shading import ClassifiedPoint, Sample, Shading, Surroundings
 from .template import ScattererTemplate
 
 
@@ -44,34 +44,31 @@ radiance L."""
 
 
 class _Shared(NamedTuple):
-    """What is common to all photons of a sample."""
+    """What is common to all photons of a sample.
+
+    - `shares`: of the materials. `mixture`: the same, normalized to sum to 1 if any is above 0.
+    - `optics`: of the sample's material. `template`: which of its templates; None if there is only one.
+    - `lights`: for each, the direction to it, its distance and irradiance. Direction None: from all sides.
+    """
 
     shares: tuple[Scalar, ...]
-    parts: tuple[Scalar, ...]
-    """The shares, normalized to sum to 1 if any is above 0."""
+    mixture: tuple[Scalar, ...]
     optics: Optics
     template: Int[Array, ""] | None
-    """None: there is one for each material."""
     lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
-    """For each light: direction to it, distance and irradiance. Direction None: from all sides."""
-
-
-class _There(NamedTuple):
-    """At a photon's place: how much its colour counts there, and the mean free path."""
-
-    scale: Scalar
-    mean_free_path: Scalar
 
 
 class _Photon(NamedTuple):
-    """A photon, placed around a sample; and what is `there`, if that is known before its place is fetched."""
+    """A photon of a sample. `inner`: the factor by which the colour at its place counts; `mean_free_path`:
+    there. None if they follow from what is read at its place."""
 
     offset: Vec3
     intensity: Scalar
-    there: _There | None
+    inner: Scalar | None = None
+    mean_free_path: Scalar | None = None
 
 
-class TemplateShading(Shading):
+class PhotonShading(Shading):
     """Templates prepared for one image.
 
     - `templates`: (materials, templates, photons). Where there are several for a material, each pixel uses
@@ -80,7 +77,7 @@ class TemplateShading(Shading):
     - `optics`: of the materials.
     - `cutoff`: None: no photon is skipped.
     - `given`: whether the templates are a user's own, in which an intensity of 0 may have a derivative. Of
-      those that were grown, a photon that has faded out, and its derivative with it, is 0.
+      those that were simulated, a photon that has faded out, and its derivative with it, is 0.
     """
 
     materials: tuple[Material, ...]
@@ -102,28 +99,24 @@ class TemplateShading(Shading):
     def _soft(self) -> bool:
         return self.occlusion == "soft"
 
-    def thresholds(self, *, derivative: bool = False) -> Float[Array, " photons"]:
+    @property
+    def _one_material(self) -> bool:
+        return len(self.materials) == 1
+
+    def thresholds(self) -> Float[Array, " photons"]:
         intensity = jax.lax.stop_gradient(self.templates.intensity)
         brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
         least = jnp.zeros_like(brightest)
         if self.cutoff is not None:
             # a little less, so that rounding leaves out no photon that `_photon` does not skip
             least = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
-        return least if derivative and self.given else jnp.where(brightest <= 0, jnp.inf, least)
+        return least if self.given else jnp.where(brightest <= 0, jnp.inf, least)
 
     @property
-    def has_dark_samples(self) -> bool:
+    def skips_hidden(self) -> bool:
         return self.cutoff is not None
 
-    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
-        material = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
-        return scaled(sample.color, 1 - _matter(material))
-
-    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        edge = EDGE if self._soft else 0.0
-        return shares(self.materials, around.volume, coordinate, value, edge=edge)
-
-    def about(self, around: Surroundings, sample: Sample) -> _Shared:
+    def begin(self, around: Surroundings, sample: Sample) -> _Shared:
         material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
         template = None
         if (count := self.templates.intensity.shape[1]) > 1:
@@ -137,30 +130,33 @@ class TemplateShading(Shading):
             elif isinstance(light, LocatedLight):
                 lights.append(tuple(light.at(sample.point)))
         total = sum(material_shares)
-        parts = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
+        mixture = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
         default = Optics(*(jnp.ones_like(total),) * 3)
-        return _Shared(material_shares, parts, _blend(self.optics, parts, default), template, tuple(lights))
+        optics = _blend(self.optics, mixture, default)
+        return _Shared(material_shares, mixture, optics, template, tuple(lights))
 
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
-        # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only a
-        # photon that is the same for all samples costs less to compute than to load.
-        def placed() -> _Photon:
-            return self._photon(sample, shared, number)
+        # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
+        # photon of a single template costs nothing, as it is the same for all samples.
+        if self._one_material and shared.template is None:
+            photon = self._photon(sample, shared, number)
+        else:
+            photon = around.stored(lambda: self._photon(sample, shared, number))
+        if not self._one_material:
+            photon = self._refracted(around, sample, shared, photon)
 
-        photon = placed if shared.template is None and len(self.materials) == 1 else _known(around, placed)
-        if len(self.materials) > 1:
-            first = photon()
-            [there] = around.stored(lambda: around.fetched([_beside(sample, first.offset)]))
-            photon = _known(around, lambda: self._refracted(around, sample, shared, first, there))
-        read = around.stored(lambda: around.fetched(self._places(sample, photon())))
-        seen, shows = around.stored(lambda: self._weights(around, sample, shared, photon(), read))
-        offset = photon().offset
-        brightness = tuple(seen * self._lit_side(offset, *light[:2]) for light in shared.lights)
+        def places() -> list[Vec3]:
+            return [_displaced(sample, photon.offset, times) for times in (1.0, *self.reach)]
+
+        read = around.stored(lambda: [around.measured(place) for place in places()])
+        seen, shows = around.stored(lambda: self._weights(around, shared, photon, places(), read))
+        brightness = tuple(seen * self._lit_side(photon.offset, *light[:2]) for light in shared.lights)
         color, _ = around.classification.classify(read[0])
         return brightness, scaled(color, shows)
 
     def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
         brightness, inner = sums
+        # 1 from a material's soft edge inwards, since an unlit part of the colour would look like emission
         matter = _matter(shared.shares)
         scale = matter * WHITE * shared.optics.reflectance
         red, green, blue = (
@@ -173,67 +169,76 @@ class TemplateShading(Shading):
         return red, green, blue
 
     def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
-        """A photon of the sample's material, or of several blended by their parts; of intensity 0 if it is
+        """A photon of the sample's material, or of several blended by their shares; of intensity 0 if it is
         skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
 
-        x = y = z = intensity = jnp.zeros_like(shared.parts[0])
-        for m, part in enumerate(shared.parts):
-            dx, dy, dz = (of_sample(self.templates.offset[m, :, number, i]) for i in range(3))
-            intensity = intensity + part * of_sample(self.templates.intensity[m, :, number])
-            x, y, z = x + part * dx, y + part * dy, z + part * dz
+        offset, light = self.templates.offset, self.templates.intensity
+        each = [
+            [*(of_sample(offset[m, :, number, i]) for i in range(3)), of_sample(light[m, :, number])]
+            for m in range(len(self.materials))
+        ]
+        if self._one_material:
+            x, y, z, intensity = each[0]
+        else:
+            x, y, z, intensity = (
+                _sum([share * one for share, one in zip(shared.mixture, several, strict=True)])
+                for several in zip(*each, strict=True)
+            )
         if self.cutoff is not None:
             skipped = sample.transmittance * intensity * self.blended < self.cutoff
             intensity = jnp.where(skipped, 0, intensity)
-        return _Photon((x, y, z), intensity, None)
+        return _Photon((x, y, z), intensity)
 
-    def _refracted(
-        self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon, read: Measured
-    ) -> _Photon:
-        """The photon, moved by refraction into the material at its place. `read`: what was fetched there."""
-        shares, optics = self._shares_at(around, _beside(sample, photon.offset), read, shared)
+    def _refracted(self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon) -> _Photon:
+        """The photon, moved by refraction into the material at its place."""
         own = shared.optics
-        # the template is stretched by the ratio of the speeds of light
-        offset = scaled(photon.offset, own.refractive_index / optics.refractive_index)
-        ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
-        scale = jnp.where(own.opacity == 0, 0, ratio)
-        return _Photon(offset, photon.intensity, _There(scale * sum(shares), optics.mean_free_path))
+        read = around.stored(lambda: around.measured(_displaced(sample, photon.offset)))
 
-    def _places(self, sample: Sample, photon: _Photon) -> list[Vec3]:
-        """Where a photon lies, and where else it is tested for occlusion."""
-        return [_beside(sample, photon.offset, times) for times in (1.0, *self.reach)]
+        def moved() -> _Photon:
+            there = around.classified(_displaced(sample, photon.offset), read)
+            shares = self._shares_at(around, there)
+            optics = _blend(self.optics, shares, own)
+            # the template is stretched by the ratio of the speeds of light
+            offset = scaled(photon.offset, own.refractive_index / optics.refractive_index)
+            ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
+            inner = jnp.where(own.opacity == 0, 0, ratio) * _sum(shares)
+            return _Photon(offset, photon.intensity, inner, optics.mean_free_path)
+
+        return around.stored(moved)
 
     def _weights(
-        self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon, read: list[Measured]
+        self,
+        around: Surroundings,
+        shared: _Shared,
+        photon: _Photon,
+        places: list[Vec3],
+        read: list[Measured],
     ) -> tuple[Scalar, Scalar]:
-        """How much of a photon is seen, and how much the colour at its place counts. `read`: what was fetched
-        at `_places`."""
-        places = self._places(sample, photon)
-        extinctions = [around.classified(*each).extinction for each in zip(places, read, strict=True)]
-        there = photon.there
-        if there is None:
-            shares, optics = self._shares_at(around, places[0], read[0], shared)
-            there = _There(_sum(shares), optics.mean_free_path)
-        if self._soft:  # the opacity of one mean free path there
-            matter = -jnp.expm1(-extinctions[0] * there.mean_free_path)
-        else:
-            matter = step(extinctions[0], 0.0)
-        visible = self._visible(photon.offset, extinctions)
-        return photon.intensity * visible, photon.intensity * there.scale * matter
+        """How much of a photon is seen, and how much the colour at its place counts. `read`: at `places`."""
+        points = [around.classified(*each) for each in zip(places, read, strict=True)]
+        inner, path = photon.inner, photon.mean_free_path
+        if inner is None or path is None:
+            shares = self._shares_at(around, points[0])
+            inner, path = _sum(shares), _blend(self.optics, shares, shared.optics).mean_free_path
+        extinction = points[0].extinction
+        # soft: the opacity of one mean free path there
+        matter = -jnp.expm1(-extinction * path) if self._soft else step(extinction, 0.0)
+        visible = self._visible(photon.offset, [point.extinction for point in points])
+        return photon.intensity * visible, photon.intensity * inner * matter
 
-    def _shares_at(
-        self, around: Surroundings, place: Vec3, read: Measured, shared: _Shared
-    ) -> tuple[tuple[Scalar, ...], Optics]:
-        """Shares of the materials at a place, and their optics; outside of all materials the sample's."""
-        there = around.classified(place, read)
-        found = self._shares(around, there.coordinate, there.value)
-        found = tuple(there.inside * share for share in found)
-        return found, _blend(self.optics, found, shared.optics)
+    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
+        edge = EDGE if self._soft else 0.0
+        return shares(self.materials, around.volume, coordinate, value, edge=edge)
+
+    def _shares_at(self, around: Surroundings, there: ClassifiedPoint) -> tuple[Scalar, ...]:
+        """Shares of the materials at a place, which fall to 0 outside of the volume."""
+        return tuple(there.inside * share for share in self._shares(around, there.coordinate, there.value))
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
-        """Visibility of a photon from the sample, from the extinctions at `_places`."""
+        """Visibility of a photon from the sample, from the extinctions at its place and at `reach`."""
         if not self._soft:
             return 1 - step(_sum(extinctions), 0.0)
         pieces = np.diff([0.0, 1.0, *self.reach])
@@ -245,37 +250,28 @@ class TemplateShading(Shading):
         if toward is None:
             return jnp.ones_like(offset[0])
         length = _norm(offset)
-        closer = sum(p * d for p, d in zip(offset, toward, strict=True))
         # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
-        near = closer - length**2 / (2 * distance)
+        near = dot(offset, toward) - length**2 / (2 * distance)
         if not self._soft:
             return step(near, 0.0)
         return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
 
 
-def _known(around: Surroundings, f: Callable[[], _Photon]) -> Callable[[], _Photon]:
-    """A function that returns what `f` returns, which is computed and stored once."""
-    found = around.stored(f)
-    return lambda: found
+def _sum(terms: Sequence[Scalar]) -> Scalar:
+    return functools.reduce(jnp.add, terms)
 
 
-def _sum(parts: Sequence[Scalar]) -> Scalar:
-    return functools.reduce(jnp.add, parts)
-
-
-def _beside(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
+def _displaced(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
     return along(sample.point, offset, jnp.full_like(offset[0], times))
 
 
 def _matter(shares: tuple[Scalar, ...]) -> Scalar:
-    """How far a sample is in any material: 1 from a material's soft edge inwards, since an unlit part of its
-    colour would look like emission."""
+    """How far a sample is in any material."""
     return jnp.minimum(2 * sum(shares), 1)
 
 
 def _norm(offset: Vec3) -> Scalar:
-    x, y, z = offset
-    return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, jnp.finfo(x.dtype).tiny ** 0.5))
+    return jnp.sqrt(jnp.maximum(dot(offset, offset), jnp.finfo(offset[0].dtype).tiny ** 0.5))
 
 
 def _blend(optics: Optics, shares: tuple[Scalar, ...], rest: Optics) -> Optics:

@@ -1,7 +1,7 @@
 """How is a classified sample shaded? The interface of lightings.
 
-Shading comes between the transfer function and compositing. A user passes a `Lighting`; it makes a `Shading`
-for each image, which adds up terms for points around a sample, one by one; and engines call the `Shader`.
+Shading comes between the transfer function and compositing. `render` takes a `Lighting`, which makes a
+`Shading` for each image; engines call the `Shader`, which adds up a sample's terms.
 """
 
 import math
@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from ..march.march import March
-from ..scene.space import Line, Space
+from ..scene.space import Space
 from ..scene.transfer import Classification, Measured, Transfer, classification_of
 from ..scene.volume import Volume, read_as, with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import OneByOne
@@ -67,16 +66,18 @@ class ClassifiedPoint(NamedTuple):
 
 
 class Surroundings(eqx.Module):
-    """The scene, as seen from a sample."""
+    """The scene around a sample.
+
+    - `live`: always true, but opaque to XLA: see `in_memory`. None: no branches, since fetches cannot be
+      recorded inside one.
+    - `tables`: the classification, if it was computed before.
+    """
 
     volume: Volume
     transfer: Transfer
     space: Space
     live: Bool[Array, ""] | None = None
-    """Always true, but opaque to XLA: see `xla.in_memory`. None: no branches, since fetches cannot be
-    recorded inside one."""
     tables: Classification | None = None
-    """The classification, if its tables were computed before."""
 
     def before_loop(self) -> "Surroundings":
         """The same, with the transfer function's tables, which a loop would compute again each time."""
@@ -92,16 +93,15 @@ class Surroundings(eqx.Module):
         return classification_of(self.transfer, self.volume) if self.tables is None else self.tables
 
     def stored(self, f: Callable[[], T]) -> T:
-        """`f()`, computed once for all its uses."""
+        """`f()`, which XLA would otherwise compute again for each of its uses."""
         return f() if self.live is None else in_memory(self.live, f)
 
-    def fetched(self, points: list[Vec3]) -> list[Measured]:
-        """What the transfer function reads at world points."""
-        classification = self.classification
-        return [classification.at(self.space.coordinate(point)) for point in points]
+    def measured(self, point: Vec3) -> Measured:
+        """What the transfer function reads at a world point."""
+        return self.classification.at(self.space.coordinate(point))
 
     def classified(self, point: Vec3, measured: Measured) -> ClassifiedPoint:
-        """What is at a world point, from what was fetched there."""
+        """What is at a world point, from what was `measured` there."""
         coordinate = self.space.coordinate(point)
         x, y, z = (
             jnp.clip(jnp.minimum(c + 1, n - c), 0, 1)
@@ -112,60 +112,8 @@ class Surroundings(eqx.Module):
         return ClassifiedPoint(inside, coordinate, measured[0], inside * extinction)
 
 
-class Shading(eqx.Module):
-    """A lighting, made ready for one image. All methods see one sample.
-
-    A sample's light is a sum of `terms` over points around it. Only `term` may read voxels: under replay,
-    those that are read elsewhere get no gradient.
-    """
-
-    @property
-    def terms(self) -> int:
-        """The number of terms."""
-        return 0
-
-    @property
-    def inline(self) -> bool:
-        """Whether all samples are shaded where they are, visible or not, since that takes less time than to
-        gather those that are visible. For shading by one term that is nearly all of its work. `about` and
-        `term` are told where the sample is, `color` also its colour; all else is as for a sample that nothing
-        hides."""
-        return False
-
-    def thresholds(self, *, derivative: bool = False) -> Float[Array, " terms"]:
-        """For each term, the transmittance below which neither it nor any after it adds anything to a sample;
-        or, for the `derivative`, to any of its parts. They increase. By default all terms are needed."""
-        return jnp.zeros(self.terms)
-
-    @property
-    def has_dark_samples(self) -> bool:
-        """Whether behind little transmittance a sample may need no term at all. Its colour is then `dark`."""
-        return False
-
-    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
-        """The colour of a sample without any terms."""
-        return sample.color
-
-    @abstractmethod
-    def about(self, around: Surroundings, sample: Sample) -> PyTree:
-        """What all terms and `color` share: it is computed once for each sample."""
-
-    def term(self, around: Surroundings, sample: Sample, shared: PyTree, number: Int[Array, ""]) -> PyTree:
-        """One term: arrays, which are summed over all terms. Not called where `terms` is 0."""
-        return ()
-
-    @abstractmethod
-    def color(self, sample: Sample, shared: PyTree, sums: PyTree) -> Vec3:
-        """The shaded colour."""
-
-
 class Lighting(eqx.Module):
-    """How samples are shaded; or finished pixels, by a lighting that overrides `shade_pixel`."""
-
-    @property
-    def shades_pixels(self) -> bool:
-        """Whether rays are marched without light, and `shade_pixel` is called once for each of them."""
-        return type(self).shade_pixel is not Lighting.shade_pixel
+    """What `render` takes as lighting. To add a lighting, subclass `Shading`."""
 
     @property
     def reads_gradient(self) -> bool:
@@ -175,46 +123,57 @@ class Lighting(eqx.Module):
     @property
     def farthest_read(self) -> float | None:
         """Distance from a sample, world length, up to which its shading reads the volume: more than 0 must be
-        read around a part of it. By default None: there is no such distance, or nobody knows it."""
+        read around a brick. By default None: unknown, or unbounded."""
         return None
 
     @abstractmethod
-    def shading(self, around: Surroundings) -> Shading:
-        """The shading of one image. What does not depend on the sample is computed here, once."""
+    def for_image(self, around: "Surroundings") -> "Shading":
+        """What shades the samples of one image. What does not depend on the sample is computed here, once."""
+
+
+class Shading(Lighting):
+    """A lighting that shades samples, by three methods, each of which sees one sample: `begin`, `term` and
+    `color`, of which only the last one is required.
+
+    The light at a sample is a sum of `terms`, such as one for each light source, or for each place from which
+    light comes. Only `term` may read voxels: under replay, those that are read elsewhere get no gradient.
+
+    If there is one term and all it reads is the gradient at the sample (`reads_gradient` is true and
+    `farthest_read` is 0), all samples are shaded where they are, since gathering the visible ones would cost
+    more. Of a sample, `begin` and `term` are then told where it is, and `color` also its colour; its
+    transmittance is 1, and all else NaN.
+    """
 
     @property
-    def smooth(self) -> "Lighting":
-        """This lighting without its noise and savings: what others are compared with. By default itself."""
+    def terms(self) -> int:
+        """The number of terms; by default 0."""
+        return 0
+
+    def thresholds(self) -> Float[Array, " terms"] | None:
+        """For each term, the transmittance between a sample and the camera below which neither this term nor
+        any later one adds anything, nor do their derivatives. They increase. By default None: all count."""
+        return None
+
+    @property
+    def skips_hidden(self) -> bool:
+        """Whether, by its `thresholds`, a sample behind little transmittance may need no term at all: its
+        colour is then computed without gathering it. By default not."""
+        return False
+
+    def for_image(self, around: "Surroundings") -> "Shading":
         return self
 
-    @property
-    def simpler(self) -> tuple["Simpler", ...]:
-        """Lightings that cost less and may look nearly the same, the cheapest first. By default none."""
+    def begin(self, around: "Surroundings", sample: Sample) -> PyTree:
+        """What all terms and `color` share. It is computed once for each sample."""
         return ()
 
-    def prepared(self, volume: Volume, transfer: Transfer, march: March) -> "Lighting":
-        """This lighting with what is worth computing once for several images, where nothing is traced."""
-        return self
+    def term(self, around: "Surroundings", sample: Sample, shared: PyTree, number: Int[Array, ""]) -> PyTree:
+        """One term: arrays, which are summed over all terms. Not called where `terms` is 0."""
+        return ()
 
-    def shade_pixel(
-        self,
-        classification: Classification,
-        space: Space,
-        line: Line,
-        rgba: Float[Array, "4"],
-        depth: Scalar,
-    ) -> Float[Array, "4"]:
-        """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
-        depth. `classification.light` shades samples. Not called unless overridden."""
-        return rgba
-
-
-class Simpler(NamedTuple):
-    """A lighting in place of another one, what it is, and whether it has gradients."""
-
-    lighting: Lighting
-    what: str
-    has_gradient: bool = True
+    @abstractmethod
+    def color(self, sample: Sample, shared: PyTree, sums: PyTree) -> Vec3:
+        """The shaded colour. `sums`: over all terms; None where `terms` is 0."""
 
 
 def lit_classification(
@@ -226,12 +185,7 @@ def lit_classification(
     if lighting is None:
         return classification
     around = Surroundings(volume, transfer, space)
-    return classification._replace(light=Shader(lighting.shading(around), around))
-
-
-def _plain(volume: Volume) -> Volume:
-    """The volume without the packed copy of its voxels."""
-    return read_as(volume, OneByOne())
+    return classification._replace(light=Shader.of(lighting, around))
 
 
 class Shader(NamedTuple):
@@ -240,10 +194,22 @@ class Shader(NamedTuple):
     shading: Shading
     around: Surroundings
 
+    @classmethod
+    def of(cls, lighting: Lighting, around: Surroundings) -> "Shader":
+        """That of a lighting."""
+        return cls(lighting.for_image(around), around)
+
+    @property
+    def inline(self) -> bool:
+        """Whether all samples are shaded where they are: see `Shading`."""
+        shading = self.shading
+        return shading.terms == 1 and shading.reads_gradient and shading.farthest_read == 0
+
     @property
     def leaves(self) -> PyTree:
         """All that has a gradient, except the transfer function and the voxels."""
-        return self.shading, self.around.space, without_voxels(_plain(self.around.volume))
+        plain = read_as(self.around.volume, OneByOne())  # without the packed copy of its voxels
+        return self.shading, self.around.space, without_voxels(plain)
 
     def with_leaves(self, leaves: PyTree, transfer: Transfer) -> "Shader":
         """The same with these leaves, a transfer function, and the same voxels."""
@@ -253,13 +219,15 @@ class Shader(NamedTuple):
 
     def __call__(self, sample: Sample) -> Vec3:
         """The shaded colour of a sample, or those of many along one axis."""
+        if self.inline:
+            sample = sample._replace(transmittance=jnp.ones_like(sample.transmittance))
         shade = shade_sample if sample.extinction.ndim == 0 else shade_samples
         return shade(self.shading, self.around, sample)
 
 
 def shade_sample(shading: Shading, around: Surroundings, sample: Sample) -> Vec3:
     """The shaded colour of a sample."""
-    shared = shading.about(around, sample)
+    shared = shading.begin(around, sample)
     return shading.color(sample, shared, _all_terms(shading, around, sample, shared))
 
 
@@ -275,14 +243,13 @@ def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: P
         added = shading.term(looped.in_memory_by(number >= 0, sample), sample, shared, number)
         return jax.tree.map(jnp.add, sums, added), None
 
-    looped = around.before_loop()
-    term = partial(shading.term, around, sample, shared)
-    return jax.lax.scan(add, varying(zeros_like_result(term), sample), jnp.arange(shading.terms))[0]
+    looped, none = around.before_loop(), no_terms(shading, around, sample, shared)
+    return jax.lax.scan(add, varying(none, sample), jnp.arange(shading.terms))[0]
 
 
 def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
     """The shaded colours of samples along one axis. Terms that none of them needs are left out."""
-    shared = jax.vmap(partial(shading.about, around))(samples)
+    shared = jax.vmap(partial(shading.begin, around))(samples)
     sums = needed_terms(shading, around, samples, shared)
     return jax.vmap(shading.color)(samples, shared, sums)
 
@@ -313,9 +280,9 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
     def add(group: Int[Array, ""], sums: PyTree) -> PyTree:
         return jax.tree.map(jnp.add, sums, terms(group * together))
 
-    needed = terms_above(shading.thresholds(), samples.transmittance)
-    groups = -(-needed // together)
-    return jax.lax.fori_loop(0, groups, add, varying(zeros_like_result(terms), samples))
+    none = jax.vmap(partial(no_terms, shading, around))(samples, shared)
+    groups = -(-terms_needed(shading, samples.transmittance) // together)
+    return jax.lax.fori_loop(0, groups, add, varying(none, samples))
 
 
 @needed_terms.def_jvp
@@ -326,14 +293,15 @@ def _(primals: Any, tangents: Any) -> Any:
     return eqx.filter_jvp(all_, primals, tangents)
 
 
-def terms_above(
-    thresholds: Float[Array, " terms"], transmittance: Float[Array, " samples"]
-) -> Int[Array, ""]:
+def terms_needed(shading: Shading, transmittance: Float[Array, " samples"]) -> Int[Array, ""]:
     """How many terms, from the first one on, any of these samples needs. Of NaN, all."""
+    thresholds = shading.thresholds()
+    if thresholds is None:
+        return jnp.asarray(shading.terms, jnp.int32)
     return jnp.sum(~(jnp.max(transmittance) < thresholds), dtype=jnp.int32)
 
 
-def zeros_like_result(of_number: Callable[[Int[Array, ""]], PyTree]) -> PyTree:
-    """Zeros of the shapes of what a function of a term's number returns."""
-    shapes = jax.eval_shape(of_number, jnp.zeros((), jnp.int32))
+def no_terms(shading: Shading, around: Surroundings, sample: Sample, shared: PyTree) -> PyTree:
+    """The sums of none of a sample's terms: zeros."""
+    shapes = jax.eval_shape(partial(shading.term, around, sample, shared), jnp.zeros((), jnp.int32))
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

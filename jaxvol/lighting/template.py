@@ -1,19 +1,17 @@
 """Scatterer templates: how light spreads inside a material, as a few photons around a point.
 
-`growth.scatterer_template` simulates one. Lee, Kwon and Shin: Scattered light representation in accordance
-with the material using scatterer template in volume rendering (2016), section 3.
+`template_simulation.scatterer_template` simulates one. Lee, Kwon and Shin: Scattered light representation in
+accordance with the material using scatterer template in volume rendering (2016), section 3.
 """
 
-from pathlib import Path
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._util.checks import integer
-from .._util.npy import read_arrays
 
 
 class ScattererTemplate(eqx.Module):
@@ -53,27 +51,15 @@ class ScattererTemplate(eqx.Module):
         intensity = self.intensity.reshape(*rest, templates * n) / templates
         return ScattererTemplate(offset, intensity).sorted()
 
-    def save(self, path: str | Path) -> None:
-        """Write the template to a NumPy file, `.npz`.
-
-        **Raises:** `ValueError` for another ending; `OSError` for a path that cannot be written."""
-        path = Path(path)
-        if path.suffix != ".npz":
-            raise ValueError(f"path must end in .npz; got {path}.")
-        np.savez(path, offset=np.asarray(self.offset), intensity=np.asarray(self.intensity))
-
-    @classmethod
-    def load(cls, path: str | Path) -> "ScattererTemplate":
-        """Read a template written by `save`.
-
-        **Raises:** `ValueError` naming what is wrong with the file."""
-        arrays = read_arrays(Path(path), ("offset", "intensity"))
-        offset, intensity = arrays["offset"], arrays["intensity"]
-        if offset.shape != (*intensity.shape, 3) or intensity.ndim < 1:
-            raise ValueError(
-                f"path: {path} must hold offset (*templates, n, 3) and intensity (*templates, n); "
-                f"got {offset.shape} and {intensity.shape}."
-            )
-        if not (np.isfinite(offset).all() and np.isfinite(intensity).all() and (intensity >= 0).all()):
-            raise ValueError(f"path: {path} must hold finite offsets and finite intensities of at least 0.")
-        return cls(jnp.asarray(offset, float), jnp.asarray(intensity, float))
+    def clustered(self, distance: float) -> "ScattererTemplate":
+        """One sorted template, in which the brightest photon within this distance gets the intensity of each
+        fainter one, which stays with intensity 0."""
+        offset = jax.lax.stop_gradient(self.offset)
+        near = sum((offset[:, None, i] - offset[None, :, i]) ** 2 for i in range(3)) <= distance**2
+        # Photons are sorted, so argmax finds the brightest: the photon itself if none near is brighter. A
+        # host may have a host in turn; doubling follows the chain to its end.
+        host = jnp.argmax(near, axis=-1)
+        for _ in range(math.ceil(math.log2(max(host.shape[0], 2)))):
+            host = host[host]
+        intensity = jnp.zeros_like(self.intensity).at[host].add(self.intensity)
+        return ScattererTemplate(self.offset, intensity).sorted()

@@ -10,9 +10,9 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from .walks import Walk
+from .walks import Walk, WalkResult
 
 
 BUSY = 0.75
@@ -25,40 +25,19 @@ Index: TypeAlias = Int[Array, " lanes"]
 """The index in the queue of each lane's walk."""
 
 
-class PathResults(NamedTuple):
-    """Results of the walks of a queue, one entry for each."""
-
-    red: Float[Array, " walks"]
-    green: Float[Array, " walks"]
-    blue: Float[Array, " walks"]
-    met: Bool[Array, " walks"]
-    scatterings: Int[Array, " walks"]
-    exhausted: Bool[Array, " walks"]
-
-    @classmethod
-    def empty(cls, count: int) -> "PathResults":
-        dark, no = jnp.zeros(count, jnp.float32), jnp.zeros(count, bool)
-        return cls(dark, dark, dark, no, jnp.zeros(count, jnp.int32), no)
-
-    def store(self, index: Index, walks: Walk) -> "PathResults":
-        """A copy with the results of these walks; an index past the last one stores nothing."""
-        new = PathResults(*walks.radiance, walks.met, walks.scatterings, walks.exhausted)
-        return jax.tree.map(lambda all_, some: all_.at[index].set(some, mode="drop"), self, new)
-
-
 class _Lanes(NamedTuple):
     """The walks in their lanes, their indices in the queue, how many have begun, and the results so far."""
 
     walks: Walk
     queue_index: Index
     begun: Int[Array, ""]
-    results: PathResults
+    results: WalkResult
 
 
 def walk_all(
     begin: Callable[[Index], Walk], step: Callable[[Walk], Walk], count: int, lanes: int
-) -> PathResults:
-    """Run all walks of a queue.
+) -> WalkResult:
+    """The results of all walks of a queue.
 
     - `begin`: the walks with these indices, from 0 to `count`. Those past the last must not be alive.
     - `step`: advances all lanes' walks by one step.
@@ -67,11 +46,11 @@ def walk_all(
     fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)
     idle = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(begin, none))
-    state = _Lanes(idle, none, jnp.zeros((), jnp.int32), PathResults.empty(count))
+    state = _Lanes(idle, none, jnp.zeros((), jnp.int32), WalkResult.zeros((count,)))
 
     def refill(state: _Lanes) -> _Lanes:
         free = ~state.walks.alive
-        results = state.results.store(jnp.where(free, state.queue_index, count), state.walks)
+        results = _stored(state, jnp.where(free, state.queue_index, count))
         queued = state.begun + jnp.cumsum(free, dtype=jnp.int32) - 1
         queue_index = jnp.where(free, jnp.minimum(queued, count), state.queue_index)
         walks = jax.tree.map(lambda new, old: jnp.where(free, new, old), begin(queue_index), state.walks)
@@ -84,7 +63,14 @@ def walk_all(
 
     state = jax.lax.while_loop(lambda state: state.begun < count, refill_and_step, state)
     state = _step_until(step, _compact(state, fewer, count), jnp.zeros((), jnp.int32))
-    return state.results.store(state.queue_index, state.walks)
+    return _stored(state, state.queue_index)
+
+
+def _stored(state: _Lanes, index: Index) -> WalkResult:
+    """The results with those of the lanes' walks at these indices; one past the last stores nothing."""
+    return jax.tree.map(
+        lambda all_, some: all_.at[index].set(some, mode="drop"), state.results, state.walks.result
+    )
 
 
 def _step_until(step: Callable[[Walk], Walk], state: _Lanes, keep: Int[Array, ""]) -> _Lanes:
@@ -99,7 +85,7 @@ def _step_until(step: Callable[[Walk], Walk], state: _Lanes, keep: Int[Array, ""
 def _compact(state: _Lanes, lanes: int, count: int) -> _Lanes:
     """Compact the walks that are alive into `lanes` lanes, and store the results of the others."""
     alive = state.walks.alive
-    results = state.results.store(jnp.where(alive, count, state.queue_index), state.walks)
+    results = _stored(state, jnp.where(alive, count, state.queue_index))
     indices = jnp.nonzero(alive, size=lanes, fill_value=alive.shape[0])[0]
     queue_index = state.queue_index.at[indices].get(mode="fill", fill_value=count)
     walks = jax.tree.map(lambda leaf: leaf.at[indices].get(mode="fill", fill_value=0), state.walks)

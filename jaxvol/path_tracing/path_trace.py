@@ -28,11 +28,10 @@ from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import compiled
 from ..xla.platform import is_traced
-from .lanes import PathResults, walk_all
-from .majorants import Majorants
+from .lanes import walk_all
 from .medium import Medium
 from .result import PathTraced
-from .walks import Walk, WalkScene, Words, step
+from .walks import Walk, WalkResult, WalkScene, Words, step
 
 
 LANES = 2**13
@@ -145,17 +144,11 @@ def path_trace(
     first = 0
     if onto is not None:
         first = _checked(onto, camera, seed).paths
-    inputs = _Inputs(
-        volume,
-        words_of(volume),
-        Blocks.of(volume, slopes=transfer.reads_gradient),
-        transfer,
-        materials,
-        lights,
-        anisotropy,
-        jnp.asarray(limit, jnp.int32),
+    blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
+    traced = _trace(
+        *(volume, words_of(volume), blocks, transfer, materials, lights, anisotropy),
+        *(jnp.asarray(limit, jnp.int32), camera, seed, jnp.asarray(first, jnp.uint32), options),
     )
-    traced = _trace(inputs, camera, seed, jnp.asarray(first, jnp.uint32), options)
     return traced if onto is None else onto.joined(traced)
 
 
@@ -204,42 +197,34 @@ def _checked(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
     return onto
 
 
-class _Inputs(eqx.Module):
-    """The scene's inputs, with the data derived from its volume."""
-
-    volume: Volume
-    words: UInt32[Array, " voxels"] | None
-    blocks: Blocks
-    transfer: Transfer
-    materials: tuple[Material, ...]
-    lights: tuple[Light, ...]
-    anisotropy: Scalar
-    max_scatterings: Int[Array, ""]
-
-    def scene(self) -> WalkScene:
-        volume = with_words(self.volume, self.words)
-        return WalkScene(
-            volume,
-            Medium.of(volume, self.transfer, self.materials),
-            Majorants.of(volume, self.blocks, self.transfer, self.materials),
-            self.lights,
-            self.anisotropy,
-            self.max_scatterings,
-        )
-
-
 @compiled
 def _trace(
-    inputs: _Inputs, camera: Camera, seed: UInt32[Array, ""], first: UInt32[Array, ""], options: _TraceOptions
+    volume: Volume,
+    words: UInt32[Array, " voxels"] | None,
+    blocks: Blocks,
+    transfer: Transfer,
+    materials: tuple[Material, ...],
+    lights: tuple[Light, ...],
+    anisotropy: Scalar,
+    max_scatterings: Int[Array, ""],
+    camera: Camera,
+    seed: UInt32[Array, ""],
+    first: UInt32[Array, ""],
+    options: _TraceOptions,
 ) -> PathTraced:
-    """Trace the pixels row by row, in batches that bound the memory."""
-    inputs, camera = jax.tree.map(_single, (inputs, camera))
-    scene, (width, height) = inputs.scene(), camera.size
+    """Trace the pixels row by row, in batches that bound the memory. `words`: the volume's packed voxels.
+    `first`: number of each pixel's first path."""
+    volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
+        _single, (volume, blocks, transfer, materials, lights, anisotropy, camera)
+    )
+    packed, (width, height) = with_words(volume, words), camera.size
+    medium = Medium.of(packed, blocks, transfer, materials)
+    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings)
     # Checked here, since comparisons in the walks would hide a NaN. The values of a volume with its own field
     # are unknown and its ranges infinite, which is not an error.
-    ranges = inputs.blocks if inputs.volume.field is None else None
-    valid = all_finite((without_voxels(inputs.volume), ranges, scene.majorants, inputs.transfer))
-    valid &= all_finite((inputs.materials, inputs.lights, inputs.anisotropy, camera))
+    ranges = blocks if volume.field is None else None
+    valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
+    valid &= all_finite((materials, lights, anisotropy, camera))
     pixels = options.pixels(camera)
     batches = -(-width * height // pixels)
     count = pixels * options.paths
@@ -290,9 +275,9 @@ def _begin(
     return Walk.begin(words, flight, direction, alive & (ray.length > 0))
 
 
-def _statistics(results: PathResults) -> tuple[Array, ...]:
+def _statistics(results: WalkResult) -> tuple[Array, ...]:
     """Fields of `PathTraced`, from radiance to exhausted, for each pixel of results (pixels, paths)."""
-    radiance = jnp.stack([results.red, results.green, results.blue], axis=-1)
+    radiance = jnp.stack(results.radiance, axis=-1)
     mean = radiance.mean(axis=1)
     deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
     met, scatterings = (leaf.astype(mean.dtype).mean(axis=1) for leaf in (results.met, results.scatterings))

@@ -53,12 +53,12 @@ class PathTraced(eqx.Module):
         Source: Chan, Golub and LeVeque 1983.
         """
         paths = self.paths + other.paths
-        part = other.paths / paths
+        share = other.paths / paths
 
         def mean(a: Array, b: Array) -> Array:
-            return a + (b - a) * part
+            return a + (b - a) * share
 
-        between = jnp.square(other.radiance - self.radiance) * (self.paths * part)
+        between = jnp.square(other.radiance - self.radiance) * (self.paths * share)
         return PathTraced(
             radiance=mean(self.radiance, other.radiance),
             opacity=mean(self.opacity, other.opacity),

@@ -4,21 +4,22 @@ Within a block, collision candidates lie at exponentially distributed distances 
 The caller decides what to do with a candidate: to accept it with probability extinction / majorant, which
 samples a path (delta tracking); or to pass it with the weight 1 - extinction / majorant, and the product of
 these weights is an unbiased estimate of the transmittance (ratio tracking). At the border of a block the
-distance is drawn anew, since the exponential distribution is memoryless. Blocks have integer indices, so that
-a flight always arrives, however its coordinates are rounded.
+distance is drawn again, since the exponential distribution is memoryless. Blocks have integer indices, so
+that a flight always arrives, however its coordinates are rounded.
 
 Sources: Woodcock et al. 1965; Novák et al., "Monte Carlo Methods for Volumetric Light Transport
 Simulation", 2018; Amanatides and Woo 1987 (from block to block).
 """
 
-import equinox as eqx
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import BLOCK
-from .majorants import Block, Majorants
+from .medium import Block, Majorants
 
 
 CROSSINGS = 2
@@ -29,7 +30,7 @@ TINY = 1e-20
 """Rates below this (grid coordinates per world length) count as 0."""
 
 
-class Flight(eqx.Module):
+class Flight(NamedTuple):
     """A straight segment through the grid, travelled up to `depth`.
 
     - `start`: grid coordinate. `rate`: its change per world length; no component is 0.
@@ -58,7 +59,7 @@ class Flight(eqx.Module):
         return cls(start, (x, y, z), jnp.zeros_like(end), end, block, majorants.at(block))
 
 
-class Candidate(eqx.Module):
+class Candidate(NamedTuple):
     """Where a flight has stopped.
 
     - `found`: at a collision candidate, at the grid coordinate `coordinate`, under this `majorant`.

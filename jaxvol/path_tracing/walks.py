@@ -5,9 +5,8 @@ which estimates how much of that light arrives. Both query the volume in the sam
 different stages run side by side, a step at a time, without waiting for each other.
 """
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
@@ -18,11 +17,12 @@ from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
 from ..scene.space import Affine
 from ..scene.volume import Volume
 from ..xla.memory import in_memory
-from .majorants import Majorants
 from .medium import Medium
 from .phase import phase, sample_phase, scattered
 from .tracking import Candidate, Flight, fly
 
+
+T = TypeVar("T")
 
 ROULETTE = 0.25
 """Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light. A value
@@ -38,7 +38,22 @@ Uniforms: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 """Uniform random numbers in [0, 1)."""
 
 
-class Walk(eqx.Module):
+class WalkResult(NamedTuple):
+    """Of a path so far: the radiance that it gathered, whether the camera's ray met anything, the number of
+    scatterings, and whether the path was cut off."""
+
+    radiance: Vec3
+    met: Bool[Array, "..."]
+    scatterings: Int[Array, "..."]
+    exhausted: Bool[Array, "..."]
+
+    @classmethod
+    def zeros(cls, shape: tuple[int, ...]) -> "WalkResult":
+        dark, no = jnp.zeros(shape, jnp.float32), jnp.zeros(shape, bool)
+        return cls((dark, dark, dark), no, jnp.zeros(shape, jnp.int32), no)
+
+
+class Walk(NamedTuple):
     """The state of one path.
 
     - `words`: key of all its random numbers. `steps`: number of steps so far.
@@ -46,9 +61,7 @@ class Walk(eqx.Module):
     - `direction`: of its own flight, world, unit; on the way to a light, that of its next own flight.
     - `throughput`: fraction of the light at its end that arrives at the camera; (r, g, b).
     - `unoccluded`: what the light adds without occlusion; `transmittance`: towards the light, so far.
-    - `radiance`: gathered so far.
-    - `met`: whether the camera ray met anything. `scatterings`: number so far.
-    - `alive`: whether it continues. `exhausted`: whether it was cut off.
+    - `alive`: whether it continues.
     """
 
     words: Words
@@ -59,38 +72,16 @@ class Walk(eqx.Module):
     throughput: Vec3
     unoccluded: Vec3
     transmittance: Scalar
-    radiance: Vec3
-    met: Bool[Array, ""]
-    scatterings: Int[Array, ""]
+    result: WalkResult
     alive: Bool[Array, ""]
-    exhausted: Bool[Array, ""]
 
     @classmethod
-    def begin(
-        cls,
-        words: Words,
-        flight: Flight,
-        direction: Vec3,
-        alive: Bool[Array, ""],
-    ) -> "Walk":
+    def begin(cls, words: Words, flight: Flight, direction: Vec3, alive: Bool[Array, ""]) -> "Walk":
         """A walk on its first flight, from where the camera's ray enters the volume."""
-        no, zero_count, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros_like(flight.depth)
-        black, one = (zero, zero, zero), zero + 1
-        return cls(
-            words,
-            steps=zero_count,
-            flight=flight,
-            to_light=no,
-            direction=direction,
-            throughput=(one, one, one),
-            unoccluded=black,
-            transmittance=zero,
-            radiance=black,
-            met=no,
-            scatterings=zero_count,
-            alive=alive,
-            exhausted=no,
-        )
+        zero = jnp.zeros_like(flight.depth)
+        black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
+        steps, to_light, result = jnp.zeros((), jnp.int32), jnp.zeros((), bool), WalkResult.zeros(())
+        return cls(words, steps, flight, to_light, direction, white, black, zero, result, alive)
 
 
 class WalkScene(NamedTuple):
@@ -101,7 +92,6 @@ class WalkScene(NamedTuple):
 
     volume: Volume
     medium: Medium
-    majorants: Majorants
     lights: tuple[Light, ...]
     anisotropy: Scalar
     max_scatterings: Int[Array, ""]
@@ -122,7 +112,7 @@ class WalkScene(NamedTuple):
 
     def flight(self, start: Vec3, direction: Vec3, end: Scalar) -> Flight:
         """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
-        return Flight.to(self.majorants, start, self.space.own(direction), self.space.spacing, end)
+        return Flight.to(self.medium.majorants, start, self.space.own(direction), self.space.spacing, end)
 
     def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
         """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
@@ -163,10 +153,10 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
         live, jax.vmap(sample_phase, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
     )
     flight, candidate = in_memory(
-        live, jax.vmap(lambda flight, draw: fly(scene.majorants, flight, draw)), walks.flight, draw
+        live, jax.vmap(lambda flight, draw: fly(scene.medium.majorants, flight, draw)), walks.flight, draw
     )
     measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.coordinate)
-    extinction, albedo = in_memory(live, jax.vmap(scene.medium.meet), measured)
+    extinction, albedo = in_memory(live, jax.vmap(scene.medium.classify), measured)
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
     scattering = in_memory(
         live,
@@ -178,9 +168,8 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
         choose,
         survive,
     )
-    found, over = candidate.found & walks.alive, candidate.over & walks.alive
-    candidate = eqx.tree_at(lambda c: (c.found, c.over), candidate, (found, over))
-    walks = eqx.tree_at(lambda w: (w.flight, w.steps), walks, (flight, walks.steps + 1))
+    candidate = candidate._replace(found=candidate.found & walks.alive, over=candidate.over & walks.alive)
+    walks = walks._replace(flight=flight, steps=walks.steps + 1)
     return jax.vmap(lambda *of_one: _advance(scene, *of_one))(walks, candidate, share, scattering, decide)
 
 
@@ -191,11 +180,10 @@ def _advance(
     advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
     if scene.located:
         to_light = _ratio_tracking(scene, walk, candidate, share, decide)
-        advanced = jax.tree.map(lambda a, b: jnp.where(walk.to_light, a, b), to_light, advanced)
-    cut_off = advanced.alive & (advanced.steps >= MAX_STEPS)
-    return eqx.tree_at(
-        lambda w: (w.alive, w.exhausted), advanced, (advanced.alive & ~cut_off, advanced.exhausted | cut_off)
-    )
+        advanced = _where(walk.to_light, to_light, advanced)
+    cut_off, result = advanced.alive & (advanced.steps >= MAX_STEPS), advanced.result
+    result = result._replace(exhausted=result.exhausted | cut_off)
+    return advanced._replace(alive=advanced.alive & ~cut_off, result=result)
 
 
 def _scatter(
@@ -221,27 +209,28 @@ def _delta_tracking(
     scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """Advance a walk on its own flight. A collision scatters it; at the end it gathers the constant light."""
+    before = walk.result
     collides = candidate.found & (decide < share)
-    capped = collides & (walk.scatterings >= scene.max_scatterings)
+    capped = collides & (before.scatterings >= scene.max_scatterings)
     scatters = collides & ~capped
     gathered = times(walk.throughput, scene.surroundings)
-    gathered = scaled(gathered, (candidate.over & walk.met).astype(share.dtype))
+    gathered = scaled(gathered, (candidate.over & before.met).astype(share.dtype))
     next_flight = scene.flight(candidate.coordinate, scattering.toward, scattering.end)
     goes_on = scattering.to_light | (greatest(scattering.throughput) > 0)
-    return Walk(
-        walk.words,
-        walk.steps,
-        jax.tree.map(lambda new, old: jnp.where(scatters, new, old), next_flight, walk.flight),
-        scatters & scattering.to_light,
-        select(scatters, scattering.direction, walk.direction),
-        select(scatters, scattering.throughput, walk.throughput),
-        select(scatters, scattering.unoccluded, walk.unoccluded),
-        jnp.ones_like(walk.transmittance),
-        plus(walk.radiance, gathered),
-        walk.met | collides,
-        walk.scatterings + scatters.astype(jnp.int32),
-        walk.alive & ~candidate.over & ~capped & (~scatters | goes_on),
-        walk.exhausted | capped,
+    return walk._replace(
+        flight=_where(scatters, next_flight, walk.flight),
+        to_light=scatters & scattering.to_light,
+        direction=select(scatters, scattering.direction, walk.direction),
+        throughput=select(scatters, scattering.throughput, walk.throughput),
+        unoccluded=select(scatters, scattering.unoccluded, walk.unoccluded),
+        transmittance=jnp.ones_like(walk.transmittance),
+        result=WalkResult(
+            plus(before.radiance, gathered),
+            before.met | collides,
+            before.scatterings + scatters.astype(jnp.int32),
+            before.exhausted | capped,
+        ),
+        alive=walk.alive & ~candidate.over & ~capped & (~scatters | goes_on),
     )
 
 
@@ -255,17 +244,17 @@ def _ratio_tracking(
     done = candidate.over | (transmittance == 0)
     gathered = scaled(walk.unoccluded, jnp.where(candidate.over, transmittance, 0))
     own_flight = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
-    return eqx.tree_at(
-        lambda w: (w.flight, w.to_light, w.transmittance, w.radiance, w.alive),
-        walk,
-        (
-            jax.tree.map(lambda new, old: jnp.where(done, new, old), own_flight, walk.flight),
-            ~done,
-            transmittance,
-            plus(walk.radiance, gathered),
-            walk.alive & (~done | (greatest(walk.throughput) > 0)),
-        ),
+    return walk._replace(
+        flight=_where(done, own_flight, walk.flight),
+        to_light=~done,
+        transmittance=transmittance,
+        result=walk.result._replace(radiance=plus(walk.result.radiance, gathered)),
+        alive=walk.alive & (~done | (greatest(walk.throughput) > 0)),
     )
+
+
+def _where(condition: Bool[Array, ""], a: T, b: T) -> T:
+    return jax.tree.map(lambda one, other: jnp.where(condition, one, other), a, b)
 
 
 def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:

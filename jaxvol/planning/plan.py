@@ -22,6 +22,7 @@ from ..scene.space import Space, median_node_distance
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
+from .lightings import simpler, smooth
 from .probe import Probe, Setting, Truth
 from .storage import stored
 from .trials import COARSEST, RAY, Trial, Trials
@@ -147,7 +148,7 @@ def plan(
       no voxel changes; or if the image changes by less than an eighth of the tolerance, and by less than all
       other errors leave of it. If neither, to float16, on the same terms.
     - **lighting**: one that has no simpler variants, such as `Phong`, is part of all these images. Of others,
-      the first of `Lighting.simpler`, of what was given and of `Lighting.smooth` that is within
+      the first of several cheaper ones, of what was given and of that without its noise that is within
       the tolerance, compared with the last (as many templates as were given, blended: their own noise does
       not count); the step is halved as long as that changes the lit image by more than what is left.
 
@@ -268,7 +269,7 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
 
 def _has_variants(lighting: Lighting) -> bool:
     """Whether there is a choice of lightings that look nearly the same."""
-    return bool(lighting.simpler) or lighting.smooth is not lighting
+    return bool(simpler(lighting)) or smooth(lighting) is not lighting
 
 
 def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
@@ -353,11 +354,12 @@ def _lit(
     def rendered(march: March, lighting: Lighting) -> Rendering:
         return probe.render(setting._replace(lighting=lighting), march)
 
-    smooth = rendered(chosen.march, lighting.smooth)
-    tried = [(each.lighting, each.what) for each in lighting.simpler if each.has_gradient or not gradients]
+    without_noise = smooth(lighting)
+    truth = rendered(chosen.march, without_noise)
+    tried = [(each.lighting, each.what) for each in simpler(lighting) if each.has_gradient or not gradients]
     left, found = goal - chosen.error, []
-    for other, what in (*tried, (lighting, "as given"), (lighting.smooth, "as given, without its noise")):
-        error = probe.distance(rendered(chosen.march, other), smooth)
+    for other, what in (*tried, (lighting, "as given"), (without_noise, "as given, without its noise")):
+        error = probe.distance(rendered(chosen.march, other), truth)
         found.append((error if math.isfinite(error) else math.inf, other, what))
         if error <= left:
             break

@@ -47,6 +47,17 @@ def gather(array: Array, index: Array) -> Array:
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
+def packed_pair(a: Array, b: Array, factor: Array) -> Array:
+    """The pair (a · factor, b · factor) in one array, so that one kernel computes both: of two arrays, XLA
+    would compute all that they share twice."""
+    return jax.lax.complex(a, b) * jax.lax.complex(factor, jnp.zeros_like(factor))
+
+
+def unpacked_pair(pair: Array) -> tuple[Array, Array]:
+    """The two arrays of a `packed_pair`."""
+    return jnp.real(pair), jnp.imag(pair)
+
+
 def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
     """`f(*arguments)`, computed once and stored in memory.
 

@@ -18,7 +18,7 @@ def between_ends(values, extinction, low, high):
 FAULTS: list[Fault] = [
     Fault(
         "light: what lies behind a photon does not hide it",
-        "lighting.photons:TemplateShading._visible",
+        "lighting.photons:PhotonShading._visible",
         lambda f: (
             lambda self, offset, extinctions: f(
                 self, offset, [extinctions[0]] + [0 * e for e in extinctions[1:]]
@@ -36,25 +36,25 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "light: the loop over photons ends before the cutoff is reached",
-        "lighting.photons:TemplateShading.thresholds",
-        lambda f: lambda self, **how: 2 * f(self, **how),
+        "lighting.photons:PhotonShading.thresholds",
+        lambda f: lambda self: 2 * f(self),
         (f"{SHADING}test_samples_shaded_together_are_shaded_as_each_alone[hard]",),
     ),
     Fault(
         "light: photons fade out where the threshold is on whole levels",
-        "lighting.threshold:Threshold.fades",
+        "lighting.template_simulation:PacketTree.fades",
         lambda f: property(lambda self: True),
         ("lighting/test_template.py::test_a_threshold_on_levels_gives_the_papers_count",),
     ),
     Fault(
         "light: baked while something is traced, it is kept as tracers",
-        "lighting.scatterers:computed_now",
+        "lighting.template_lighting:computed_now",
         lambda f: lambda function, *of: function(*of),
         ("lighting/test_baked.py::test_light_that_was_baked_inside_a_program_serves_outside",),
     ),
     Fault(
         "Phong: samples are shaded where their cells begin",
-        "engine.inline_shading:_sample",
+        "engine.shading:_inline_sample",
         lambda f: lambda pipeline, ray, cell: f(pipeline, ray, replace(cell, width=0 * cell.width)),
         (f"{PHONG}test_images_are_those_of_the_reference",),
     ),

@@ -32,7 +32,7 @@ def shaded(lighting, volume, transfer, points, transmittance=None, pixels=None, 
     around = surroundings(volume, transfer)
     transmittance = jnp.ones(len(points)) if transmittance is None else transmittance
     pixels = jnp.zeros((len(points), 2), jnp.int32) if pixels is None else pixels
-    shader = Shader(lighting.shading(around), around)
+    shader = Shader.of(lighting, around)
     samples = jax.vmap(partial(sample_at, around))(points, transmittance, pixels)
     return jnp.stack((shader if together else jax.vmap(shader))(samples), axis=-1)
 

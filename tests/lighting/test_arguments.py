@@ -21,11 +21,11 @@ from jaxvol.lighting import (
     material,
     scatterer_template,
     scatterer_templates,
-    template_capacity,
 )
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import materials_of
-from jaxvol.lighting.threshold import Threshold
+from jaxvol.lighting.template_lighting import with_baked_light
+from jaxvol.lighting.template_simulation import PacketTree
 
 from .samples import shaded
 
@@ -49,10 +49,6 @@ BAD = {
     "threshold 0": (grown(threshold=0.0), "threshold must be"),
     "threshold 1": (grown(threshold=1.0), "threshold must be"),
     "threshold on": (grown(threshold_on="tree"), "threshold_on must be one of photon, level; got 'tree'"),
-    "energy": (grown(energy="lost"), "energy must be one of conserving, print"),
-    "flights": (grown(flights=False), 'flights=False requires energy="print'),
-    "no angle": (grown(critical_angle=0.0), "critical_angle must be"),
-    "wide angle": (grown(critical_angle=91.0), "critical_angle must be"),
     "opacity too low": (
         grown(FAINT),
         "opacity 0.031 leaves no photon above threshold=0.01.*packets=4.*a threshold of at most 0.00775",
@@ -63,7 +59,6 @@ BAD = {
         "opacity 0.2 leaves no photon above threshold=0.1",
     ),
     "opacity 0": (grown(Material(0.0, 1.0)), "opacity must be above 0"),
-    "endless": (grown(Material(1.0, 1.0), energy="printed"), "opacity must be below 1"),
     "traced": (
         lambda: jax.eval_shape(lambda a: scatterer_template(Material(a, 1.0), 0).intensity, 0.5),
         "levels must be given where opacity is traced",
@@ -74,7 +69,6 @@ BAD = {
     ),
     "too many templates": (lambda: scatterer_templates(HALF, 0, count=10**9), "1000000000 templates.*asks"),
     "count": (lambda: scatterer_templates(HALF, 0, count=0), "count must be an integer of at least 1"),
-    "capacity": (lambda: template_capacity(FAINT, threshold_on="tree"), "threshold_on must be one of"),
     "photons kept": (lambda: PAIR.brightest(0), "photons must be an integer"),
     # materials
     "opacity below 0": (lambda: Material(-0.1, 1.0), r"opacity must be in \[0, 1\]; got -0.1"),
@@ -85,8 +79,6 @@ BAD = {
     "values": (lambda: Material(0.5, 1.0, values=(2, 2)), "values must be .* low < high"),
     "label": (lambda: Material(0.5, 1.0, label=-1), "label must be an integer of at least 0"),
     "both": (lambda: Material(0.5, 1.0, values=(0, 1), label=1), "values and label must not both be given"),
-    "density": (lambda: Material.from_scatterers(0.5, 0.0, 1.0), "density must be greater than 0"),
-    "cross_section": (lambda: Material.from_scatterers(0.5, 1.0, 0.0), "cross_section must be greater than"),
     "preset": (lambda: material("fat"), "name must be one of skin, muscle, bone; got 'fat'"),
     "millimetre": (lambda: material("skin", millimetre=0.0), "millimetre must be greater than 0"),
     "no materials": (lambda: materials_of([]), "materials must hold at least one Material"),
@@ -105,7 +97,6 @@ BAD = {
     # lighting by templates
     "templates": (lit(templates=0), "templates must be an integer"),
     "photons": (lit(photons=0), "photons must be an integer"),
-    "choice": (lit(choice="sample"), "choice must be one of pixel, material; got 'sample'"),
     "occlusion": (lit(occlusion="some"), "occlusion must be one of soft, h"),
     "reach": (lit(reach=(1.0, 2.0)), "reach must be multiples above 1"),
     "reach's order": (lit(reach=(4.0, 2.0)), "reach must be multiples"),
@@ -113,14 +104,16 @@ BAD = {
     "seed": (lit(seed=-1), "seed must be an integer"),
     "baked": (lit(baked=1), "baked must be an integer of at least 2"),
     "a fine grid": (
-        lambda: lit(baked=10**5)().prepared(VOLUME, TRANSFER, jv.March(0.1)),
+        lambda: with_baked_light(lit(baked=10**5)(), VOLUME, TRANSFER, jv.March(0.1)),
         "nodes for baked=100000.*asks for .* GiB",
     ),
-    "many templates": (lambda: lit(templates=10**9)().grown(blend=False), "1000000000 templates.*asks for"),
+    "many templates": (
+        lambda: lit(templates=10**9)().simulated(blend=False),
+        "1000000000 templates.*asks for",
+    ),
     "faint": (lit(FAINT), "opacity 0.031 leaves no photon"),
     "given": (lit([HALF, HALF], given=PAIR), "templates of 2 materials"),
     "given by a number": (lit(given=3), "given must be a ScattererTemplate; got 3"),
-    "a critical angle": (lit(critical_angle=91.0), "critical_angle must be"),
     "lights": (lit(lights=()), "lights must be a light"),
     "materials": (lit(()), "materials must hold at least one Material"),
     "labels": (
@@ -154,23 +147,22 @@ def test_bad_input_is_named(case):
 
 
 def test_the_threshold_that_is_advised_leaves_photons():
-    assert Threshold(value=0.00775).levels(FAINT) > 1
+    assert PacketTree(threshold=0.00775).levels(FAINT) > 1
 
 
 def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():
-    """Of an opacity that is not traced, no more than there are; and energy that is not conserved is not made
-    up for."""
+    """Of an opacity that is not traced, no more than there are."""
     one, two = (lit(levels=levels)() for levels in (1, 2))
     assert (one.photons, two.photons) == (4, 12)
 
     def shape(opacity):
         lighting = lit(Material(opacity, 1.0), levels=2)()
         assert lighting.photons >= two.photons
-        return lighting.grown(blend=False).intensity
+        return lighting.simulated(blend=False).intensity
 
     assert jax.eval_shape(shape, 0.5).shape[:2] == (1, two.templates)
-    grown = jax.eval_shape(lambda: lit(energy="printed", critical_angle=42.0)().grown(blend=True).intensity)
-    assert grown.shape[:2] == (1, 1)
+    blended = jax.eval_shape(lambda: lit()().simulated(blend=True).intensity)
+    assert blended.shape[:2] == (1, 1)
 
 
 def test_baked_light_is_read_at_any_distance():

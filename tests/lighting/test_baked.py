@@ -16,9 +16,10 @@ from jaxvol.lighting import (
     Material,
     ScattererTemplate,
     ScattererTemplates,
-    scatterers,
+    template_lighting,
 )
 from jaxvol.lighting.baked import BakedLighting
+from jaxvol.lighting.template_lighting import with_baked_light
 
 from ..scenes import around, scaled_phantom, soft_transfer
 from .samples import colors_of, program
@@ -56,7 +57,7 @@ def on_the_ball():
 def test_baked_light_is_that_of_all_templates_blended_and_has_no_gradient():
     volume, points = ball(), on_the_ball()
     exact = colors_of(templates(blend=True), volume, TRANSFER, points)
-    ready = templates(baked=NODES).prepared(volume, TRANSFER, MARCH)
+    ready = with_baked_light(templates(baked=NODES), volume, TRANSFER, MARCH)
     assert isinstance(ready, BakedLighting)
     assert ready.shape == (NODES,) * 3
     assert np.abs(colors_of(ready, volume, TRANSFER, points) - exact).mean() < 0.05 * exact.mean()
@@ -69,7 +70,7 @@ def test_light_that_was_baked_inside_a_program_serves_outside():
     volume, lighting = ball(), templates(baked=NODES)
 
     def prepared():
-        return jax.tree.leaves(lighting.prepared(volume, TRANSFER, MARCH))
+        return jax.tree.leaves(with_baked_light(lighting, volume, TRANSFER, MARCH))
 
     jax.eval_shape(lambda x: (prepared(), x)[1], 0.0)
     assert not any(isinstance(leaf, jax.core.Tracer) for leaf in prepared())
@@ -82,10 +83,10 @@ def test_light_is_baked_once_for_what_stays_the_same(monkeypatch):
         calls.append(lighting)
         return BakedLighting(jnp.zeros(8, jnp.uint32), jnp.zeros(3), (2, 2, 2))
 
-    monkeypatch.setattr(scatterers, "_baked", baked)
+    monkeypatch.setattr(template_lighting, "_baked", baked)
 
     def prepared(volume=volume, transfer=TRANSFER, light=SUN, path=0.12, step=0.1):
-        return templates(light, path, baked=9).prepared(volume, transfer, jv.March(step))
+        return with_baked_light(templates(light, path, baked=9), volume, transfer, jv.March(step))
 
     first = prepared()
     assert prepared() is first

@@ -122,7 +122,7 @@ def all_slopes(scene, viewer):
     around = surroundings(volume, jv.TransferFunction((0.0, 1.0), np.ones((2, 3)), (1.0, 1.0)))
     sample = sample_at(around, jnp.asarray(POINT, viewer.dtype), jnp.ones((), viewer.dtype), zero, -viewer)
     sample = sample._replace(color=apart(jnp.asarray(COLOR, viewer.dtype)))
-    color = jnp.stack(shade_sample(lighting.shading(around), around, sample))
+    color = jnp.stack(shade_sample(lighting.for_image(around), around, sample))
     return jnp.sum(color), color
 
 

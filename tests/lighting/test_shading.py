@@ -17,57 +17,48 @@ from jaxvol.lighting import (
     ConstantLight,
     Deferred,
     DirectionalLight,
-    Lighting,
     Material,
     ScattererTemplate,
     ScattererTemplates,
+    Shading,
 )
-from jaxvol.lighting.shading import TOGETHER, Shader, Shading, terms_above
+from jaxvol.lighting.shading import TOGETHER, Shader, terms_needed
 
 from ..scenes import around, in_float64, scaled_phantom, slow, soft_transfer
 from .samples import check_gradient, image_of_reference, in_double, program, sample_at, shaded, surroundings
 
 
-class Fog(Lighting):
+class Fog(Shading):
     """What lies at nine places toward the light weakens it, and adds its colour, the less of it the less is
     seen of the sample."""
 
     toward: Any
     density: Any
 
-    def shading(self, around):
-        return FogShading(self)
-
-
-class FogShading(Shading):
-    how: Fog
-
     @property
     def terms(self):
         return TOGETHER + 1
 
     @property
-    def has_dark_samples(self):
+    def skips_hidden(self):
         return True
 
-    def thresholds(self, *, derivative=False):
+    def thresholds(self):
         return 0.05 + jnp.arange(self.terms) / 20
 
-    def about(self, around, sample):
-        return plus(
-            apart(self.how.toward), scaled(sample.direction, -0.02 * jnp.ones_like(sample.extinction))
-        )
+    def begin(self, around, sample):
+        return plus(apart(self.toward), scaled(sample.direction, -0.02 * jnp.ones_like(sample.extinction)))
 
     def term(self, around, sample, shared, number) -> Any:
         weight = jnp.maximum(sample.transmittance - self.thresholds()[number], 0) ** 2
         point = along(sample.point, shared, 1 + number.astype(weight.dtype))
-        [read] = around.fetched([point])
+        read = around.measured(point)
         color, _ = around.classification.classify(read)
         return weight * around.classified(point, read).extinction, scaled(color, weight)
 
     def color(self, sample, shared, sums):
         depth, inner = sums
-        return plus(scaled(sample.color, jnp.exp(-self.how.density * depth)), scaled(inner, depth / 5))
+        return plus(scaled(sample.color, jnp.exp(-self.density * depth)), scaled(inner, depth / 5))
 
 
 # ---------------------------------------------------------------- images
@@ -109,7 +100,7 @@ def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
             of_point = sample_at(around, point, jnp.ones(()), zero, direction)
             return of_point._replace(color=apart(color))
 
-        shader = Shader(FOG.shading(around), around)
+        shader = Shader.of(FOG, around)
         return jnp.stack(shader(jax.vmap(sample)(points, directions, colors)), axis=-1)
 
     points = origins + np.asarray(unlit.depth)[rows, columns][:, None] * directions
@@ -202,19 +193,21 @@ def test_samples_shaded_together_are_shaded_as_each_alone(occlusion):
         assert (np.max(found) > 0.01) == (bright > 0.05)
 
 
-class Counting(FogShading):
-    """Terms of 1 each."""
+class CountedTerms(Shading):
+    """Terms of 1 each, as many as of a fog."""
+
+    @property
+    def terms(self):
+        return FOG.terms
+
+    def thresholds(self):
+        return FOG.thresholds()
 
     def term(self, around, sample, shared, number):
         return jnp.ones_like(sample.extinction)
 
     def color(self, sample, shared, sums):
         return sums, sums, sums
-
-
-class CountedTerms(Lighting):
-    def shading(self, around):
-        return Counting(FOG)
 
 
 def test_the_loop_ends_where_none_of_the_samples_needs_more():
@@ -234,18 +227,16 @@ def test_the_photons_that_are_needed_are_those_above_the_cutoff(blend):
     volume = scaled_phantom("sphere")
 
     @eqx.filter_jit
-    def needed(lighting, transmittance, derivative):
-        shading = lighting.shading(surroundings(volume, soft_transfer()))
-        thresholds = shading.thresholds(derivative=derivative)
-        return terms_above(thresholds, transmittance), shading.templates.intensity
+    def needed(lighting, transmittance):
+        shading = lighting.for_image(surroundings(volume, soft_transfer()))
+        return terms_needed(shading, transmittance), shading.templates.intensity
 
     for transmittance in (1.0, 0.5, 0.1, 0.05):
         several = jnp.asarray([0.0, transmittance], jnp.float32)
-        count, intensity = needed(templates(0.03, blend=blend), several, False)
+        count, intensity = needed(templates(0.03, blend=blend), several)
         shown = transmittance * np.asarray(intensity) * (2 if blend else 1) >= 0.03
         assert count == max(np.nonzero(shown)[-1], default=-1) + 1
     every = PHOTONS.intensity.size if blend else 11
-    assert needed(templates(0.03, blend=blend), jnp.asarray([0.0, jnp.nan]), False)[0] == every
-    if not blend:
-        assert needed(templates(0.0), several, False)[0] == 10
-        assert needed(templates(0.0), several, True)[0] == 11  # as its intensity may be differentiated
+    assert needed(templates(0.03, blend=blend), jnp.asarray([0.0, jnp.nan]))[0] == every
+    if not blend:  # also the one of intensity 0, which may be differentiated
+        assert needed(templates(0.0), several)[0] == 11

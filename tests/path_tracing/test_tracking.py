@@ -11,7 +11,6 @@ from jaxvol._util.noise import hashed_uniforms_4
 from jaxvol._util.piecewise_linear import upper_bound_between
 from jaxvol._util.vec3 import apart
 from jaxvol.lighting import Material
-from jaxvol.path_tracing.majorants import Majorants
 from jaxvol.path_tracing.medium import Medium
 from jaxvol.path_tracing.tracking import Flight, fly
 from jaxvol.scene.occupancy import Blocks
@@ -65,12 +64,12 @@ def places(random: np.random.Generator) -> np.ndarray:
 
 @jax.jit
 def extinction_and_majorant(volume, blocks, transfer, materials, coordinates):
-    medium = Medium.of(volume, transfer, materials)
-    majorants = Majorants.of(volume, blocks, transfer, materials)
+    medium = Medium.of(volume, blocks, transfer, materials)
+    majorants = medium.majorants
 
     def at(coordinate):
         place = apart(coordinate)
-        extinction, albedo = medium.meet(medium.measure(place))
+        extinction, albedo = medium.classify(medium.measure(place))
         return extinction, jnp.stack(albedo), majorants.at(majorants.holding(place))
 
     return jax.vmap(at)(coordinates)
@@ -150,8 +149,8 @@ COUNT = 40_000
 @jax.jit
 def tracked(volume, transfer, start, direction, length):
     """Transmittances by ratio tracking, whether delta tracking passes, which flights are done, and steps."""
-    medium = Medium.of(volume, transfer)
-    majorants = Majorants.of(volume, Blocks.of(volume), transfer)
+    medium = Medium.of(volume, Blocks.of(volume), transfer)
+    majorants = medium.majorants
     triples = [tuple(jnp.full(COUNT, a) for a in apart(vector)) for vector in (start, direction)]
     flights = jax.vmap(
         lambda start, direction: Flight.to(majorants, start, direction, apart(volume.spacing), length)
@@ -163,7 +162,7 @@ def tracked(volume, transfer, start, direction, length):
         zero = jnp.zeros_like(lane)
         draw, decide, _, _ = hashed_uniforms_4(lane, zero, zero + step.astype(jnp.uint32), zero)
         flights, candidate = jax.vmap(lambda flight, u: fly(majorants, flight, u))(flights, draw)
-        extinction, _ = jax.vmap(lambda coordinate: medium.meet(medium.measure(coordinate)))(
+        extinction, _ = jax.vmap(lambda coordinate: medium.classify(medium.measure(coordinate)))(
             candidate.coordinate
         )
         share = extinction / jnp.maximum(candidate.majorant, 1e-30)

@@ -11,6 +11,7 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
 from jaxvol.metrics import rmse
 from jaxvol.planning import trials
+from jaxvol.planning.lightings import smooth
 from jaxvol.planning.plan import _checked, _proven
 from jaxvol.scene.occupancy import Blocks
 from jaxvol.scene.space import Affine
@@ -254,7 +255,7 @@ def test_light_is_simpler_where_that_looks_the_same():
     light = ScattererTemplates(jv.Material(0.3, 0.1, 1.4), ConstantLight((0.5, 0.5, 0.5)), templates=2)
     found = plan_of(tolerance=0.05, lighting=light)
     fine = jv.March(float(SPHERE.spacing.min()) / 8, (jv.AlphaCorrection(),), "midpoint")
-    truth = jv.render(SPHERE, soft_transfer(), CAMERA, fine, lighting=light.smooth)
+    truth = jv.render(SPHERE, soft_transfer(), CAMERA, fine, lighting=smooth(light))
     image = jv.render(found.volume, soft_transfer(), CAMERA, found.march, lighting=found.lighting)
     assert found.within
     assert differ(image, truth) <= 0.05

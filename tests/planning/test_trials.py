@@ -3,6 +3,7 @@
 No ray is marched: errors and numbers of samples are formulas of the march.
 """
 
+import importlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,8 +16,8 @@ from hypothesis import given, settings, strategies
 import jaxvol as jv
 from jaxvol.compositing.blending import Over
 from jaxvol.compositing.projections import Average
-from jaxvol.lighting.shading import Simpler
 from jaxvol.planning import trials
+from jaxvol.planning.lightings import Simpler
 from jaxvol.planning.plan import Part, _brightest, _lit, _marched
 from jaxvol.planning.probe import Probe, Setting
 from jaxvol.planning.trials import Trial, Trials
@@ -25,6 +26,7 @@ from jaxvol.scene.rendering import Details
 from ..scenes import scaled_phantom, soft_transfer
 
 
+PLAN = importlib.import_module("jaxvol.planning.plan")
 VOLUME = scaled_phantom("sphere")
 Formula = Callable[[float], float]
 
@@ -41,13 +43,11 @@ class Light(jv.lighting.Phong):
         super().__init__()
         self.error, self.others, self.grain = error, others, grain
 
-    @property
     def smooth(self) -> "Light":
         return Light(0.0, grain=self.grain)
 
-    @property
-    def simpler(self) -> tuple[Simpler, ...]:
-        return tuple(Simpler(each, f"wrong by {each.error}", each.error < 0.5) for each in self.others)
+    def simpler(self) -> list[Simpler]:
+        return [Simpler(each, f"wrong by {each.error}", each.error < 0.5) for each in self.others]
 
 
 class Known(Probe):
@@ -194,7 +194,10 @@ def lit(known: Known, light: Light, *, goal: float = 1e-2, gradients: bool = Fal
     march = found.march(1.0)
     parts = [Part("step 1", True, "of a voxel")]
     chosen = Trial(march, 1e-3, 100.0, "midpoint")
-    return _lit(found, chosen, light, goal, parts, gradients=gradients), parts
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PLAN, "smooth", Light.smooth)
+        patch.setattr(PLAN, "simpler", Light.simpler)
+        return _lit(found, chosen, light, goal, parts, gradients=gradients), parts
 
 
 def test_the_first_light_within_the_goal_is_taken():

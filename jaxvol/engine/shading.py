@@ -1,0 +1,195 @@
+"""Shades the samples of a segment: those of positive weight, gathered in chunks; or all, inline.
+
+Shading a sample costs many times as much as fetching it, and few samples are visible. Inline, the light's one
+term is computed for all samples in a branch of its own; colours are then elementwise.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from .._util.vec3 import Scalar, Vec3, along
+from ..compositing.blending import Composite, Weighting
+from ..compositing.selection import Selection
+from ..lighting.shading import Sample, Shader, no_terms
+from ..march.march import Cell
+from ..ray import Progress, Scene, stopped
+from ..scene.space import Ray
+from ..scene.transfer import Measured
+from ..scene.volume import with_fetch
+from ..xla.compaction import Chosen
+from ..xla.memory import in_memory
+from ..xla.trees import PyTree
+
+
+# ---------------------------------------------------------------- inline
+
+
+def inline_shader(scene: Scene) -> Shader | None:
+    """What shades all samples of a march where they are, if anything does."""
+    light = scene.classification.light
+    if not isinstance(light, Shader) or isinstance(scene.compositing, Selection):
+        return None
+    return light if light.inline else None
+
+
+def light_terms(
+    shader: Shader, scene: Scene, live: Bool[Array, ""], ray: Ray, cells: Callable[[], tuple[Cell, ...]]
+) -> list[PyTree]:
+    """The terms of all samples of cells, arrays (cells, rays), in memory. `live`: see `in_memory`."""
+    shading, around = shader
+    volume = around.volume
+
+    def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
+        coordinate = around.space.coordinate(_inline_sample(scene, ray, cell).point)
+        return volume.fetch.base(volume.data, coordinate)
+
+    def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
+        sample = _inline_sample(scene, ray, cell)
+        here = replace(around, volume=with_fetch(volume, volume.fetch.of_slopes_at(begin)))
+        return shading.term(here, sample, shading.begin(here, sample), jnp.zeros((), jnp.int32))
+
+    def all_(f: Callable[..., PyTree], *more: list[PyTree]) -> list[PyTree]:
+        over_rays = jax.vmap(f, in_axes=(0,) * (2 + len(more)))
+        mapped = jax.vmap(over_rays, in_axes=(None, *(0,) * (1 + len(more))))
+        return [mapped(ray, *piece) for piece in zip(cells(), *more, strict=True)]
+
+    begins = in_memory(live, partial(all_, begin))
+    return in_memory(live, partial(all_, term), begins)
+
+
+def lit_colors(
+    shader: Shader, scene: Scene, ray: Ray, cells: list[Cell], colors: list[Vec3], terms: list[PyTree]
+) -> list[Vec3]:
+    """The shaded colours of all samples of cells, arrays (cells, rays), from their colours and terms."""
+    shading, around = shader
+
+    def one(ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
+        sample = _inline_sample(scene, ray, cell)._replace(color=color)
+        return shading.color(sample, shading.begin(around, sample), term)
+
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
+    return [each(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
+
+
+def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
+    """Where a sample is. What it shows is not told (to pass it on took 13 % of a frame): NaN."""
+    depth, unknown = scene.march.sample(cell), jnp.full_like(cell.front, jnp.nan)
+    point, color = along(ray.entry, ray.direction, depth), (unknown, unknown, unknown)
+    return Sample(point, ray.direction, (), color, unknown, jnp.ones_like(unknown), ray.pixel)
+
+
+# ---------------------------------------------------------------- visible samples
+
+
+class Weights(NamedTuple):
+    """Of samples, arrays (cells, rays), one for each piece of a cell: the weight of each, the opacity
+    composited before it and with it, and whether the ray was finished before."""
+
+    weight: list[Scalar]
+    before: list[Scalar]
+    after: list[Scalar]
+    finished: list[Bool[Array, "cells rays"]]
+
+
+def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
+    """The weights of consecutive cells, from the opacities of their pieces."""
+    compositing = scene.compositing
+    assert isinstance(compositing, Weighting)
+    composite, finished = Composite(at.composite.opacity), at.finished
+    found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
+    for k in range(alphas[0].shape[0]):
+        for i, alpha in enumerate(alphas):
+            before = composite.opacity
+            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
+            composite = composite.add(weight)
+            found[i].append((weight, before, composite.opacity, finished))
+        finished |= jax.vmap(partial(stopped, scene))(composite)
+    each = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in found]
+    return Weights(*(list(values) for values in zip(*each, strict=True)))
+
+
+def visible(weights: Weights, chunk: int) -> Chosen:
+    """The samples of positive weight."""
+    return Chosen.of([weight > 0 for weight in weights.weight], chunk)
+
+
+def samples_of(
+    chosen: Chosen,
+    indices: Int[Array, " chunk"],
+    scene: Scene,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    weights: Weights,
+) -> Sample:
+    """The samples at these flat indices of a segment."""
+    entry, direction, pixel = jax.tree.map(
+        lambda leaf: leaf.at[indices % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
+    )
+    depths = [scene.march.sample(cell) for cell in cells]
+    depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), indices)
+    color, extinction = jax.vmap(scene.classification.of_cells)(read)
+    transmittance = scene.compositing.transmittance(Composite(before))
+    return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
+
+
+def shaded_colors(
+    scene: Scene,
+    chunk: int,
+    ray: Ray,
+    at: Progress,
+    cells: list[Cell],
+    measured: list[Measured],
+    alphas: list[Scalar],
+) -> list[Vec3]:
+    """Shaded colours of a segment's samples; any finite ones for invisible samples."""
+    weights, light = weights_of(scene, at, alphas), scene.classification.light
+    assert isinstance(light, Shader)
+    none = jnp.zeros_like(alphas[0])
+    start, shown = [(none, none, none)] * len(alphas), [weight > 0 for weight in weights.weight]
+    if light.shading.skips_hidden:
+        start, dark = _without_terms(scene, light, ray, cells, measured, weights)
+        shown = [each & ~unlit for each, unlit in zip(shown, dark, strict=True)]
+    chosen = Chosen.of(shown, chunk)
+
+    def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
+        samples = samples_of(chosen, indices, scene, ray, cells, measured, weights)
+        return chosen.put(colors, indices, light(samples))
+
+    flat = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *start)
+    return chosen.split(chosen.fold(one, flat), len(alphas))
+
+
+def _without_terms(
+    scene: Scene,
+    light: Shader,
+    ray: Ray,
+    cells: list[Cell],
+    measured: list[Measured],
+    weights: Weights,
+) -> tuple[list[Vec3], list[Bool[Array, "cells rays"]]]:
+    """The colours of a segment's samples without any term of light, and which of them need none: behind the
+    first few samples most do not, and cost much less here than gathered."""
+    shading, around = light
+    thresholds = shading.thresholds()
+    assert thresholds is not None
+
+    def one(ray: Ray, cell: Cell, measured: Measured, before: Scalar) -> tuple[Vec3, Bool[Array, ""]]:
+        point = along(ray.entry, ray.direction, scene.march.sample(cell))
+        color, extinction = scene.classification.of_cells(measured)
+        transmittance = scene.compositing.transmittance(Composite(before))
+        sample = Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
+        shared = shading.begin(around, sample)
+        color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
+        return color, transmittance < thresholds[0]
+
+    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
+    found = [each(ray, *piece) for piece in zip(cells, measured, weights.before, strict=True)]
+    colors, dark = zip(*found, strict=True)
+    return list(colors), list(dark)

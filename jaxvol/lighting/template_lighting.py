@@ -1,0 +1,271 @@
+"""Lighting by scatterer templates: which templates are used, and when light is baked. `photons` says what
+each photon adds to a sample.
+
+Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
+volume rendering (2016), sections 3.3 and 3.4.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, get_args
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._util.checks import flag, integer, is_flag, number
+from ..march.march import March, Transform
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume, without_voxels
+from ..xla.compiling import computed_now
+from ..xla.memo import memoized
+from ..xla.platform import is_traced
+from .baked import BakedLighting, bake, nodes_for
+from .deferred import Deferred
+from .lights import Light, lights_of
+from .materials import Material, materials_of, optics_of
+from .photons import Occlusion, PhotonShading
+from .shading import Lighting, Shading, Surroundings
+from .template import ScattererTemplate
+from .template_simulation import PacketTree, ThresholdOn, scatterer_templates
+
+
+class ScattererTemplates(Lighting):
+    """Light scattered inside materials, by templates.
+
+    A sample at x in a material is surrounded by the photons of one of the material's templates: photon j lies
+    at x + p_j and has intensity a_j. Under lights of irradiance E, a sample of colour c gets the radiance
+
+        k R Σ_lights E b (c + s)    b = Σ_lit side a_j v_j    s = Σ_in matter a_j c(x + p_j)
+
+    1. The lit side consists of the photons nearer to the light than x. Constant light has an irradiance of π
+       times its radiance, and comes from all sides.
+    2. The visibility v_j is 0 for a hidden photon and 1 for others, tested at x + p_j and at the multiples
+       `reach` of p_j.
+    3. b, the brightness, grows with the intensities of the photons that are not hidden.
+    4. s, the inner colour that shines through, comes from photons in the same material,
+    5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
+       times its intensity. Here n is the refractive index, α the opacity, and primes mark the photon's
+       material.
+    6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
+
+    A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
+    inwards, a sample is lit entirely as that material, and keeps nothing of its own colour.
+
+    **Scale.** The paper's sum is E b (c + s), without a unit. Here the intensities of a template sum to 1
+    (except for `given` templates, which are used as they are), and k R turns the sum into radiance on the
+    scale of `path_trace`: k = 4 / (3π) is a constant, and R is the `Optics.reflectance` of the sample's
+    material, which falls from 1 to 0 as its opacity rises. So ratios between pixels of one material are the
+    paper's if its template held all energy before it was scaled; if the threshold cut some off, s weighs more
+    here. To get the paper's sum, divide by k R. A flat face of white matter, of which only the surface is
+    visible, has a radiance of R L under a `ConstantLight` of radiance L. White half-spaces have 0.9 to 1.6
+    times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For
+    darker colours, templates are too bright: in path tracing the colour darkens each of many scatterings, in
+    templates it darkens the sum once.
+
+    **Arguments:**
+
+    - `materials`: one or several. Where two overlap, the first counts.
+    - `lights`: one or several.
+    - `templates`: number per material, of which each pixel uses one, chosen at random (the paper does not say
+      which). A single one has no noise, takes less time, and is lopsided in the same way everywhere.
+      `blend`: use all of them for every sample, instead. This has less noise, and takes as much longer as
+      there are templates.
+    - `photons`: keep this many of each template's brightest photons, scaled to the energy of all. By default
+      all.
+    - `occlusion`: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
+      each segment taken at its far end; materials and the lit side have soft edges, and the image is
+      differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
+      points. The gradient with respect to λ, the light and the camera is then wrong, since it misses photons
+      that become hidden or change their material.
+    - `reach`: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
+      for thin parts in front of others.
+    - `cutoff`: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
+      misses the photons that are skipped.
+    - `seed`: of the templates, and of their choice for each pixel.
+    - `packets`, `threshold`, `threshold_on`: of the templates, see `scatterer_template`.
+    - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light of
+      all templates is computed once and then fetched, as long as volume, transfer function and lighting stay
+      the same; if any of them is traced, it is computed for each image. It carries no gradient.
+    - `levels`: of the templates' trees; required if an opacity is traced.
+    - `given`: templates to use instead of simulated ones, with leading axes (materials, templates). Their
+      lengths and intensities are used as they are, so that nothing depends on the materials' mean free paths.
+
+    Templates are simulated for each image from the materials' current parameters, so that these have
+    gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
+    show, since invisible points are not lit. Where it fails, and where not: `experiments/stability.py`, "long
+    mean free paths", "short mean free paths".
+
+    **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
+    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for templates or
+    a grid that do not fit into memory.
+    """
+
+    materials: tuple[Material, ...]
+    lights: tuple[Light, ...]
+    given: ScattererTemplate | None
+    cutoff: Float[Array, ""] | None
+    templates: int = eqx.field(static=True)
+    blend: bool = eqx.field(static=True)
+    photons: int = eqx.field(static=True)
+    occlusion: Occlusion = eqx.field(static=True)
+    reach: tuple[float, ...] = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+    packets: int = eqx.field(static=True)
+    threshold: float = eqx.field(static=True)
+    threshold_on: ThresholdOn = eqx.field(static=True)
+    levels: int = eqx.field(static=True)
+    baked: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        materials: Material | Sequence[Any],
+        lights: Light | tuple[Light, ...] | Any,
+        *,
+        templates: int = 8,
+        blend: bool | Any = False,
+        photons: int | None = None,
+        occlusion: Occlusion | Any = "soft",
+        reach: Sequence[float] = (2.0, 4.0),
+        cutoff: float | None = None,
+        seed: int = 0,
+        baked: int | bool | Any = False,
+        packets: int = 4,
+        threshold: float = 0.01,
+        threshold_on: ThresholdOn | Any = "photon",
+        levels: int | None = None,
+        given: ScattererTemplate | Any | None = None,
+    ):
+        self.materials, self.lights = materials_of(materials), lights_of(lights)
+        self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
+        if occlusion not in get_args(Occlusion):
+            raise ValueError(f"occlusion must be one of {', '.join(get_args(Occlusion))}; got {occlusion!r}.")
+        self.occlusion, self.reach, self.seed = occlusion, _checked_reach(reach), integer("seed", seed, 0)
+        if cutoff is None:
+            cutoff = 0.02 if occlusion == "hard" else 0.0
+        self.cutoff = None
+        if is_traced(cutoff) or cutoff != 0:
+            self.cutoff = number("cutoff", cutoff, above=0, below=1)
+        # True: 64 nodes, fine enough for light that scatters over several voxels
+        self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
+        tree = PacketTree.checked(packets, threshold, threshold_on)
+        self.packets, self.threshold, self.threshold_on = tree.packets, tree.threshold, threshold_on
+        self.given = given
+        if given is not None:
+            _check_given(given, len(self.materials))
+            self.templates, self.levels = given.intensity.shape[1], 0
+            available = given.intensity.shape[-1]
+        else:
+            self.levels = tree.levels_of(self.materials, levels)
+            available = tree.capacity(self.levels)
+            if not is_traced([each.opacity for each in self.materials]):
+                available = min(available, max(map(tree.most_photons, self.materials)))
+        self.photons = available if photons is None else min(available, integer("photons", photons, 1))
+
+    @property
+    def farthest_read(self) -> float | None:
+        if self.baked:
+            return None
+        offset = np.asarray(self.simulated(blend=self.blend).offset)
+        indices = [float(material.refractive_index) for material in self.materials]
+        stretched = max(indices) / min(indices)  # by refraction
+        return float(np.max(np.linalg.norm(offset, axis=-1))) * max(1.0, *self.reach) * stretched
+
+    def for_image(self, around: Surroundings) -> Shading:
+        if self.baked:
+            return _baked(self, around).for_image(around)
+        return self._by_photons(blend=self.blend, cutoff=self.cutoff)
+
+    def simulated(self, *, blend: bool) -> ScattererTemplate:
+        """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
+        each material."""
+        if self.given is not None:
+            templates = self.given
+        else:
+            templates = scatterer_templates(
+                self.materials,
+                self.seed,
+                count=self.templates,
+                packets=self.packets,
+                threshold=self.threshold,
+                threshold_on=self.threshold_on,
+                levels=self.levels,
+            ).normalized()  # restores the energy that the threshold has cut off
+        if not blend:
+            return templates.brightest(self.photons)
+        blended = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
+        return blended.brightest(self.photons * self.templates)
+
+    def _by_photons(self, *, blend: bool, cutoff: Float[Array, ""] | None) -> PhotonShading:
+        return PhotonShading(
+            self.materials,
+            self.lights,
+            self.simulated(blend=blend),
+            optics_of(self.materials),
+            cutoff,
+            blended=self.templates if blend else 1,
+            given=self.given is not None,
+            occlusion=self.occlusion,
+            reach=self.reach,
+            seed=self.seed,
+        )
+
+
+def _checked_reach(reach: Any) -> tuple[float, ...]:
+    fault = ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
+    try:
+        multiples = tuple(float(each) for each in reach)
+    except TypeError as other:
+        raise fault from other
+    if not all(b > a for a, b in zip((1.0, *multiples), (*multiples, math.inf), strict=True)):
+        raise fault
+    return multiples
+
+
+def _check_given(given: Any, materials: int) -> None:
+    if not isinstance(given, ScattererTemplate):
+        raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")
+    if given.intensity.ndim != 3 or given.intensity.shape[0] != materials:
+        raise ValueError(
+            f"given must hold templates of {materials} materials, "
+            f"with intensities of shape (materials, templates, n); got {given.intensity.shape}."
+        )
+
+
+@eqx.filter_jit
+def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
+    nodes = nodes_for(around.volume, lighting.baked)  # checks the memory before templates are simulated
+    return bake(lighting._by_photons(blend=True, cutoff=None), around, nodes)
+
+
+def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:
+    """The lighting, with light that is to be baked computed once for all images of a scene; where anything is
+    traced, it is left to `for_image`."""
+    if isinstance(lighting, Deferred):
+        return Deferred(with_baked_light(lighting.lighting, volume, transfer, march))
+    if not isinstance(lighting, ScattererTemplates) or not lighting.baked:
+        return lighting
+    # of the march, only the transforms that locate points affect the light
+    spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
+    leaves, tree = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
+    if is_traced(leaves, volume.data):
+        return lighting
+    cache = memoized(volume.data, _bake_cache)
+    entry = cache.get(tree)
+    if entry is None or not all(_same(a, b) for a, b in zip(entry[0], leaves, strict=True)):
+        cache.clear()
+        with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
+            around = Surroundings(volume, transfer, march.locate(volume))
+        cache[tree] = entry = leaves, computed_now(_baked, lighting, around)
+    return entry[1]
+
+
+def _bake_cache(_: Array) -> dict[Any, Any]:
+    """Cache of a volume's baked light: the last one only, keyed by its other inputs."""
+    return {}
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two leaves are certainly equal; large ones, such as labels, only if they are the same array."""
+    return a is b or (np.size(a) <= 2**16 and np.array_equal(np.asarray(a), np.asarray(b)))
