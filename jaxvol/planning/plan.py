@@ -10,18 +10,23 @@ from jaxtyping import Array, Bool
 
 from .._util.checks import described, flag, integer
 from ..arguments import check_arguments
+from ..bricks import VoxelSource, render_bricks
+from ..bricks.opening import Openable
 from ..compositing.compositing import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
+from ..engine.driver import render_scene
+from ..engine.scene import Scene
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
 from ..march.transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
-from ..scene.rendering import Rendering
+from ..scene.rendering import BrickReport, Rendering
 from ..scene.space import Space, median_node_distance
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
+from .memory import read_within, with_bricks
 from .probe import Probe, Setting, Truth
 from .storage import stored
 from .trials import COARSEST, RAY, Trial, Trials
@@ -61,6 +66,8 @@ voxels: the median of 21 images of `experiments.planning`, between 0.18 and 0.72
 HALVED = 3
 """How often the step is halved at most because light changes along a ray."""
 
+UNPROVEN = "not proven by a copy; kept"
+
 DECIDED = AdaptiveSampling, EarlyTermination, SpaceLeaping
 """Transforms that a plan decides on, besides `AlphaCorrection` at the exit."""
 
@@ -76,13 +83,19 @@ class Part(NamedTuple):
 class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
-    - `march`, `volume`, `lighting`: what to pass to `render`.
+    - `march`, `volume`, `lighting`, `compositing`: what to pass to `render`. Where `bricks` is given,
+      `volume` is only the copy that was planned with.
     - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels; where
       nothing could be proven to be within the tolerance, just above it.
     - `seconds`: predicted for one image on this machine, once compiled, to within a factor of some 2.
       `samples`: predicted for each pixel.
     - `parts`: what was kept or left out, and why.
     - `probed`: seconds that planning took, compilation included.
+    - `source`, `memory`: the volume and the budget, bytes, if there was one.
+    - `stride`: of the copy of every n-th voxel that was planned with, to which `error`, `seconds` and
+      `samples` belong; 1 where the volume fits.
+    - `bricks`: what to expect of `render_bricks`, of which nothing is read yet: at most `needed` bricks will
+      be, for this camera and others of as many pixels. None where the volume fits.
     """
 
     march: March
@@ -94,11 +107,31 @@ class Plan(NamedTuple):
     samples: float
     parts: tuple[Part, ...]
     probed: float
+    compositing: Compositing[Any] = Over()
+    source: VoxelSource | None = None
+    memory: int | None = None
+    stride: int = 1
+    bricks: BrickReport | None = None
 
     @property
     def within(self) -> bool:
         """Whether the predicted error is within the tolerance."""
         return self.error <= self.tolerance
+
+    def render(self, transfer: Transfer | Any, camera: Camera | Any, **options: Any) -> Rendering:
+        """The image as planned.
+
+        **Arguments:** `transfer`, `camera`: as for the plan. `options`: `outputs` and `devices`, as for
+        `render`.
+
+        **Returns:** as `render`.
+        """
+        how = {"compositing": self.compositing, "lighting": self.lighting, **options}
+        if self.bricks is not None:
+            return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
+        check_arguments("render(transfer, camera)", transfer=transfer, camera=camera)
+        scene = Scene(self.volume, transfer, camera, self.march, self.compositing, self.lighting)
+        return render_scene(scene, options.get("outputs", "all"), "replay", devices=options.get("devices"))
 
     def __str__(self) -> str:
         transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
@@ -109,17 +142,31 @@ class Plan(NamedTuple):
             f"{rmse}, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a pixel; "
             f"some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
         )
-        wide = max(len(part.name) for part in self.parts)
+        wide = max((len(part.name) for part in self.parts), default=0)
         lines = [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
-        return "\n".join([head, *lines])
+        return "\n".join([*self._memory_lines(), head, *lines])
+
+    def _memory_lines(self) -> list[str]:
+        if self.source is None or self.memory is None:
+            return []
+        size, given = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
+        if self.bricks is None:
+            return [f"in memory: {size} of voxels, and what is made of them, fit into {given}"]
+        return [
+            f"{' x '.join(map(str, self.bricks.counts))} bricks: {size} of voxels, and what is made of them, "
+            f"do not fit into {given}; at most {self.bricks.needed} are read. Planned on a copy of one voxel "
+            f"in {self.stride} along each axis, at 1/{self.stride} of its step; error and time below are the "
+            "copy's"
+        ]
 
 
 def plan(
-    volume: Volume | Any,
+    volume: Volume | Openable,
     transfer: Transfer | Any,
     camera: Camera | Any,
     tolerance: float | Any,
     *,
+    memory: int | Any | None = None,
     transforms: tuple[Transform, ...] | Any = (),
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
@@ -150,6 +197,12 @@ def plan(
       the first of `Lighting.simpler`, of what was given and of `Lighting.smooth` that is within
       the tolerance, compared with the last (as many templates as were given, blended: their own noise does
       not count); the step is halved as long as that changes the lit image by more than what is left.
+    - **bricks**: a volume that does not fit into `memory`, with what `render` makes of it (IN_MEMORY bytes
+      for each byte of voxels), is rendered by `render_bricks`. The march is planned on a copy of every n-th
+      voxel along each axis, and its step divided by n. That is cautious where the volume is smooth, but the
+      error is that of the copy: detail finer than n voxels has been seen in samples only. A copy does not
+      prove what is empty, so that `AlphaCorrection` and `SpaceLeaping` are kept. Where the smallest bricks,
+      with what a ray may read around them, do not fit, the step is halved, up to four times.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
     estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
@@ -159,8 +212,11 @@ def plan(
 
     **Arguments:**
 
-    - `volume`, `transfer`, `camera`: the scene. An image of another camera needs a plan of its own.
+    - `volume`: a `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
+    - `transfer`, `camera`: as for `render`. An image of another camera needs a plan of its own.
     - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
+    - `memory`: bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
+      quarter of the device's memory otherwise.
     - `transforms`: those that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
       kept.
     - `compositing`, `lighting`: as for `render`.
@@ -177,9 +233,13 @@ def plan(
     takes images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
 
     **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
-    (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
+    (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides; for a source that
+    `bricks.source_of` refuses; and for less memory than a copy or the smallest bricks take.
     """
     begun = time.perf_counter()
+    source, stride = None, 1
+    if memory is not None or not isinstance(volume, Volume):
+        volume, source, memory, stride = read_within(volume, memory)
     order = "plan(volume, transfer, camera, tolerance)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
     gradients = flag("gradients", gradients)
@@ -193,7 +253,7 @@ def plan(
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
 
     over = isinstance(setting.compositing, Over)
-    proven, parts = _proven(visible, space, given)
+    proven, parts = _proven(visible, space, given, copy=stride > 1)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
     voxel = float(median_node_distance(space, visible.shape))
 
@@ -230,9 +290,25 @@ def plan(
         setting, rounding, said = stored(probe, setting._replace(lighting=lit), chosen.march, allowed)
     parts += [Part(*each) for each in said]
     seconds = _seconds(trials, chosen) + light_seconds
-    taken = time.perf_counter() - begun
+    bricks = None
+    if source is not None and stride > 1:
+        how = memory, stride, scene.compositing, lit
+        march, bricks = with_bricks(source, transfer, camera, march, *how)
     return Plan(
-        march, setting.volume, lit, tolerance, error + rounding, seconds, chosen.samples, tuple(parts), taken
+        march=march,
+        volume=setting.volume,
+        lighting=lit,
+        tolerance=tolerance,
+        error=error + rounding,
+        seconds=seconds,
+        samples=chosen.samples,
+        parts=tuple(parts),
+        probed=time.perf_counter() - begun,
+        compositing=scene.compositing,
+        source=source,
+        memory=memory,
+        stride=stride,
+        bricks=bricks,
     )
 
 
@@ -280,26 +356,28 @@ def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx
 
 
 def _proven(
-    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...]
+    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...], *, copy: bool = False
 ) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that proofs decide on, from the blocks that may hold anything visible."""
+    """Transforms that proofs decide on, from the blocks that may hold anything visible. `copy`: these are of
+    a copy, which does not prove that there is nothing in between."""
     found: list[Transform] = []
     parts = []
     at_faces = space.visible_at_faces(visible)
     faces = sum(map(bool, at_faces))
     if any(isinstance(each, AlphaCorrection) for each in given):
         parts.append(Part("AlphaCorrection", True, "part of the scene"))
-    elif faces:
+    elif faces or copy:
         cut = "" if len(at_faces) == 6 else " and cuts"
         why = f"something may be visible at {faces} of the volume's {len(at_faces)} faces{cut}"
-        parts.append(Part("AlphaCorrection", True, why))
+        parts.append(Part("AlphaCorrection", True, why if faces else UNPROVEN))
         found.append(AlphaCorrection())
     else:
         parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
     empty = float(np.mean(~np.asarray(visible)))
     leaps = empty >= EMPTY
-    parts.append(Part("SpaceLeaping", leaps, f"{empty:.1%} of the blocks hold nothing visible"))
-    return (*found, *((SpaceLeaping(),) if leaps else ())), parts
+    why = f"{empty:.1%} of the blocks hold nothing visible"
+    parts.append(Part("SpaceLeaping", leaps or copy, why if leaps or not copy else UNPROVEN))
+    return (*found, *((SpaceLeaping(),) if leaps or copy else ())), parts
 
 
 def _marched(trials: Trials, parts: list[Part], *, lit: bool, once: bool) -> tuple[Trial, Truth]:
