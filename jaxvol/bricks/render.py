@@ -157,7 +157,8 @@ def render_bricks(
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
     place = {"spacing": spacing, "origin": origin}
     traced = {name: value for name, value in place.items() if is_traced(value)}
-    levels = levels_of(source, **{name: None if name in traced else place[name] for name in place}, **options)
+    known = {name: value for name, value in place.items() if name not in traced}
+    levels = levels_of(source, **known, **options)
     if traced and len(levels) > 1:
         raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
     room = budget(memory)

@@ -6,25 +6,23 @@ import operator
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, TypeAlias, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from .._util.axes import XYZ, Axes, permuted
+from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, described, finite_array, integer
-from .._util.voxels import DTYPES, WHOLE, check_shape, check_type
+from .._util.voxels import check_shape
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
+from .conversion import Box, converted, voxel_type
 
 
 Result = TypeVar("Result")
 
 Triple: TypeAlias = tuple[float, float, float]
-
-Box: TypeAlias = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 """Three voxel indices along x, y, z, checked at run time."""
@@ -32,7 +30,7 @@ Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 SPACE = ("x", "y", "z")
 
 AT_ONCE = 2**23
-"""Bytes of storage that are read at a time: a larger box is read in layers."""
+"""Bytes of storage that are read at a time: a larger box is read in parts."""
 
 PAGE = 2**12
 """Bytes of a memory map that are read beside a row's own if only a part of it is: the pages at its ends."""
@@ -187,9 +185,9 @@ class VoxelSource:
             return converted(self._stored(box, axes), box, axes, self.name)
         self.check_unchanged()
         voxels = empty_array(permuted([b - a for a, b in zip(*box, strict=True)], axes), self.dtype)
-        for layer in self._layers_of(box):
-            place = [slice(a - x, b - x) for a, b, x in zip(*layer, box[0], strict=True)]
-            voxels[permuted(place, axes)] = converted(self._stored(layer, axes), layer, axes, self.name)
+        for part in self.parts(box, AT_ONCE):
+            place = [slice(a - x, b - x) for a, b, x in zip(*part, box[0], strict=True)]
+            voxels[permuted(place, axes)] = converted(self._stored(part, axes), part, axes, self.name)
         if self._map is not None:
             self._map.forget()
         return voxels
@@ -234,21 +232,23 @@ class VoxelSource:
             )
         return moved
 
-    def _layers_of(self, box: Box) -> Iterator[Box]:
-        """A box, cut between chunks, along the axis on which it touches the most of them, into parts of no
-        more than AT_ONCE bytes of storage, or of single layers of chunks."""
-        low, high = box
-        counts = [(b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)]
-        axis = max(self.order, key=lambda axis: counts[axis])
-        chunk = self.chunks[axis]
-        of_layer = self.bytes_touched(permuted([b - a for a, b in zip(low, high, strict=True)], XYZ))
-        of_layer //= counts[axis]
-        thick = chunk * max(1, AT_ONCE // max(of_layer, 1))
-        ends = [low[axis], *range(low[axis] // chunk * chunk + thick, high[axis], thick), high[axis]]
-        for begin, end in pairwise(ends):
-            first, last = list(low), list(high)
-            first[axis], last[axis] = begin, end
-            yield permuted(first, XYZ), permuted(last, XYZ)
+    def parts(self, box: Box, most: int) -> Iterator[Box]:
+        """A box, cut between chunks into parts that are stored in at most so many bytes, or in one chunk. Of
+        what is not stored in chunks, planes with more are cut into rows. In the order of storage."""
+        extent, item = list(self.chunks), max(self.stored_type.itemsize, self.dtype.itemsize)
+        middle = self.order[1]
+        while not self.chunked and extent[middle] > 1 and math.prod(extent) * item > most:
+            extent[middle] = -(-extent[middle] // 2)
+        for axis in reversed(self.order):  # rows first
+            while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= most:
+                extent[axis] = min(2 * extent[axis], self.shape[axis])
+        pieces = []
+        for low, high, chunk, size in zip(*box, self.chunks, extent, strict=True):
+            begin = low - low % min(chunk, size)
+            pieces.append(list(pairwise([low, *range(begin + size, high, size), high])))
+        for piece in product(*permuted(pieces, self.order)):
+            x, y, z = permuted(piece, inverse(self.order))
+            yield (x[0], y[0], z[0]), (x[1], y[1], z[1])
 
     def _box(self, low: Corner, high: Corner) -> Box:
         try:
@@ -395,62 +395,3 @@ def check_is_array(thing: Any) -> None:
             "source must be an array, a Volume, a VoxelSource, or the path of a file or folder; got "
             f"{described(thing)}."
         )
-
-
-def voxel_type(stored: np.dtype) -> np.dtype:
-    """The type in which voxels stored as `stored` are read: one of `Volume`'s types, in native byte order.
-
-    Booleans become uint8. Integers of 32 and 64 bits become float32, which holds them exactly up to 2**24.
-    float64 is kept if JAX's 64-bit types are enabled, and becomes float32 otherwise.
-
-    **Raises:** `ValueError` for a type that no volume has, such as a complex one.
-    """
-    check_type(stored)
-    if stored.kind == "b":
-        return np.dtype(np.uint8)
-    if stored.name in DTYPES:
-        return stored.newbyteorder("=")
-    return np.dtype(np.float32) if stored.kind in "iu" else np.dtype(jnp.result_type(float))
-
-
-def comparable(voxels: np.ndarray) -> np.ndarray:
-    """16-bit floats as float32, of which NumPy finds extremes many times faster."""
-    return voxels if voxels.dtype.kind in "iu" or voxels.itemsize > 2 else voxels.astype(np.float32)
-
-
-def range_of(voxels: np.ndarray) -> tuple[float, float]:
-    """Least and greatest voxel; NaN if any is, and infinite if any is: unlike a mask, they take no memory."""
-    with np.errstate(invalid="ignore"):
-        ranges = [(layer.min(), layer.max()) for layer in map(comparable, voxels)]
-        return float(np.min(ranges)), float(np.max(ranges))
-
-
-def converted(voxels: np.ndarray, box: Box, axes: Axes, name: str) -> np.ndarray:
-    """Voxels as `voxel_type` says, and C-contiguous. `box`: where they were read. `axes`: of the array.
-
-    **Raises:** `ValueError` for NaN, infinity, and integers that float32 does not hold exactly, with the
-    place of the first.
-    """
-    dtype = voxel_type(voxels.dtype)
-    if dtype == np.float32 and voxels.dtype.kind in "iu":
-        least, most = WHOLE["float32"]
-        low, high = int(voxels.min()), int(voxels.max())
-        if low < least or high > most:
-            raise ValueError(
-                f"{name}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; "
-                f"got {voxels.dtype} from {low} to {high} in the box {box[0]} to {box[1]}. Subtract an "
-                "offset, or rescale them."
-            )
-    with np.errstate(over="ignore"):  # overflow to infinity is rejected below
-        voxels = np.ascontiguousarray(voxels, dtype)
-    if dtype.kind in "iu":
-        return voxels
-    if not np.all(np.isfinite(range_of(voxels))):
-        wrong = ~(abs(voxels) < np.inf)
-        first = np.unravel_index(np.argmax(wrong), voxels.shape)
-        place = tuple(start + int(first[axes.index(axis)]) for axis, start in enumerate(box[0]))
-        raise ValueError(
-            f"{name}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite in the "
-            f"box {box[0]} to {box[1]}, the first at {place}. Replace them first."
-        )
-    return voxels

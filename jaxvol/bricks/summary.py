@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from .._util.axes import XYZ, Axes, inverse, permuted
+from .._util.axes import Axes, inverse, permuted
 from .._util.memory import give_back
 from ..scene.occupancy import BLOCK, Blocks, widened
+from .conversion import Box, comparable
 from .grid import BrickGrid
-from .sources import Box, Corner, VoxelSource, comparable, in_background
+from .sources import Corner, VoxelSource, in_background
 
 
 CELL = 16
@@ -153,31 +154,13 @@ def scan(source: VoxelSource, cell: int, *, memory: int = 2**28, progress: Progr
 def _parts(source: VoxelSource, memory: int) -> Iterator[tuple[Box, np.ndarray]]:
     """All voxels, in boxes of whole chunks, each read while the one before is looked at, with their axes in
     the order of storage."""
-    boxes = list(_boxes(source, min(memory // COPIES, MOST)))
+    boxes = list(source.parts(((0, 0, 0), source.shape), min(memory // COPIES, MOST)))
     coming = in_background(source.read, *boxes[0], source.order)
     for box, following in zip(boxes, [*boxes[1:], None], strict=True):
         voxels = coming.result()
         if following is not None:
             coming = in_background(source.read, *following, source.order)
         yield box, voxels
-
-
-def _boxes(source: VoxelSource, most: int) -> Iterator[Box]:
-    """Boxes of whole chunks that hold all voxels, of no more than `most` bytes if a chunk has no more. What
-    is not stored in chunks is cut into rows if a plane has more."""
-    extent, item = list(source.chunks), source.dtype.itemsize
-    if not source.chunked:
-        middle = source.order[1]
-        while extent[middle] > 1 and math.prod(extent) * item > most:
-            extent[middle] = -(-extent[middle] // 2)
-    for axis in reversed(source.order):  # rows first
-        while extent[axis] < source.shape[axis] and 2 * math.prod(extent) * item <= most:
-            extent[axis] = min(2 * extent[axis], source.shape[axis])
-    ends = [range(0, n, step) for n, step in zip(source.shape, extent, strict=True)]
-    for low in product(*permuted(ends, source.order)):
-        first = permuted(low, inverse(source.order))
-        last = [min(a + e, n) for a, e, n in zip(first, extent, source.shape, strict=True)]
-        yield first, permuted(last, XYZ)
 
 
 def _over_blocks(

@@ -27,8 +27,9 @@ from ..scene.space import Ray, Space
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.xla import compiled
 from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
+from .conversion import range_of
 from .grid import BrickGrid, Node
-from .sources import VoxelSource, in_background, range_of
+from .sources import VoxelSource, in_background
 from .split import Margin, bytes_of, cheapest, check_stored, divided, fits, split, stored_of, stored_shape
 from .summary import Summary, summary_of
 

@@ -1,5 +1,6 @@
 """Does a plan with a budget choose bricks where they are needed, and only there?"""
 
+import sys
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,8 +11,8 @@ import jaxvol as jv
 from jaxvol.bricks import source_of
 from jaxvol.compositing.compositing import Over
 from jaxvol.metrics import rmse
+from jaxvol.planning.choices import proven_transforms
 from jaxvol.planning.memory import IN_MEMORY, read_within, with_bricks
-from jaxvol.planning.plan import _proven
 from jaxvol.scene.space import Affine
 
 from ..scenes import around, scaled_phantom, soft_transfer
@@ -55,9 +56,9 @@ def test_bricks_are_planned_where_the_volume_does_not_fit(path):
 def test_a_copy_does_not_prove_that_nothing_is_empty_or_at_the_faces():
     for visible, kept in ((True, ("AlphaCorrection",)), (False, ("SpaceLeaping",))):
         blocks, space = jnp.full((12, 12, 12), visible), Affine(VOLUME)
-        own, _ = _proven(blocks, space, ())
+        own, _ = proven_transforms(blocks, space, ())
         assert tuple(type(each).__name__ for each in own) == kept
-        found, parts = _proven(blocks, space, (), copy=True)
+        found, parts = proven_transforms(blocks, space, (), copy=True)
         assert [type(each).__name__ for each in found] == ["AlphaCorrection", "SpaceLeaping"]
         assert all(part.kept for part in parts)
         assert [part.why for part in parts].count("not proven by a copy; kept") == 1
@@ -83,7 +84,7 @@ def test_a_plan_without_parts_is_printed_and_rendered():
     given = soft_transfer(), around(VOLUME)
     image = jv.render(VOLUME, *given, march)
     np.testing.assert_array_equal(found.render(*given).rgba, image.rgba)
-    with pytest.raises(ValueError, match=r"camera must be .* That is the transfer"):
+    with pytest.raises(ValueError, match=r"transfer must be .* That is the camera"):
         found.render(*given[::-1])
 
 
@@ -98,6 +99,6 @@ BAD: list[tuple[Any, Any, str]] = [
 
 @pytest.mark.parametrize(("source", "memory", "message"), BAD)
 def test_bad_arguments_are_named_before_anything_is_planned(source, memory, message, path, monkeypatch):
-    monkeypatch.setattr("jaxvol.planning.plan.Probe", None)
+    monkeypatch.setattr(sys.modules["jaxvol.planning.plan"], "Probe", None)
     with pytest.raises(ValueError, match=message):
         planned(path if source is None else source, memory)
