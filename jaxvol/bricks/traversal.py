@@ -98,8 +98,8 @@ class Traversal:
     min_stored: Node
     stored: Node
     memory: int
-    rays: Any = None
-    at: Any = None
+    rays: Ray = field(init=False)
+    at: Progress = field(init=False)
     done: int = 0
     loads: list[int] = field(default_factory=list)
     bytes_read: int = 0
