@@ -273,7 +273,7 @@ def plan(
     parts += [Part(*each) for each in said]
     seconds = seconds_of(trials, chosen) + light_seconds
     bricks = None
-    if source is not None and stride > 1:
+    if source is not None and memory is not None and stride > 1:
         how = memory, stride, scene.compositing, lit
         march, bricks = with_bricks(source, transfer, camera, march, *how)
     return Plan(
