@@ -101,12 +101,11 @@ def cheapest_march(trials: Trials, parts: list[Part], *, lit: bool, once: bool) 
     if uniform.kind == "preintegrated":
         parts.append(Part("preintegrated", True, "the midpoint rule would be slower within the tolerance"))
         return uniform, truth
-    if samples <= WORTHWHILE and step >= FAIR:
-        why = f"{samples:.1f} samples a pixel: too few to save any"
-        parts.append(Part("preintegrated, AdaptiveSampling", False, why))
-        return uniform, truth
-    if once:
+    few = samples <= WORTHWHILE and step >= FAIR
+    if few or once:
         why = "not tried for one image: a program of its own takes longer to compile than it saves"
+        if few:
+            why = f"{samples:.1f} samples a pixel: too few to save any"
         parts.append(Part("preintegrated, AdaptiveSampling", False, why))
         return uniform, truth
     others = {
