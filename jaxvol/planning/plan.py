@@ -221,9 +221,9 @@ def plan(
     check_arguments(order, transfer=transfer, camera=camera, lighting=lighting)
     gradients = flag("gradients", gradients)
     once = flag("once", once)
-    source, stride = None, 1
+    source, room, stride = None, None, 1
     if memory is not None or not isinstance(volume, Volume):
-        volume, source, memory, stride = read_within(volume, memory)
+        volume, source, room, stride = read_within(volume, memory)
     check_arguments(order, volume=volume)
     scene = Setting(volume, transfer, compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, (scene, camera))
@@ -273,8 +273,8 @@ def plan(
     parts += [Part(*each) for each in said]
     seconds = seconds_of(trials, chosen) + light_seconds
     bricks = None
-    if source is not None and memory is not None and stride > 1:
-        how = memory, stride, scene.compositing, lit
+    if source is not None and room is not None and stride > 1:
+        how = room, stride, scene.compositing, lit
         march, bricks = with_bricks(source, transfer, camera, march, *how)
     return Plan(
         march=march,
@@ -288,7 +288,7 @@ def plan(
         probed=time.perf_counter() - begun,
         compositing=scene.compositing,
         source=source,
-        memory=memory,
+        memory=room,
         stride=stride,
         bricks=bricks,
     )
