@@ -9,31 +9,28 @@ from collections.abc import Iterator
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol.bricks.cells import Turn
-from jaxvol.bricks.stream import Load, Stream
-from jaxvol.ray import Progress
-from jaxvol.scene.space import Ray
+from jaxvol.bricks.cells import Visit
+from jaxvol.bricks.traversal import Load, Traversal
 
 
-def each_at_once(stream: Stream, rays: Ray, living: list[Progress]) -> Iterator[Load]:
+def each_at_once(traversal: Traversal) -> Iterator[Load]:
     """Each brick with all its cells of each ray, whatever other bricks the ray meets between them:
     `render_bricks(..., method=each_at_once)`."""
-    for brick in stream.order:
-        if not stream.visible[brick]:
+    for brick in traversal.order:
+        if not traversal.visible[brick]:
             continue
-        outside = np.ones(stream.grid.number + 1, bool)
+        outside = np.ones(traversal.grid.number + 1, bool)
         outside[brick] = False
         own = ~outside
         own[-1] = True  # a ray goes on through a gap, in which there is no brick
-        others = jnp.asarray(outside)
-        turn = Turn(jnp.asarray(brick, jnp.int32), others, jnp.asarray(own), others)
-        reached, load = jnp.zeros(rays.length.shape, jnp.int32), None
+        visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(own), jnp.asarray(outside))
+        reached, load = jnp.zeros(traversal.rays.length.shape, jnp.int32), None
         while True:
-            found = stream.cells_in(turn, rays, living[0], reached)
+            found = traversal.cells_in(visit, reached)
             if found is None:
                 break
             if load is None:
-                load = stream.load(brick, found.cells, *stream.around(brick))
+                load = traversal.load(brick, found.cells, *traversal.around(brick))
             else:
                 load = load._replace(cells=found.cells)
             reached = found.reached

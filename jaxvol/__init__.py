@@ -9,7 +9,7 @@ from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
 from .app.automatic import automatic_transfer as automatic_transfer
 from .app.viewer import serve as serve, view as view
-from .bricks import BudgetPlan as BudgetPlan, plan as plan, render_bricks as render_bricks
+from .bricks import render_bricks as render_bricks
 from .compositing.blending import Compositing as Compositing, Over as Over, Weighting as Weighting
 from .compositing.isosurface import Isosurface as Isosurface
 from .compositing.projections import Average as Average, Maximum as Maximum, Minimum as Minimum
@@ -54,7 +54,7 @@ from .march.transforms import (
     ToroidalMap as ToroidalMap,
 )
 from .path_tracing import PathTraced as PathTraced, path_trace as path_trace
-from .planning import Plan as Plan
+from .planning import Plan as Plan, plan as plan
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .scene.camera import Camera as Camera

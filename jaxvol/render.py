@@ -99,6 +99,7 @@ def render(
     if isinstance(march, str):
         if march != "auto":
             raise ValueError(f'march must be a jaxvol March or "auto"; got {march!r}.')
+        check_arguments(order, volume=volume)
         given = PLANNED if tolerance is None else tolerance
         found = plan(volume, transfer, camera, given, compositing=compositing, lighting=lighting)
         if not found.within:

@@ -15,8 +15,8 @@ from jaxvol.scene.space import Path as RayPath
 ROOT = Path(jv.__file__).parent
 
 NAMES = """
-    xla _util scene march lighting compositing ray reference engine planning render path_tracing
-    metrics io bricks fitting app __main__ __init__
+    xla _util scene march lighting compositing ray reference engine io bricks planning render
+    path_tracing metrics fitting app __main__ __init__
 """
 ORDER = [str(name) for name in NAMES.split()]
 """Order of imports, from the volume to the command line: a file imports only entries before its own."""

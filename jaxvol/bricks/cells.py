@@ -1,10 +1,10 @@
-"""Which cells of each ray does a brick take?
+"""Which cells of each ray lie in a brick?
 
 A cell belongs to the brick in which it begins, if samples were not moved. In a grid with straight rays each
 ray meets a brick once, and its cells there follow from where it enters and leaves. Where rays are curved, a
-ray may come back to a brick that it has left. Bricks are then taken in turn, and a ray goes on while it is
-in this one, or in one that was taken before: those cells are taken from the overlap, by which a brick is
-read larger than it is (Kim, Kwon and Shin 2008).
+ray may come back to a brick that it has left. Bricks are then visited one after the other, and a ray goes on
+while it is in this one, or in one that was visited before: those cells are read with the brick, which is the
+overlap of Kim, Kwon and Shin 2008.
 """
 
 from typing import NamedTuple
@@ -27,8 +27,9 @@ from .grid import BrickGrid
 SLACK = 3
 """Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more
 for rounding."""
+
 CHUNK = 8
-"""Cells of a ray that are looked at at a time."""
+"""Cells of a ray that are tested at a time."""
 
 
 def reach(march: March, segment: int) -> int:
@@ -36,28 +37,25 @@ def reach(march: March, segment: int) -> int:
     return SLACK + max(segment, longest_run(march))
 
 
-class Turn(eqx.Module):
-    """One brick's turn.
+class Visit(eqx.Module):
+    """One brick, and where rays may go while it is in memory.
 
     - `brick`: its number.
-    - `over`: bricks over which rays move to it: those that are empty.
-    - `through`: bricks through which they go on from it: itself, those that are empty, and those that have
-      had their turn, unless it is only the brick that counts.
-    - `empty`: bricks of which no voxel is needed.
+    - `passable`: bricks through which rays go on from it, itself included.
+    - `empty`: bricks of which no voxel is needed, through which rays move to it.
 
-    All three have an entry for each brick, and one more for what lies outside of the volume.
+    The last two have an entry for each brick, and one more for what lies outside of the volume.
     """
 
     brick: Int[Array, ""]
-    over: Bool[Array, " bricks"]
-    through: Bool[Array, " bricks"]
+    passable: Bool[Array, " bricks"]
     empty: Bool[Array, " bricks"]
 
 
-class Found(NamedTuple):
-    """Cells of rays (tiles, groups, rays) in a brick's turn.
+class BrickCells(NamedTuple):
+    """Cells of rays (tiles, groups, rays in a group) that are marched while a brick is in memory.
 
-    - `cells`: from the first to the last one, which lie in the brick, the overlap, or what is empty.
+    - `cells`: from the first to the last one, which lie in bricks that are passable.
     - `reached`: index to which each ray has then come.
     - `low`, `high`: a box of grid coordinates that holds all points of these cells.
     - `any`: whether there are any cells.
@@ -70,25 +68,25 @@ class Found(NamedTuple):
     any: Bool[Array, ""]
 
 
-def widened(cells: CellRange) -> CellRange:
-    """The cells, with those before and behind them whose samples may have been moved to there."""
+def padded(cells: CellRange) -> CellRange:
+    """The cells, and those around them whose samples may be shifted into them."""
     some = cells.until > cells.first
     first, until = jnp.maximum(cells.first - SLACK, 0), cells.until + SLACK
     return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
 
 
-def of_straight(
+def straight_cells(
     grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], brick: Int[Array, ""]
 ) -> CellRange:
-    """The cells of straight rays in a brick, and those whose samples may have been moved to there; none of
-    rays that miss it, or are not alive."""
+    """The cells of straight rays in a brick, and those whose samples may be shifted into it; none of rays
+    that miss it, or are not alive."""
     near, far, hit = _within(grid, march, rays, brick)
     first, until = jnp.ceil(near).astype(jnp.int32) - SLACK, jnp.floor(far).astype(jnp.int32) + 1 + SLACK
     none, hit = jnp.zeros_like(first), alive & hit
     return CellRange(jnp.where(hit, jnp.maximum(first, 0), none), jnp.where(hit, until, none))
 
 
-def behind_straight(
+def first_behind(
     grid: BrickGrid, march: March, rays: Ray, order: Int[Array, " bricks"], number: Int[Array, ""]
 ) -> Int[Array, "*rays"]:
     """Of straight rays, the first cell that begins behind the first `number` bricks of an order in which each
@@ -120,18 +118,19 @@ def _within(
     return jnp.clip(near / march.step, 0, last), jnp.clip(far / march.step, 0, last), hit
 
 
-def of_curved(
+def curved_cells(
     grid: BrickGrid,
     march: March,
     rays: Ray,
     at: Progress,
     reached: Int[Array, "*rays"],
-    turn: Turn,
+    visit: Visit,
     beyond: int,
-) -> Found:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other. `at`: where the
-    march has come to; `reached`: to which cell of each ray its bricks have been found. `beyond`: steps before
-    and behind its cells that `low` and `high` are to hold, too."""
+) -> BrickCells:
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other.
+
+    - `at`: where the march has come to. `reached`: to which cell of each ray its bricks have been found.
+    - `beyond`: steps before and behind its cells that `low` and `high` are to hold, too."""
     alive = ~at.finished
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
@@ -172,7 +171,7 @@ def of_curved(
             at = bricks(index[None] + number)
             stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
             passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
-            seen = passed & jnp.any(~turn.empty[at], axis=0) & going[None]
+            seen = passed & jnp.any(~visit.empty[at], axis=0) & going[None]
             last = jnp.maximum(last, jnp.max(jnp.where(seen, index[None] + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
             return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
@@ -181,19 +180,19 @@ def of_curved(
         index, last, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), more, start)
         return index, last
 
-    first, _ = while_in(turn.over, reached, alive)
-    here = jnp.any(bricks(first[None])[:, 0] == turn.brick, axis=0)
-    # where its points lie in several bricks, the first one to have its turn takes the cell
-    mine = alive & here & ahead(first[None])[0]
-    _, until = while_in(turn.through, first, mine)
+    first, _ = while_in(visit.empty, reached, alive)
+    here = jnp.any(bricks(first[None])[:, 0] == visit.brick, axis=0)
+    # where its points lie in several bricks, the first one that is visited takes the cell
+    enters = alive & here & ahead(first[None])[0]
+    _, until = while_in(visit.passable, first, enters)
     until = jnp.maximum(until, first + 1)
-    cells = CellRange(jnp.where(mine, first, 0), jnp.where(mine, until, 0))
+    cells = CellRange(jnp.where(enters, first, 0), jnp.where(enters, until, 0))
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         index, low, high = state
         index_ = index[None] + number
         coordinate, inside = points(index_)
-        counts = mine[None] & (index_ <= (until + beyond)[None]) & (index_ >= 0)
+        counts = enters[None] & (index_ <= (until + beyond)[None]) & (index_ >= 0)
         low, high = _around(low, high, coordinate, inside & counts[None])
         for end in returns:
             held = [end.within(index_, offset, march.step) & counts for offset in fronts]
@@ -202,9 +201,11 @@ def of_curved(
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)
     _, low, high = jax.lax.while_loop(
-        lambda state: jnp.any(mine & (state[0] <= until + beyond)), widen, (first - beyond, nothing, -nothing)
+        lambda state: jnp.any(enters & (state[0] <= until + beyond)),
+        widen,
+        (first - beyond, nothing, -nothing),
     )
-    return Found(cells, jnp.where(mine, until, first), low, high, jnp.any(mine))
+    return BrickCells(cells, jnp.where(enters, until, first), low, high, jnp.any(enters))
 
 
 class _End(NamedTuple):

@@ -1,4 +1,4 @@
-"""How is a volume split into bricks, and in which order are these rendered?"""
+"""How is a volume divided into bricks, and in which order are these rendered?"""
 
 import math
 from dataclasses import dataclass
@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Vec3, apart
+from ..march.transforms import ToroidalMap
 from ..scene.camera import Camera, axes_of
 from ..scene.space import Space, Straight
 
@@ -55,13 +56,12 @@ class BrickGrid:
         return number
 
     def order(self, space: Space, camera: Camera) -> list[int]:
-        """All bricks, front to back, by the depth of their centres as the camera sees them.
+        """All bricks, front to back, by the depth of their centers.
 
-        Where rays are straight in the grid, no ray meets a brick after one that is behind it in this order:
-        depth is counted in bricks there, as the sum of the distances along the three axes, none of which
-        falls along a ray. (The distance itself would do for bricks of equal size; the last ones may be
-        smaller.) Where rays are curved it is the paper's rule, by distance, and a ray may meet them in
-        another order."""
+        Where rays are straight in the grid, depth is the sum of the distances along the three axes, counted
+        in bricks. None of the three falls along a ray, so that no ray meets a brick after one that is behind
+        it. Where rays are curved, depth is the distance from the camera, as in the paper, and a ray may meet
+        bricks in another order."""
         index = np.stack(np.unravel_index(np.arange(self.number), self.counts), axis=-1)
         centers = (index + 0.5) * self.size
         eye, (_, _, forward) = camera.position, axes_of(camera)
@@ -76,9 +76,8 @@ class BrickGrid:
                 depth = np.sum(np.abs(centers - start) / self.size, axis=-1)
         else:
             x, y, z = (jnp.asarray(c) for c in np.minimum(centers, np.asarray(self.shape) - 1).T)
-            toward = np.stack(
-                [np.asarray(p) for p in jax.vmap(space.point)((x, y, z))], axis=-1
-            ) - np.asarray(eye)
+            points = np.stack([np.asarray(c) for c in jax.vmap(space.point)((x, y, z))], axis=-1)
+            toward = points - np.asarray(eye)
             depth = toward @ np.asarray(forward) if parallel else np.linalg.norm(toward, axis=-1)
         return np.argsort(depth, kind="stable").tolist()
 
@@ -87,3 +86,45 @@ def is_straight(space: Space) -> bool:
     """Whether rays are straight in the grid."""
     zero, one = jnp.zeros(()), jnp.ones(())
     return isinstance(space.path((zero, zero, zero), (one, zero, zero)), Straight)
+
+
+def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
+    """By how much bricks must overlap at their curved faces along γ, so that each ray meets each brick once.
+
+    A ray may enter a brick, pass through the one that lies nearer to the probe, and come back. If the farther
+    brick includes the cap between the curved face and its chord, it need not be rendered again. At a face at
+    the distance l from the apex the cap has the height K = l - l cos(θ/2), where θ is the angle of a brick's
+    fan; along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger
+    counts. It suffices where the brick beyond a face is rendered before the one within, and rays from side to
+    side of a brick need all of it: with less, they are blended in the wrong order. `render_bricks` does not
+    use it: how far each brick is read is found from the rays.
+
+    Where it fails, and where not: `experiments/stability.py`, "overlap under k".
+
+    **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
+
+    **Returns:** K* of each face between two bricks, from the probe outwards, voxels.
+
+    Source: Kim, Kwon and Shin 2008, section 3.2.
+    """
+    cells = [n - 1 for n in grid.shape]
+    beta, sigma, gamma = (
+        np.asarray(ends, float) for ends in (probe.beta_range, probe.sigma_range, probe.gamma_range)
+    )
+    sweep, fan, depth = (
+        np.ptp(ends) * size / n for ends, size, n in zip((beta, sigma, gamma), grid.size, cells, strict=True)
+    )
+    at: Float[np.ndarray, " faces"] = gamma[0] + depth * np.arange(1, grid.counts[2])
+    from_apex, from_axis = float(probe.b) + at, float(probe.a) + float(probe.b) + at
+    height = np.maximum(from_apex * (1 - np.cos(fan / 2)), from_axis * (1 - np.cos(sweep / 2)))
+    return (np.maximum(height, 0) * cells[2] / np.ptp(gamma)).tolist()
+
+
+def share(overlaps: list[float], nodes: int) -> float:
+    """What the overlap adds to a volume: whole layers at each face.
+
+    **Arguments:** `overlaps`: of each face, from `overlap_of`. `nodes`: of the volume along γ.
+
+    **Returns:** the part of the volume that is read twice.
+    """
+    return sum(math.ceil(overlap) for overlap in overlaps) / nodes

@@ -1,8 +1,9 @@
-"""Which source, and which levels of detail, does a user mean?"""
+"""Which source, and which levels of detail, does a user mean, and which level is fine enough for a view?"""
 
 import math
 import os
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -14,19 +15,17 @@ from .._util.named_axes import along_xyz, is_named
 from .._util.npy import npy_header
 from .._util.voxels import check_shape
 from ..io.formats.raw import raw_header
+from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume
-from .ome_zarr import levels_in
-from .sources import Triple, VoxelSource, triple
-from .zarr import is_zarr_array, zarr_array
+from .sources import VoxelSource
+from .zarr import METADATA, is_zarr_array, ome_zarr_levels, zarr_array
 
 
 Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 """A source, a volume, the path of a file or folder, or an array."""
 
-METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs"
-"""Files, of which a Zarr array or group has at least one."""
-
 OF_RAW, OF_ARRAY, OF_ZARR = ("shape", "dtype"), ("axes", "index"), ("axes", "index", "missing")
+OPTIONS = *OF_RAW, *OF_ZARR
 
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:
@@ -84,7 +83,7 @@ def levels_of(
     """
     options = {"shape": shape, "dtype": dtype, "axes": axes, "index": index, "missing": missing}
     options = {name: value for name, value in options.items() if value is not None}
-    place: dict[str, Any] = {"spacing": triple("spacing", spacing), "origin": triple("origin", origin)}
+    place: dict[str, Any] = {"spacing": spacing, "origin": origin}
     if isinstance(thing, str | os.PathLike) and str(thing):
         return _of_path(Path(thing), options, place)
     if isinstance(thing, VoxelSource | Volume):
@@ -95,10 +94,11 @@ def levels_of(
                 f"spacing and origin are those of {described(thing)}; got {place} as well. Leave them out."
             )
         return (source,)
-    _refuse(described(thing), options, () if is_named(thing) else OF_ARRAY)
     if is_named(thing):
-        thing, told = along_xyz(thing)
-        place = {name: triple(name, told.get(name)) if at is None else at for name, at in place.items()}
+        _refuse(described(thing), options, ())
+        thing, own = along_xyz(thing)
+        return (VoxelSource(thing, **_with_own(place, own)),)
+    _refuse(described(thing), options, OF_ARRAY)
     return (VoxelSource(thing, **options, **place),)
 
 
@@ -110,13 +110,17 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
     if path.is_dir():
         return _of_folder(path, options, place)
     name = path.name.lower()
-    if name.endswith((".raw", ".raw.gz")):
+    if name.endswith(".raw"):
         _refuse(str(path), options, OF_RAW)
-        return (_raw(path, **options, **place),)
+        return (_raw(path, Header(options.get("shape"), options.get("dtype")), place),)
     if name.endswith(".npy"):
         _refuse(str(path), options, OF_ARRAY)
         return (_npy(path, **options, **place),)
-    _refuse(str(path), options, ())
+    if name.endswith(".raw.gz"):
+        raise ValueError(
+            f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: "
+            f"gunzip -k {path}."
+        )
     raise ValueError(
         f"path: {path} is not of a kind that is read in parts: .raw, .npy, or the folder of a Zarr array or "
         "an OME-Zarr image. If it fits into memory, pass jv.load(path), or for ultrasound the volume and "
@@ -124,23 +128,12 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
     )
 
 
-def _raw(
-    path: Path, shape: Any = None, dtype: Any = None, spacing: Triple | None = None, origin: Any = None
-) -> VoxelSource:
-    if path.name.lower().endswith(".gz"):
-        raise ValueError(
-            f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: "
-            f"gunzip -k {path}."
-        )
-    size, stored, fields = raw_header(path, Header(shape, dtype), 48)
+def _raw(path: Path, header: Header, place: dict[str, Any]) -> VoxelSource:
+    size, stored, own = raw_header(path, header, 48)
     check_size(path, file_size(path), math.prod(size) * stored.itemsize)
     check_shape(size)
     mapped = np.memmap(path, stored, "r", shape=size, order="F")
-    spacing, origin = (
-        triple(name, fields.get(name)) if given is None else given
-        for name, given in (("spacing", spacing), ("origin", origin))
-    )
-    return VoxelSource(mapped, spacing, origin, name=str(path))
+    return VoxelSource(mapped, **_with_own(place, own), name=str(path))
 
 
 def _npy(path: Path, **options: Any) -> VoxelSource:
@@ -163,7 +156,12 @@ def _of_folder(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tu
         return (zarr_array(path, **options, **place),)
     if "axes" in options:
         raise ValueError(f"axes: the metadata of the OME-Zarr image {path} name its axes. Leave it out.")
-    return levels_in(path, **options, **place)
+    return ome_zarr_levels(path, **options, **place)
+
+
+def _with_own(place: dict[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Spacing and origin as given, or else as the data say."""
+    return {name: own.get(name) if given is None else given for name, given in place.items()}
 
 
 def _refuse(what: str, options: dict[str, Any], allowed: tuple[str, ...]) -> None:
@@ -172,3 +170,27 @@ def _refuse(what: str, options: dict[str, Any], allowed: tuple[str, ...]) -> Non
             f"{', '.join(unused)}: {what} takes no such option; {', '.join(OF_RAW)} belong to raw files, "
             f"{', '.join(OF_ARRAY)} to arrays and .npy files, {', '.join(OF_ZARR)} to paths of Zarr arrays."
         )
+
+
+def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:
+    """The coarsest level whose voxels are no larger than a pixel at the volume's corner nearest to the image
+    plane. An axis along which a level is as fine as the finest does not count against it.
+
+    **Arguments:** `levels`: of the same volume, finest first (`levels_of`). `camera`: the view.
+
+    **Returns:** its index, 0 for the finest; also where the camera is within the volume.
+    """
+    finest = levels[0]
+    width, height = camera.size
+    left, right, low, high = np.asarray(camera.window, float)
+    pixel = min((right - left) / width, (high - low) / height)
+    if camera.parallel_scale is not None:
+        pixel *= float(camera.parallel_scale)
+    else:
+        forward, position = (np.asarray(each, float) for each in (axes_of(camera)[2], camera.position))
+        size = np.array(finest.spacing) * (np.array(finest.shape) - 1)
+        corners = np.array(finest.origin) + np.array(list(product((0, 1), repeat=3))) * size
+        nearest = max(float(np.min((corners - position) @ forward)), 0.0)
+        pixel *= np.tan(np.deg2rad(float(camera.view_angle)) / 2) * nearest
+    allowed = np.maximum(pixel, finest.spacing) * (1 + 1e-6)  # spacings of equal length may be rounded
+    return max(k for k, level in enumerate(levels) if k == 0 or np.all(np.array(level.spacing) <= allowed))

@@ -1,7 +1,7 @@
 """Renders a volume that need not fit into memory, brick by brick."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -48,17 +48,20 @@ from ..xla.compiling import compiled
 from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree, strong
-from .grid import is_straight
-from .levels import level_for
-from .opening import OF_RAW, OF_ZARR, levels_of
-from .owned import render_owned
+from .distributed import render_distributed
+from .grid import Node, is_straight
+from .opening import OPTIONS, level_for, levels_of
 from .sources import VoxelSource
-from .stream import METHODS, Method, Stream
-from .summary import Summary, summary_of
+from .traversal import Method, Request, Traversal
 
+
+METHODS = "overlap", "reload"
 
 Own = Literal["rays", "bricks"]
-"""What devices may own."""
+"""What may be dealt out to devices."""
+
+BATCH = 72
+"""`Tiling.batch` on a CPU. Few rays meet a brick, and the last batch takes as long as its longest ray."""
 
 
 def render_bricks(
@@ -84,16 +87,12 @@ def render_bricks(
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
 
     The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
-    is read. Of each ray it is kept how far it has come. A brick that no ray needs is not read: one in which
-    nothing is visible, outside of the view, or behind what is opaque. The image is that of `render`, lit or
-    not, whatever the bricks and the order in which voxels are stored. In float32, colours, opacity and the
-    components of a normal agree to 2e-5, and depth to 1e-6 of itself, some units in its last place (seen in
-    three real volumes, from outside, far away and inside: 7e-6, 0 and 8e-8; by `Maximum`, under a transfer
-    function that rises within an eightieth of the values, 3e-5). `samples` may be others, since what is empty
-    is left out by bricks. So may `exhausted`: with a `max_samples` that is too small, a ray whose last
-    samples would lie in empty bricks is not exhausted here. `error`, under `AdaptiveSampling`, is another
-    estimate of the same error, above or below that of `render` (of ultrasound, at a tolerance of 0.003: from
-    0.004 above to 0.018 below, where the largest was 0.03; under that steep transfer function by up to 0.18).
+    is read. A brick that no ray needs is not read: one in which nothing is visible, outside of the view, or
+    behind what is opaque. The image is that of `render`, lit or not, whatever the bricks: in float32,
+    colours, opacity and the components of a normal agree to 2e-5, and depth to 1e-6 of itself (by `Maximum`,
+    under a transfer function that rises within an eightieth of the values, 3e-5). `samples` may be others,
+    since what is empty is left out by bricks. So may `exhausted`, where a `max_samples` is too small, and
+    `error`, which is another estimate of the same error.
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
@@ -109,34 +108,31 @@ def render_bricks(
       2 / 16³ of the voxels, and Zarr 16 MiB of decoded chunks for each level that is read. By default a
       quarter of the device's memory. Where rays are curved in the grid, more may be read of a later brick
       than of those before, which compiles programs again.
-    - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory`. By default those
-      of which least is read (`bricks/choice.py`); where rays are curved in the grid, one more along their
-      longest axis until they fit, first where less is read by that. There are fewer along an axis of too few
-      voxels, and no more than 65 536 in all. What these bricks take may exceed `memory`.
+    - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory` and of which least
+      is read. There are fewer along an axis of too few voxels, and no more than 65 536 in all. What these
+      bricks take may exceed `memory`.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
       fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
-      them. A function plans turns of its own (`bricks.stream.Turns`).
+      them. Or a function that chooses the next brick (`bricks.traversal.Schedule`).
     - `lighting`: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
       (`Lighting.farthest_read`).
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
       are no larger than a pixel at the volume's nearest corner (`bricks.level_for`); under a `ToroidalMap`
-      the finest, 0: its ranges are those of the finest level's nodes, and those of others lie elsewhere.
+      the finest, 0, whose nodes its ranges are of.
     - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
       anything visible. The former may end below the latter, where bricks are not needed, or above it, where
       they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
     - `devices`: as for `render`. `memory` is that of each device.
     - `own`: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
-      is read once (in each process) and copied to all. It is exact for everything that one device renders,
-      and so are its gradients. `"bricks"`: each device has its own bricks, marches all rays through them, and
-      the partial images are combined front to back. No voxel goes to two devices or processes, but for what
-      is read around bricks; so where reading takes longest, and for several processes. Devices get
-      consecutive bricks of the order front to back, so that rays must be straight in the grid (no
-      `ToroidalMap`), and what a ray shows must not depend on what lies in front but by its transmittance
-      (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by `"over"`). An `EarlyTermination` sees what
-      is in front on the same device alone: up to `opacity_left` of the colours behind are added, which one
-      device leaves out, and depth changes with them. Without it, depth agrees to 1e-5 of itself (8e-6 seen,
-      by an eye within the volume). Each device keeps some 300 bytes for each pixel. No gradients.
+      is read once (in each process) and copied to all. `"bricks"`: each device has its own bricks, marches
+      all rays through them, and the partial images are combined front to back. No voxel goes to two devices
+      or processes, but for what is read around bricks; so where reading takes longest, and for several
+      processes. Rays must be straight in the grid (no `ToroidalMap`), and what a ray shows must not depend on
+      what lies in front but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by
+      `"over"`). An `EarlyTermination` sees what is in front on the same device alone: up to `opacity_left` of
+      the colours behind are added, and depth changes with them. Without it, depth agrees to 1e-5 of itself.
+      Each device keeps some 300 bytes for each pixel. No gradients.
 
     **Returns:** as `render`, and in `Rendering.bricks` what it took.
 
@@ -144,9 +140,9 @@ def render_bricks(
     spacing and origin: a second march reads the bricks again. Where the march does not leap, that one reads
     bricks of no extinction, too, whose gradient need not be 0. Where it leaps, the derivative by the
     extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other parts
-    of it. There is no gradient to the voxels, none of
-    modes that choose a sample or resolve (`"maximum"`, `"average"`, `Isosurface`), none in forward mode
-    (`jax.jvp`) or of second order, and none inside `jax.jit` or `jax.vmap`.
+    of it. There is no gradient to the voxels, none of modes that choose a sample or resolve (`"maximum"`,
+    `"average"`, `Isosurface`), none in forward mode (`jax.jvp`) or of second order, and none inside `jax.jit`
+    or `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
     unknown; for voxels outside of the ranges of values found before, which tell that it changed; for less
@@ -162,31 +158,28 @@ def render_bricks(
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     _check(march, transfer, lighting, method, outputs, own)
-    if unknown := sorted(options.keys() - {*OF_RAW, *OF_ZARR}):
+    if unknown := sorted(options.keys() - {*OPTIONS}):
         raise TypeError(f"render_bricks has no arguments {', '.join(unknown)}; see its docstring.")
     if progress is not None and not callable(progress):
         raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
-    known = {n: v for n, v in (("spacing", spacing), ("origin", origin)) if not is_traced(v)}
+    place = {"spacing": spacing, "origin": origin}
+    traced = {name: value for name, value in place.items() if is_traced(value)}
+    known = {name: value for name, value in place.items() if name not in traced}
     levels = levels_of(source, **known, **options)
+    if traced and len(levels) > 1:
+        raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
     room = budget(memory)
     chosen = _level(levels, level, camera, march)
-    place = chosen.spacing or (1.0, 1.0, 1.0), chosen.origin or (0.0, 0.0, 0.0)
-    if len(known) < 2:
-        if len(levels) > 1:
-            raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
-        place = (
-            part if name in known else given
-            for name, given, part in zip(("spacing", "origin"), (spacing, origin), place, strict=True)
-        )
-    scene = _scene_of(chosen, place, transfer, camera, march, compositing, lighting)
+    scene = _scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
     check_not_sharded(mesh, scene)
-    scene, owned = on_all(mesh, scene), own == "bricks" and mesh is not None
-    job = _Job(chosen, room, _counts(bricks), method, outputs, progress, mesh, owned, [])
-    if owned:
-        _check_owned(scene, method)
+    scene, deals_bricks = on_all(mesh, scene), own == "bricks"
+    request = Request(chosen, room, _counts(bricks), method, progress, number_of(mesh) if deals_bricks else 1)
+    job = _Job(request, outputs, mesh, deals_bricks, [])
+    if deals_bricks:
+        _check_distributed(scene, method)
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
         raise ValueError(
             "render_bricks has gradients in reverse mode (jax.grad, jax.vjp), of first order, and none in "
@@ -194,14 +187,15 @@ def render_bricks(
             'memory, or adjoint="direct" for higher derivatives.'
         )
     rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
-    return Rendering(
-        rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=job.streams[0].report())
-    )
+    report = job.traversals[0].report()
+    return Rendering(rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=report))
 
 
 def budget(memory: int | Any | None) -> int:
     """Bytes that bricks may take: by default a quarter of the device's memory."""
-    return memory_of_device() // 4 if memory is None else integer("memory", memory, 1)
+    if memory is None:
+        return memory_of_device() // 4
+    return integer("memory", memory, 1, otherwise=", a number of bytes")
 
 
 def bricks_of(
@@ -213,27 +207,25 @@ def bricks_of(
     memory: int,
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | None = None,
-) -> Stream:
+) -> Traversal:
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
     _check(march, transfer, lighting, "overlap", "all", "rays")
-    place = source.spacing or (1.0, 1.0, 1.0), source.origin or (0.0, 0.0, 0.0)
-    scene = _scene_of(source, place, transfer, camera, march, compositing, lighting)
-    marched = _marched(scene)
-    job = _Job(source, memory, None, "overlap", "all", None, None, False, [])
-    return job.stream(marched, scene, job.options("all"))
+    scene = _scene_of(source, transfer, camera, march, compositing, lighting)
+    return _Job(Request(source, memory), "all", None, False, []).traversal(_marched(scene), scene, "all")
 
 
 def _scene_of(
     source: VoxelSource,
-    place: Iterable[Any],
     transfer: Transfer,
     camera: Camera,
     march: March,
     compositing: Mode | Compositing[Any] | Any,
     lighting: Lighting | None,
+    **traced: Any,
 ) -> Scene:
-    """The scene of a source, without its voxels. `place`: spacing and origin, along x, y and z."""
-    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
+    """The scene of a source, without its voxels. `traced`: spacing and origin in place of the source's."""
+    place = {"spacing": source.spacing, "origin": source.origin} | traced
+    volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
     return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
@@ -251,37 +243,30 @@ def _marched(scene: Scene) -> Scene:
 
 @dataclass(frozen=True)
 class _Job:
-    """How a scene is rendered. `owned`: whether devices own bricks. `streams`: those that did it, filled as
-    they do."""
+    """How a scene is rendered.
 
-    source: VoxelSource
-    memory: int
-    counts: tuple[int, int, int] | None
-    method: Method
+    - `devices`: over which rays are dealt out, or bricks, if `deals_bricks`.
+    - `traversals`: filled while the scene is rendered. A gradient has a second one."""
+
+    request: Request
     outputs: RenderOutputs
-    progress: Callable[[int, int], Any] | None
     devices: Mesh | None
-    owned: bool
-    streams: list[Stream]
+    deals_bricks: bool
+    traversals: list[Traversal]
 
     def options(self, outputs: Any) -> RenderOptions:
         """What is computed, and how rays are divided."""
         tiling = Tiling.of_backend(self.devices)
-        return RenderOptions(outputs, tiling._replace(devices=None) if self.owned else tiling)
+        if not tiling.turns:  # on a CPU
+            tiling = tiling._replace(batch=BATCH)
+        return RenderOptions(outputs, tiling._replace(devices=None) if self.deals_bricks else tiling)
 
-    def stream(self, marched: Scene, shown: Scene, options: RenderOptions) -> Stream:
+    def traversal(self, marched: Scene, shown: Scene, outputs: Any) -> Traversal:
         """The bricks of a scene, as rays are marched, and as they are shown."""
-
-        def summary() -> Summary:
-            if self.streams:  # the second march of a gradient
-                return self.streams[0].summary
-            return summary_of(self.source, memory=self.memory)
-
-        where = self.memory, self.counts, self.method, self.progress
-        least = number_of(self.devices) if self.owned else 1
-        stream = Stream.of(self.source, summary, marched, shown, options, *where, least)
-        self.streams.append(stream)
-        return stream
+        known = self.traversals[0].summary if self.traversals else None
+        found = Traversal.of(self.request, marched, shown, self.options(outputs), known)
+        self.traversals.append(found)
+        return found
 
 
 _set_out, _march_part, _arrive = map(compiled, (begin_rays, march_brick, finish_image))
@@ -292,24 +277,24 @@ _start_pull, _pull_part, _end_pull = map(compiled, (begin_vjp, vjp_of_brick, fin
 def _image(scene: Scene, job: _Job) -> Rendering:
     mode, outputs = scene.compositing, job.outputs
     marched, selects = _marched(scene), isinstance(mode, Selection)
-    options = job.options("depth" if mode.resolves and outputs == "rgba" else outputs)
-    stream = job.stream(marched, scene, options)
-    if job.owned:
+    traversal = job.traversal(marched, scene, "depth" if mode.resolves and outputs == "rgba" else outputs)
+    options = traversal.options
+    if job.deals_bricks:
         assert job.devices is not None
-        return render_owned(stream, job.devices)
-    exact = callable(job.method)
+        return render_distributed(traversal, job.devices)
+    exact = callable(job.request.method)
 
     def march_brick(
-        part: Volume, cells: CellRange, state: tuple[RayStates, PyTree]
+        brick: Volume, cells: CellRange, state: tuple[RayStates, PyTree]
     ) -> tuple[RayStates, PyTree]:
         underway, pixels = state
-        after = _march_part(*_on(part, marched, options), underway, cells, exact)
+        after = _march_part(*_on(brick, marched, options), underway, cells, exact)
         if selects:
-            pixels = _resolve_part(*_on(part, scene, options), marched.march, underway.at, after, pixels)
+            pixels = _resolve_part(*_on(brick, scene, options), marched.march, underway.at, after, pixels)
         return after, pixels
 
     underway = _set_out(marched, options)
-    state = stream.through(underway.rays, (underway, None), lambda state: state[0].at, march_brick)
+    state = traversal.through(underway.rays, (underway, None), lambda state: state[0].at, march_brick)
     underway, pixels = state
     rendering = _arrive(marched, options, underway)
     if not mode.resolves:
@@ -343,8 +328,8 @@ def _(perturbed: Any, scene: Scene, job: _Job) -> tuple[Rendering, Rendering]:
             f"compositing by {type(mode).__name__} has no gradient through bricks; use jv.render on a volume "
             "in memory."
         )
-    if callable(job.method):
-        raise ValueError('method: turns of your own have no gradient; use "overlap".')
+    if callable(job.request.method):
+        raise ValueError('method: a schedule of your own has no gradient; use "overlap".')
     rendering = _differentiable(scene, job)
     return rendering, rendering
 
@@ -356,29 +341,30 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _
             "the gradient by bricks reads its source while it is computed, and so not inside jax.jit, "
             "jax.vmap or jax.jacrev: call what jax.vjp returns outside of them, once for each cotangent."
         )
-    options, whole = job.options(job.outputs), of_all_outputs(rendering, cotangent)
-    stream = job.stream(scene, scene, options)
+    traversal, whole = job.traversal(scene, scene, job.outputs), of_all_outputs(rendering, cotangent)
+    options = traversal.options
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
-        stream = replace(stream, visible=np.ones_like(stream.visible))
+        traversal.visible = np.ones_like(traversal.visible)
 
     def pull_brick(
-        part: Volume, cells: CellRange, state: tuple[Sums, ReplayState]
+        brick: Volume, cells: CellRange, state: tuple[Sums, ReplayState]
     ) -> tuple[Sums, ReplayState]:
-        here, options_, acceleration = _on(part, scene, options)
+        here, options_, acceleration = _on(brick, scene, options)
         return _pull_part(here, perturbed, options_, acceleration, *state, cells)
 
     state = _start_pull(scene, perturbed, options, rendering, whole)
-    state = stream.through(state[1].states.rays, state, lambda state: state[1].states.at, pull_brick)
+    rays = state[1].states.rays
+    state = traversal.through(rays, state, lambda state: state[1].states.at, pull_brick)
     found = _end_pull(scene, perturbed, options, *state, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 
 def _on(
-    part: Volume, scene: Scene, options: RenderOptions
+    brick: Volume, scene: Scene, options: RenderOptions
 ) -> tuple[Scene, RenderOptions, VolumeAcceleration]:
-    """The scene with a part of its volume."""
-    acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
-    return scene._replace(volume=part), options, acceleration
+    """The scene with a brick of its volume."""
+    acceleration = VolumeAcceleration.of(brick, scene.transfer, scene.march, scene.lighting)
+    return scene._replace(volume=brick), options, acceleration
 
 
 def _level(
@@ -403,7 +389,7 @@ def _level(
     return levels[level_for(levels, camera)]
 
 
-def _counts(bricks: Any) -> tuple[int, int, int] | None:
+def _counts(bricks: Any) -> Node | None:
     if bricks is None:
         return None
     try:
@@ -432,7 +418,7 @@ def _check(
             'SpaceLeaping("min_distance") starts rays at what is visible first in the whole volume; use '
             '"hierarchy", "distance" or "beam" with bricks.'
         )
-    if lighting is not None and lighting.farthest_read is None:
+    if lighting is not None and (lighting.farthest_read is None):
         raise ValueError(
             "lighting must say how far around a sample it reads (Lighting.farthest_read), and light samples; "
             f"{type(lighting).__name__} needs the whole volume here. Phong does not, and neither do "
@@ -440,7 +426,7 @@ def _check(
         )
 
 
-def _check_owned(scene: Scene, method: Method) -> None:
+def _check_distributed(scene: Scene, method: Method) -> None:
     """Raises where partial images of bricks cannot be combined."""
     march, mode = scene.march, scene.compositing
     refused = {

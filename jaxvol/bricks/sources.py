@@ -6,21 +6,22 @@ import operator
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, TypeAlias, TypeVar
 
 import jax
 import numpy as np
 
-from .._util.axes import XYZ, Axes, permuted
+from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, described, finite_array, integer
 from .._util.voxels import check_shape
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
-from .dtypes import Box, converted, voxel_type
+from .conversion import Box, converted, voxel_type
 
 
 Result = TypeVar("Result")
+
 Triple: TypeAlias = tuple[float, float, float]
 
 Corner: TypeAlias = Sequence[int] | np.ndarray | Any
@@ -29,19 +30,19 @@ Corner: TypeAlias = Sequence[int] | np.ndarray | Any
 SPACE = ("x", "y", "z")
 
 AT_ONCE = 2**23
-"""Bytes of storage that are read at a time: a box that takes more is read in layers."""
+"""Bytes of storage that are read at a time: a larger box is read in parts."""
 
 PAGE = 2**12
-"""Bytes that a row of a memory map costs beside its own if it is read in part: the pages at its ends."""
+"""Bytes of a memory map that are read beside a row's own if only a part of it is: the pages at its ends."""
 
 ALIGNED = 64
-"""JAX's arrays lie at addresses that are multiples of so many bytes."""
+"""JAX uses an array of NumPy in place if its address is a multiple of so many bytes."""
 
 _READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
 
 def in_background(function: Callable[..., Result], *arguments: Any) -> "Future[Result]":
-    """Call in another thread, of those that read."""
+    """Calls a function that reads in another thread."""
     return _READERS.submit(function, *arguments)
 
 
@@ -53,21 +54,20 @@ class VoxelSource:
     - `array`: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
       axis: an array or a memory map of NumPy, an array of JAX, zarr, h5py, dask or tensorstore, or an object
       of your own. It is read from other threads, and possibly by several at once.
-    - `spacing`, `origin`, `direction`: as in `Volume`; None where nobody knows them.
+    - `spacing`, `origin`, `direction`: as in `Volume`.
     - `axes`: the name of each of its axes, such as "tczyx" or ["z", "y", "x"]; x, y and z among them. By
       default it is array[x, y, z], as in `Volume`.
     - `index`: which entry to take along each other axis, such as {"c": 1, "t": 0}. An axis of one entry needs
       none.
-    - `name`: what it is called in errors.
-    - `hint`: what to do where reading fails, from the error's text.
+    - `name`: what it is called in errors. `hint`: what errors say to do where reading fails.
 
     **Attributes:** all have their axes in the order x, y, z.
 
-    - `shape`: number of voxels.
-    - `dtype`: of the voxels that `read` returns (`dtypes.voxel_type`). `stored_type`: of those of the array.
-    - `chunks`: voxels of the parts in which it is stored, or of a plane where it is stored as a whole. What
-      is read at a time is cut between them.
-    - `order`: axes in the order of storage: along the first one, neighbours lie farthest apart.
+    - `shape`: number of voxels. `spacing`, `origin`, `direction`: as given.
+    - `dtype`: of the voxels that `read` returns (`voxel_type`). `stored_type`: of those of the array.
+    - `chunks`: voxels of the parts in which it is stored, or of a plane where it is stored as a whole.
+      `chunked`: whether it is stored in parts. What is read at a time is cut between them.
+    - `order`: axes in the order of storage, 0 for x: along the first one, neighbours lie farthest apart.
 
     **Raises:** `ValueError` for a shape or type that no volume has, for axes or an index that the array does
     not have, and for a traced array.
@@ -83,33 +83,35 @@ class VoxelSource:
         axes: str | Sequence[str] | Any | None = None,
         index: Mapping[str, int] | None = None,
         name: str = "array",
-        hint: Callable[[str], str] = lambda fault: "",
+        hint: str = "Check what it is stored in.",
     ):
-        check_known(array)
+        check_is_array(array)
         self._immutable = isinstance(array, jax.Array)
         if self._immutable:
             array = np.asarray(array)  # JAX would compile a program for each box
-        self.array, self.name, self._hint = array, name, hint
-        self.spacing, self.origin = triple("spacing", spacing), triple("origin", origin)
+        self.array, self.name, self.hint = array, name, hint
+        self.spacing = _triple("spacing", (1.0, 1.0, 1.0) if spacing is None else spacing)
+        self.origin = _triple("origin", (0.0, 0.0, 0.0) if origin is None else origin)
         self.direction = direction
         shape = tuple(map(int, array.shape))
         if len(shape) < 3:
             check_shape(shape)
         names = _axis_names(name, axes, len(shape))
-        self._fixed = _fixed(name, names, shape, index or {})
         place = tuple(names.index(each) for each in SPACE)
-        spatial = sorted(place)
-        self._axes = permuted([spatial.index(axis) for axis in place], XYZ)
-        self._spatial = spatial
         check_shape(tuple(shape[axis] for axis in place))
         self.shape: tuple[int, int, int] = permuted([shape[axis] for axis in place], XYZ)
         self.stored_type = np.dtype(_dtype_of(array))
         self.dtype = voxel_type(self.stored_type)
-        chunks, order = _layout_of(array, shape, place)
-        x, y, z = (min(chunks[axis], n) for axis, n in zip(place, self.shape, strict=True))
-        self.chunks: tuple[int, int, int] = x, y, z
+        chunks, order = _layout_of(array, shape)
         slow, middle, fast = (place.index(axis) for axis in order if axis in place)
         self.order: Axes = slow, middle, fast
+        self.chunked = chunks is not None
+        if chunks is None:
+            chunks = [1 if axis == place[slow] else n for axis, n in enumerate(shape)]
+        x, y, z = (min(chunks[axis], n) for axis, n in zip(place, self.shape, strict=True))
+        self.chunks: tuple[int, int, int] = x, y, z
+        self._place = place
+        self._fixed = _fixed(name, names, shape, index or {})
         begin = getattr(getattr(array, "domain", None), "origin", None)
         self._begin = tuple(begin) if begin is not None else (0,) * len(shape)
         self._map = _map_under(array)
@@ -120,17 +122,14 @@ class VoxelSource:
         """The voxels of a `Volume`.
 
         **Raises:** `ValueError` for one with labels or a field, which are not voxels, and a traced one."""
-        check_known(volume)
+        check_is_array(volume)
         for part in ("labels", "field"):
             if getattr(volume, part) is not None:
                 raise ValueError(
                     f"source must be a volume of voxels alone; got a Volume with {part}. Pass volume.data, "
                     "or render it with jv.render."
                 )
-        (dx, dy, dz), (x, y, z) = (
-            np.asarray(part, float).tolist() for part in (volume.spacing, volume.origin)
-        )
-        return cls(volume.data, (dx, dy, dz), (x, y, z), direction=volume.direction, name="volume")
+        return cls(volume.data, volume.spacing, volume.origin, direction=volume.direction, name="volume")
 
     @property
     def nbytes(self) -> int:
@@ -185,23 +184,30 @@ class VoxelSource:
         if self.in_memory:
             return converted(self._stored(box, axes), box, axes, self.name)
         self.check_unchanged()
-        voxels = empty_box(*box, axes, self.dtype)
-        for layer in self._layers_of(box):
-            place = [slice(a - x, b - x) for a, b, x in zip(*layer, box[0], strict=True)]
-            voxels[permuted(place, axes)] = converted(self._stored(layer, axes), layer, axes, self.name)
+        voxels = empty_array(permuted([b - a for a, b in zip(*box, strict=True)], axes), self.dtype)
+        for part in self.parts(box, AT_ONCE):
+            place = [slice(a - x, b - x) for a, b, x in zip(*part, box[0], strict=True)]
+            voxels[permuted(place, axes)] = converted(self._stored(part, axes), part, axes, self.name)
         if self._map is not None:
             self._map.forget()
         return voxels
 
-    def read_async(self, low: Corner, high: Corner, axes: Axes = XYZ) -> "Future[np.ndarray]":
-        """`read` in another thread: `.result()` waits for the voxels, and raises what `read` raises."""
-        return in_background(self.read, low, high, axes)
+    def subsampled(self, stride: int) -> Volume:
+        """Every `stride`-th voxel, read in slabs across the axis where these are thinnest."""
+        axis = int(np.argmax([n / c for n, c in zip(self.shape, self.chunks, strict=True)]))
+        thick = -(-max(self.chunks[axis], stride) // stride) * stride
+        slabs = []
+        for begin in range(0, self.shape[axis], thick):
+            low, high = [0, 0, 0], list(self.shape)
+            low[axis], high[axis] = begin, min(begin + thick, self.shape[axis])
+            slabs.append(self.read(low, high)[::stride, ::stride, ::stride].copy())
+        return Volume(np.concatenate(slabs, axis), [stride * s for s in self.spacing], self.origin)
 
     def _stored(self, box: Box, axes: Axes) -> np.ndarray:
         """The voxels of a box as they are stored, with their axes in the order `axes`."""
         index: list[Any] = list(self._fixed)
-        for a, b, axis in zip(*box, self._axes, strict=True):
-            index[self._spatial[axis]] = slice(a, b)
+        for a, b, axis in zip(*box, self._place, strict=True):
+            index[axis] = slice(a, b)
         # views of tensorstore count from where they begin in the whole
         index = [
             i + start if isinstance(i, int) else slice(i.start + start, i.stop + start)
@@ -211,13 +217,13 @@ class VoxelSource:
             given = self.array[tuple(index)]
             found = np.asarray(given)
         except Exception as fault:  # of whatever library
-            hint = self._hint(str(fault)) or "Check what it is stored in."
             raise ValueError(
-                f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). {hint}"
+                f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). {self.hint}"
             ) from fault
         if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
             raise ValueError(f"{self.name}: voxels from {box[0]} to {box[1]} are masked. Fill them first.")
-        moved = found.transpose(permuted(self._axes, axes)) if found.ndim == 3 else found
+        rank = [sorted(self._place).index(axis) for axis in self._place]
+        moved = found.transpose(permuted(rank, axes)) if found.ndim == 3 else found
         size = permuted([b - a for a, b in zip(*box, strict=True)], axes)
         if moved.shape != size:
             raise ValueError(
@@ -226,21 +232,23 @@ class VoxelSource:
             )
         return moved
 
-    def _layers_of(self, box: Box) -> Iterator[Box]:
-        """A box, cut between chunks, along the axis on which it touches the most of them, into parts of no
-        more than AT_ONCE bytes of storage, or of single layers of chunks."""
-        low, high = box
-        counts = [(b - 1) // c - a // c + 1 for a, b, c in zip(low, high, self.chunks, strict=True)]
-        axis = max(self.order, key=lambda axis: counts[axis])
-        chunk = self.chunks[axis]
-        of_layer = self.bytes_touched(permuted([b - a for a, b in zip(low, high, strict=True)], XYZ))
-        of_layer //= counts[axis]
-        thick = chunk * max(1, AT_ONCE // max(of_layer, 1))
-        ends = [low[axis], *range(low[axis] // chunk * chunk + thick, high[axis], thick), high[axis]]
-        for begin, end in pairwise(ends):
-            first, last = list(low), list(high)
-            first[axis], last[axis] = begin, end
-            yield permuted(first, XYZ), permuted(last, XYZ)
+    def parts(self, box: Box, most: int) -> Iterator[Box]:
+        """A box, cut between chunks into parts that are stored in at most so many bytes, or in one chunk. Of
+        what is not stored in chunks, planes with more are cut into rows. In the order of storage."""
+        extent, item = list(self.chunks), max(self.stored_type.itemsize, self.dtype.itemsize)
+        middle = self.order[1]
+        while not self.chunked and extent[middle] > 1 and math.prod(extent) * item > most:
+            extent[middle] = -(-extent[middle] // 2)
+        for axis in reversed(self.order):  # rows first
+            while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= most:
+                extent[axis] = min(2 * extent[axis], self.shape[axis])
+        pieces = []
+        for low, high, chunk, size in zip(*box, self.chunks, extent, strict=True):
+            begin = low - low % min(chunk, size)
+            pieces.append(list(pairwise([low, *range(begin + size, high, size), high])))
+        for piece in product(*permuted(pieces, self.order)):
+            x, y, z = permuted(piece, inverse(self.order))
+            yield (x[0], y[0], z[0]), (x[1], y[1], z[1])
 
     def _box(self, low: Corner, high: Corner) -> Box:
         try:
@@ -304,24 +312,19 @@ def _dtype_of(array: Any) -> np.dtype:
         raise ValueError(f"source must have a dtype that NumPy knows; got {found!r}.") from fault
 
 
-def _layout_of(array: Any, shape: tuple[int, ...], place: tuple[int, ...]) -> tuple[list[int], list[int]]:
-    """Voxels of a chunk along each axis, and the axes in the order of storage, the slowest first. `place`:
-    the axes of space, of which planes are the chunks of what has none."""
+def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[list[int] | None, list[int]]:
+    """Voxels of a chunk along each axis, None where there are no chunks; and the axes in the order of
+    storage, the slowest first."""
     axes = list(range(len(shape)))
-    strides = getattr(array, "strides", None)
-    if isinstance(array, np.ndarray) and strides is not None:
-        axes.sort(key=lambda axis: -abs(strides[axis]))
     layout = getattr(array, "chunk_layout", None)
     if layout is not None:  # tensorstore
-        return [c or n for c, n in zip(layout.read_chunk.shape, shape, strict=True)], list(
-            layout.inner_order or axes
-        )
+        chunks = [c or n for c, n in zip(layout.read_chunk.shape, shape, strict=True)]
+        return chunks, list(layout.inner_order or axes)
+    if isinstance(array, np.ndarray):
+        return None, sorted(axes, key=lambda axis: -abs(array.strides[axis]))
     chunks = getattr(array, "chunks", None)
-    if chunks is None:
-        slowest = next(axis for axis in axes if axis in place)
-        return [1 if axis == slowest else n for axis, n in enumerate(shape)], axes
     # of zarr and h5py a number for each axis, of dask all numbers
-    return [int(np.max(c)) for c in chunks], axes
+    return None if chunks is None else [int(np.max(c)) for c in chunks], axes
 
 
 def _axis_names(name: str, axes: Any, rank: int) -> list[str]:
@@ -353,20 +356,16 @@ def _fixed(name: str, names: list[str], shape: tuple[int, ...], index: Mapping[s
     return fixed
 
 
-def empty_box(low: Corner, high: Corner, axes: Axes, dtype: np.dtype) -> np.ndarray:
-    """An array for the voxels of a box, with its axes in this order. It is aligned as JAX aligns its own, so
-    that `jax.device_put` uses it in place where the device is the CPU."""
-    shape = permuted([int(b) - int(a) for a, b in zip(low, high, strict=True)], axes)
+def empty_array(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An uninitialized array, aligned so that `jax.device_put` uses it in place where the device is the
+    CPU."""
     size = math.prod(shape) * dtype.itemsize
     memory = np.empty(size + ALIGNED, np.uint8)
     start = -memory.ctypes.data % ALIGNED
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
-def triple(name: str, value: Any) -> Triple | None:
-    """`value` as three finite numbers; None stays None."""
-    if value is None:
-        return None
+def _triple(name: str, value: Any) -> Triple:
     finite_array(name, value, (3,))
     x, y, z = np.asarray(value, float).tolist()
     if name == "spacing" and min(x, y, z) <= 0:
@@ -374,8 +373,9 @@ def triple(name: str, value: Any) -> Triple | None:
     return x, y, z
 
 
-def check_known(thing: Any) -> None:
-    """**Raises** `ValueError` for traced voxels, spacing or origin, and what is no array."""
+def check_is_array(thing: Any) -> None:
+    """**Raises** `ValueError` for traced voxels, spacing or origin, and for what is neither an array nor a
+    `Volume`."""
     if is_traced(thing):
         raise ValueError(
             "source must not be traced, since it is read while an image is made: there are no gradients to "
@@ -384,12 +384,14 @@ def check_known(thing: Any) -> None:
         )
     if isinstance(thing, VoxelSource):
         raise ValueError(f"array must be one, not a source; got {described(thing)}.")
-    if isinstance(thing, type) or (not isinstance(thing, Volume) and not _is_array(thing)):
+    try:
+        has_boxes = all(hasattr(thing, name) for name in ("shape", "dtype", "__getitem__"))
+    except Exception as fault:  # of whatever library, such as h5py where the file is closed
+        raise ValueError(
+            f"source must be an array that can be read; got {described(thing)} ({fault}). Keep its file open."
+        ) from fault
+    if isinstance(thing, type) or not (isinstance(thing, Volume) or has_boxes):
         raise ValueError(
             "source must be an array, a Volume, a VoxelSource, or the path of a file or folder; got "
             f"{described(thing)}."
         )
-
-
-def _is_array(thing: Any) -> bool:
-    return all(hasattr(thing, name) for name in ("shape", "dtype", "__getitem__"))

@@ -1,14 +1,23 @@
-"""How large may bricks be, and how much larger are they read than they are?"""
+"""How large may bricks be, how much is read around them, and which split of a volume takes the least time?
+
+Where rays are straight, any split shows the same image. Bricks that follow the shape of what is visible leave
+out more of what is not; rows of a file that are cut are read with their gaps; and each brick takes time for
+all rays.
+"""
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from .._util.checks import integer
 from .._util.files import MOST_VOXELS
+from .._util.vec3 import Vec3
 from ..march.march import March
 from ..march.strides import longest_run, stride_control
 from ..march.transforms import ToroidalMap
@@ -16,22 +25,29 @@ from ..march.transforms.adaptive_sampling import FARTHEST
 from ..ray import Scene
 from ..scene.occupancy import BLOCK
 from ..scene.space import Space
+from ..xla.compiling import compiled
 from .cells import reach
-from .grid import BrickGrid, Node, is_straight
-from .overlap import most
+from .grid import BrickGrid, Node, is_straight, overlap_of
+from .sources import VoxelSource
 
 
 EDGE = 16
 """Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
 MOST_BRICKS = 2**16
-"""How many a user may ask for. Each has its turn, in which it is looked for along all rays, also where it is
-not read: without a limit, an image of a billion bricks would not end."""
+"""How many a user may ask for: each is looked for along all rays, also where it is not read."""
 
 COPIES = 2.5
 """Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of
 blocks takes, less than half. Voxels that are stored in another type take `sources.AT_ONCE` bytes more while
 they are read, or a layer of chunks, if that is more."""
+
+PER_RAY = 100
+"""Bytes that can be read in the time that a brick takes for a ray that misses it: on a CPU, of 512 x 512
+rays."""
+
+MORE = 2
+"""How many times as many bricks are tried as fit into memory."""
 
 
 class TooLittleMemory(ValueError):
@@ -48,6 +64,8 @@ class Margin:
     - `light`: world length around a sample within which light is looked for.
     - `around`: nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`.
     - `slopes`: whether the gradient is read.
+    - `straight`: whether rays are straight in the grid.
+    - `probe`: whose bricks overlap. None if bricks do not.
     """
 
     cells: Node
@@ -56,15 +74,17 @@ class Margin:
     light: float
     around: int
     slopes: bool
+    straight: bool = True
+    probe: ToroidalMap | None = None
 
     @classmethod
     def of(cls, march: March, space: Space, shape: Node, segment: int, shown: Scene) -> "Margin":
         """That of a march in a grid of this shape, which takes `segment` cells of a ray at a time. `shown`:
         what is measured and lit there."""
-        transfer, lighting = shown.transfer, shown.lighting
+        transfer, lighting, straight = shown.transfer, shown.lighting, is_straight(space)
         steps = reach(march, segment)
         # where rays are curved, a brick's own cells are found by points that may lie four steps apart
-        length = (steps + (0 if is_straight(space) else 4)) * float(march.step)
+        length = (steps + (0 if straight else 4)) * float(march.step)
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
         around = 2 if slopes else 1
         if stride_control(march) is not None:  # blocks around a run's own, and the windows of these
@@ -73,14 +93,15 @@ class Margin:
             around += BLOCK * (math.ceil(min(rounds, FARTHEST)) + 2)  # runs that touch more are not made
         light = 0.0 if lighting is None else lighting.farthest_read
         assert light is not None
-        margin = cls((0, 0, 0), steps, length, light, around, slopes)
+        probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
+        margin = cls((0, 0, 0), steps, length, light, around, slopes, straight, probe)
         return replace(margin, cells=margin.of_box(space, shape, np.zeros(3), np.asarray(shape) - 1))
 
     def of_box(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> Node:
         """Nodes along each axis that are read around the cells that begin in a box."""
         far = nodes_within(space, shape, low, high, self.length)
         low, high = np.maximum(low - far, 0), np.minimum(high + far, np.asarray(shape) - 1)
-        x, y, z = far + self.of_points(space, shape, low, high) + (0 if is_straight(space) else 1)
+        x, y, z = far + self.of_points(space, shape, low, high) + (0 if self.straight else 1)
         return int(x), int(y), int(z)
 
     def of_points(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -94,7 +115,7 @@ def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, l
     and in these nodes themselves, also beyond the grid, through which a ray may come to other nodes of it."""
     nodes = np.zeros(3)
     while length > 0:
-        distances = np.asarray(_distances(space, low - nodes, high + nodes))
+        distances = _distances(space, low - nodes, high + nodes)
         with np.errstate(divide="ignore"):
             more = np.maximum(nodes, np.minimum(np.ceil(length / distances), shape))
         if np.array_equal(more, nodes):
@@ -103,22 +124,33 @@ def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, l
     return nodes.astype(int)
 
 
-def _distances(space: Space, low: np.ndarray, high: np.ndarray) -> tuple[float, float, float]:
-    ends = [tuple(jnp.asarray(c, space.middle[0].dtype) for c in end.tolist()) for end in (low, high)]
-    (x0, y0, z0), (x1, y1, z1) = ends
-    dx, dy, dz = space.least_distances((x0, y0, z0), (x1, y1, z1))
-    return float(dx), float(dy), float(dz)
+def _distances(space: Space, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Least distances between neighbouring nodes along each axis in a box."""
+    ends = (tuple(jnp.asarray(c, space.middle[0].dtype) for c in end.tolist()) for end in (low, high))
+    return np.asarray([float(distance) for distance in _least_distances(space, *ends)])
+
+
+@compiled
+def _least_distances(space: Space, low: Vec3, high: Vec3) -> Vec3:
+    return space.least_distances(low, high)
 
 
 def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
-    """Nodes that are read at a time, at least so many. Such a part can begin at a multiple of BLOCK wherever
+    """Nodes that are read at a time, at least so many. Such a box can begin at a multiple of BLOCK wherever
     it lies, so that its blocks are those of the whole."""
     x, y, z = (n - BLOCK * max((n - w - BLOCK + 1) // BLOCK, 0) for n, w in zip(shape, wanted, strict=True))
     return x, y, z
 
 
+def stored_of(grid: BrickGrid, margin: Margin) -> Node:
+    """Nodes that are read at a time for the bricks of this grid."""
+    overlap = 0 if margin.probe is None else math.ceil(max(overlap_of(margin.probe, grid), default=0.0))
+    x, y, z = (size + 1 + 2 * around for size, around in zip(grid.size, margin.cells, strict=True))
+    return stored_shape(grid.shape, (x, y, z + overlap))
+
+
 def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
-    """Memory that parts of this shape take: the one that is rendered, what is made of it, and the next
+    """Memory that bricks of this shape take: the one that is rendered, what is made of it, and the next
     one."""
     kind = np.dtype(dtype)
     packed = (8 if kind.itemsize == 1 else 4) if margin.slopes and kind.kind in "ui" else 0
@@ -126,52 +158,16 @@ def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
 
 
 def fits(stored: Node, dtype: Any, margin: Margin, memory: int) -> bool:
-    """Whether parts of this shape can be volumes, and take no more than so many bytes."""
+    """Whether bricks of this shape can be volumes, and take no more than so many bytes."""
     return math.prod(stored) <= MOST_VOXELS and bytes_of(stored, dtype, margin) <= memory
 
 
-def split(
-    shape: Node, dtype: Any, memory: int, margin: Margin, probe: ToroidalMap | None, least: int = 1
-) -> BrickGrid:
-    """Few bricks that fit into so many bytes, and have fewer than 2**31 voxels: there is one more along the
-    axis where they are longest, until they do; first among the axes along which the smallest bricks, with
-    what is read around them, are shorter than the volume. There are at least `least`, unless they would be
-    smaller than bricks are.
-
-    **Raises:** `TooLittleMemory` if the smallest ones do not fit."""
-    memory = integer("memory", memory, 1)
-    cells = [n - 1 for n in shape]
-    x, y, z = (min(EDGE, c) for c in cells)
-    short = np.less(stored_of(BrickGrid(shape, (x, y, z)), margin, probe), shape).tolist()
-    parts = [1, 1, 1]
-    while True:
-        size = [rounded(-(-c // p), c) for c, p in zip(cells, parts, strict=True)]
-        grid = BrickGrid(shape, (size[0], size[1], size[2]))
-        stored = stored_of(grid, margin, probe)
-        left = [axis for axis in range(3) if size[axis] > min(EDGE, cells[axis])]
-        smallest = not left
-        if fits(stored, dtype, margin, memory) and (grid.number >= least or smallest):
-            return grid
-        if smallest:
-            check_part(stored)
-            raise TooLittleMemory(
-                f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
-                f"{' x '.join(map(str, size))} cells and what is read around them, less for a "
-                f"shorter step; got {memory}."
-            )
-        parts[max(left, key=lambda axis: (short[axis], size[axis]))] += 1
-
-
-def check_smallest(shape: Node, dtype: Any, memory: int) -> None:
-    """**Raises** `TooLittleMemory` if no march at all has bricks that fit: not even one that reads nothing
-    around them but what interpolation takes."""
-    x, y, z = (min(EDGE, n - 1) for n in shape)
-    margin = Margin((1, 1, 1), steps=0, length=0.0, light=0.0, around=1, slopes=False)
-    least = bytes_of(stored_of(BrickGrid(shape, (x, y, z)), margin, None), dtype, margin)
-    if memory < least:
-        raise TooLittleMemory(
-            f"memory must be at least {least} bytes, which the smallest bricks take, of {x} x {y} x {z} "
-            f"cells, however short the step; most marches take more. Got {memory}."
+def check_stored(stored: Node) -> None:
+    """**Raises** `ValueError` if a brick of this shape has more voxels than a volume may have."""
+    if math.prod(stored) > MOST_VOXELS:
+        raise ValueError(
+            "bricks must be so many, and steps so short, that a brick and what is read around it have fewer "
+            f"than 2**31 voxels; got {' x '.join(map(str, stored))} along x, y and z."
         )
 
 
@@ -183,29 +179,91 @@ def divided(shape: Node, counts: Node) -> BrickGrid:
     grid = BrickGrid(shape, (x, y, z))
     if grid.number > MOST_BRICKS:
         raise ValueError(
-            f"bricks must be no more than {MOST_BRICKS} in all, each of which has its turn; got {counts}, "
-            f"which divide {' x '.join(map(str, shape))} voxels into {grid.number}. Ask for bricks of "
-            f"{EDGE} cells or more along each side."
+            f"bricks must be no more than {MOST_BRICKS} in all; got {counts}, which divide "
+            f"{' x '.join(map(str, shape))} voxels into {grid.number}. Ask for bricks of {EDGE} cells or "
+            "more along each side."
         )
     return grid
 
 
-def check_part(stored: Node) -> None:
-    """**Raises** `ValueError` if a part of this shape has more voxels than a volume may have."""
-    if math.prod(stored) > MOST_VOXELS:
-        raise ValueError(
-            "bricks must be so many, and steps so short, that a brick and what is read around it have fewer "
-            f"than 2**31 voxels; got {' x '.join(map(str, stored))} along x, y and z."
-        )
+def split(shape: Node, dtype: Any, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
+    """Few bricks that fit into so many bytes, and have fewer than 2**31 voxels: there is one more along the
+    axis where they are longest, until they do; first among the axes along which the smallest bricks, with
+    what is read around them, are shorter than the volume. There are at least as many as `devices`, unless
+    they would be smaller than bricks are.
+
+    **Raises:** `TooLittleMemory` if the smallest ones do not fit."""
+    memory = integer("memory", memory, 1)
+    cells = [n - 1 for n in shape]
+    x, y, z = (min(EDGE, c) for c in cells)
+    short = np.less(stored_of(BrickGrid(shape, (x, y, z)), margin), shape).tolist()
+    counts = [1, 1, 1]
+    while True:
+        size = [_rounded(-(-c // count), c) for c, count in zip(cells, counts, strict=True)]
+        grid = BrickGrid(shape, (size[0], size[1], size[2]))
+        stored = stored_of(grid, margin)
+        divisible = [axis for axis in range(3) if size[axis] > min(EDGE, cells[axis])]
+        if fits(stored, dtype, margin, memory) and (grid.number >= devices or not divisible):
+            return grid
+        if not divisible:
+            check_stored(stored)
+            raise TooLittleMemory(
+                f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
+                f"{' x '.join(map(str, size))} cells and what is read around them, less for a "
+                f"shorter step; got {memory}."
+            )
+        counts[max(divisible, key=lambda axis: (short[axis], size[axis]))] += 1
 
 
-def stored_of(grid: BrickGrid, margin: Margin, probe: ToroidalMap | None) -> Node:
-    """Nodes that are read at a time for the bricks of this grid."""
-    overlap = most(probe, grid)
-    wanted = [s + 1 + 2 * m + k for s, m, k in zip(grid.size, margin.cells, overlap, strict=True)]
-    return stored_shape(grid.shape, (wanted[0], wanted[1], wanted[2]))
+def cheapest(
+    grid: BrickGrid,
+    source: VoxelSource,
+    visible: Callable[[BrickGrid], Bool[np.ndarray, " bricks"]],
+    margin: Margin,
+    memory: int,
+    rays: int,
+    devices: int = 1,
+) -> BrickGrid:
+    """The split of the volume that takes the least time to read and to march, as far as that is known, among
+    those into no more than MORE times as many bricks as `grid` has that fit into `memory`.
+
+    - `visible`: tells for each brick of a grid whether anything may be visible in it.
+    - `devices`: how many take a brick each at a time, and the least number of bricks."""
+
+    def cost(other: BrickGrid) -> int:
+        stored = stored_of(other, margin)
+        each = source.bytes_touched(stored) + math.prod(stored) * source.dtype.itemsize + PER_RAY * rays
+        return each * -(-int(visible(other).sum()) // devices)
+
+    fitting = _fitting(grid.shape, source.dtype, margin, memory, MORE * grid.number)
+    return min([grid, *(other for other in fitting if other.number >= devices)], key=cost)
 
 
-def rounded(size: int, cells: int) -> int:
+def _fitting(shape: Node, dtype: Any, margin: Margin, memory: int, most: int) -> Iterator[BrickGrid]:
+    """Splits into at most so many bricks that fit: of any sizes along two axes, and of the largest that fits
+    along the third."""
+    sizes = [_sizes(n - 1) for n in shape]
+    seen = set[Node]()
+    for third in range(3):
+        a, b = (axis for axis in range(3) if axis != third)
+        for along_a, along_b in product(sizes[a], sizes[b]):
+            for along_third in sizes[third]:
+                by_axis = {a: along_a, b: along_b, third: along_third}
+                grid = BrickGrid(shape, (by_axis[0], by_axis[1], by_axis[2]))
+                if grid.number > most or grid.size in seen:
+                    break
+                if fits(stored_of(grid, margin), dtype, margin, memory):
+                    seen.add(grid.size)
+                    yield grid
+                    break
+
+
+def _sizes(cells: int) -> list[int]:
+    """Sizes of bricks along an axis of so many cells, one for each number of bricks, the largest first."""
+    counts = range(1, max(1, -(-cells // EDGE)) + 1)
+    return sorted({_rounded(-(-cells // count), cells) for count in counts}, reverse=True)
+
+
+def _rounded(size: int, cells: int) -> int:
     """Cells of a brick along an axis of so many, at least `size`."""
     return min(-(-size // EDGE) * EDGE, cells)

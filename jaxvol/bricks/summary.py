@@ -1,12 +1,10 @@
 """Which values occur where in a source? Ranges of its blocks, found in one pass over all voxels.
 
-From these, a renderer tells which bricks are empty without reading them. They are the ranges that
-`occupancy.Blocks` has of a volume in memory.
+They tell which bricks are empty without reading them, as `occupancy.Blocks` does of a volume in memory.
 """
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -14,14 +12,14 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
-from .._util.axes import XYZ, Axes, inverse, permuted
-from .._util.checks import integer
+from .._util.axes import Axes, inverse, permuted
 from .._util.memory import give_back
 from ..scene.occupancy import BLOCK, Blocks, widened
-from .dtypes import Box, is_half
-from .sources import Corner, VoxelSource
+from .conversion import Box, comparable
+from .grid import BrickGrid
+from .sources import Corner, VoxelSource, in_background
 
 
 CELL = 16
@@ -60,15 +58,15 @@ class Summary:
         touched = tuple(
             slice(first, last + 1)
             for first, last in (
-                self.blocks_of(int(a), int(b) - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
+                self._blocks_of(int(a), int(b) - 1, n) for a, b, n in zip(low, high, self.shape, strict=True)
             )
         )
         return float(self.low[touched].min()), float(self.high[touched].max())
 
-    def where(self, holds: Callable[[Blocks], Any]) -> np.ndarray:
-        """For each block, whether something holds of it, such as `transfer.visible`: some layers of them at a
-        time, since a transfer function may take a hundred times their memory. `holds` is a
-        tree (`eqx.Partial`): a new lambda would be compiled anew."""
+    def where(self, holds: Callable[[Blocks], Any]) -> Bool[np.ndarray, "bx by bz"]:
+        """For each block, whether something holds of it, such as `transfer.visible`. Some layers of blocks at
+        a time, since a transfer function may take a hundred times their memory. `holds` is a tree
+        (`eqx.Partial`), so that it is compiled once."""
         layers = max(1, AT_ONCE // self.low[0].size)
         found = []
         for begin in range(0, len(self.low), layers):
@@ -76,7 +74,31 @@ class Summary:
             found.append(np.asarray(_holding(holds, self.low[some], self.high[some])))
         return np.concatenate(found)
 
-    def blocks_of(self, first: int, last: int, count: int) -> tuple[int, int]:
+    def bricks_with(
+        self, blocks: Bool[np.ndarray, "bx by bz"]
+    ) -> Callable[[BrickGrid], Bool[np.ndarray, " bricks"]]:
+        """A function that tells for each brick of a grid whether it has any of these blocks. It looks them up
+        in a summed-volume table."""
+        table = blocks.astype(np.int32)
+        for axis in range(3):
+            np.cumsum(table, axis, out=table)
+        table = np.pad(table, ((1, 0),) * 3)
+
+        def among(grid: BrickGrid) -> Bool[np.ndarray, " bricks"]:
+            ends = []
+            for size, n in zip(grid.size, grid.shape, strict=True):
+                touched = [self._blocks_of(low, min(low + size, n - 1), n) for low in range(0, n - 1, size)]
+                first, last = np.array(touched).T
+                ends.append(((first, -1), (last + 1, 1)))
+            number: Any = 0
+            for corner in product(*ends):
+                x, y, z = (index for index, _ in corner)
+                number = number + math.prod(sign for _, sign in corner) * table[np.ix_(x, y, z)]
+            return number.reshape(-1) > 0
+
+        return among
+
+    def _blocks_of(self, first: int, last: int, count: int) -> tuple[int, int]:
         """First and last block along an axis of `count` nodes, that together hold the nodes `first` to
         `last`."""
         final = -(-(count - 1) // self.cell) - 1
@@ -86,14 +108,18 @@ class Summary:
 
 def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress | None = None) -> Summary:
     """The summary of a source, from one pass over its voxels. The source keeps it for the next images, unless
-    it is an array of NumPy or a memory map that is open for writing. Of arrays of other libraries it is taken
-    that nobody writes to them: open a source anew after that.
+    it is an array of NumPy or a memory map that is open for writing. Arrays of other libraries are assumed
+    not to change: open a source again after writing to one.
 
-    **Arguments:** `source`: the voxels. `memory`, `progress`: see `scan`.
+    **Arguments:**
 
-    **Returns:** the summary.
+    - `source`: the voxels.
+    - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk takes more.
+    - `progress`: called after each part; what it raises ends the pass.
 
-    **Raises:** as `scan` does.
+    **Returns:** the summary. It takes 2 / 16³ of the voxels' memory.
+
+    **Raises:** `ValueError` for what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
     """
     if source._summary is not None:
         source.check_unchanged()
@@ -105,28 +131,15 @@ def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress |
     return found
 
 
-def scan(
-    source: VoxelSource, cell: int | Any = BLOCK, *, memory: int = 2**28, progress: Progress | None = None
-) -> Summary:
-    """The summary of a source, from one pass over its voxels.
-
-    **Arguments:**
-
-    - `cell`: cells along the side of a block. A summary takes 2 / `cell`³ of the voxels' memory.
-    - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk takes more.
-    - `progress`: called after each part; what it raises ends the pass.
-
-    **Raises:** `ValueError` for what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
-    """
-    cell = integer("cell", cell, 1)
+def scan(source: VoxelSource, cell: int, *, memory: int = 2**28, progress: Progress | None = None) -> Summary:
+    """As `summary_of`, by reading all voxels. `cell`: cells along the side of a block."""
     blocks = tuple(-(-(n - 1) // cell) for n in source.shape)
     limits = (jnp.iinfo if source.dtype.kind in "iu" else jnp.finfo)(source.dtype)
     low, high = np.full(blocks, limits.max, source.dtype), np.full(blocks, limits.min, source.dtype)
     done, order = 0, source.order
     for box, voxels in _parts(source, memory):
         done += voxels.size
-        if is_half(voxels.dtype):  # NumPy compares these one by one, and float32 in a fraction of the time
-            voxels = voxels.astype(np.float32)
+        voxels = comparable(voxels)
         first = permuted(box[0], order)
         for ranges, combine in ((low, np.minimum), (high, np.maximum)):
             part, place = _over_blocks(voxels, first, cell, combine, permuted(blocks, order))
@@ -141,28 +154,12 @@ def scan(
 def _parts(source: VoxelSource, memory: int) -> Iterator[tuple[Box, np.ndarray]]:
     """All voxels, in boxes of whole chunks, each read while the one before is looked at, with their axes in
     the order of storage."""
-    most = min(memory // COPIES, MOST)
-    extent = list(source.chunks)
-    item = source.dtype.itemsize
-    for axis in reversed(source.order):  # rows first
-        while extent[axis] < source.shape[axis] and 2 * math.prod(extent) * item <= most:
-            extent[axis] = min(2 * extent[axis], source.shape[axis])
-    ends = [range(0, n, step) for n, step in zip(source.shape, extent, strict=True)]
-    boxes: list[Box] = []
-    for low in product(*permuted(ends, source.order)):
-        first = permuted(low, inverse(source.order))
-        last = [min(a + e, n) for a, e, n in zip(first, extent, source.shape, strict=True)]
-        boxes.append((first, permuted(last, XYZ)))
-
-    def reading(number: int) -> "Future[np.ndarray]":
-        low, high = boxes[number]
-        return source.read_async(low, high, source.order)
-
-    coming = reading(0)
-    for number, box in enumerate(boxes):
+    boxes = list(source.parts(((0, 0, 0), source.shape), min(memory // COPIES, MOST)))
+    coming = in_background(source.read, *boxes[0], source.order)
+    for box, following in zip(boxes, [*boxes[1:], None], strict=True):
         voxels = coming.result()
-        if number + 1 < len(boxes):
-            coming = reading(number + 1)
+        if following is not None:
+            coming = in_background(source.read, *following, source.order)
         yield box, voxels
 
 
@@ -174,23 +171,15 @@ def _over_blocks(
     place = []
     for axis, (begin, count) in enumerate(zip(first, counts, strict=True)):
         end = begin + voxels.shape[axis]
-        block, until = max((begin - 1) // cell, 0), min((end - 1) // cell + 1, count)
-        place.append(slice(block, until))
-        voxels = _along(voxels, axis, begin, end, range(block, until), cell, combine)
+        blocks = slice(max((begin - 1) // cell, 0), min((end - 1) // cell + 1, count))
+        at = np.arange(blocks.start, blocks.stop) * cell + np.arange(cell + 1)[:, None]
+        at = np.clip(at, begin, end - 1) - begin  # a node that is not there becomes one of the same block
+        found = voxels.take(at[0], axis)
+        for nodes in at[1:]:
+            combine(found, voxels.take(nodes, axis), out=found)
+        voxels = found
+        place.append(blocks)
     return voxels, (place[0], place[1], place[2])
-
-
-def _along(
-    voxels: np.ndarray, axis: int, begin: int, end: int, blocks: range, cell: int, combine: np.ufunc
-) -> np.ndarray:
-    """Along one axis, of which there are the nodes from `begin` to `end`."""
-
-    at = np.arange(blocks.start, blocks.stop) * cell + np.arange(cell + 1)[:, None]
-    at = np.clip(at, begin, end - 1) - begin  # a node that is not there becomes one of the same block
-    found = voxels.take(at[0], axis)
-    for nodes in at[1:]:
-        combine(found, voxels.take(nodes, axis), out=found)
-    return found
 
 
 @eqx.filter_jit

@@ -5,27 +5,39 @@ import time
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 from jaxtyping import Array, Bool
 
 from .._util.checks import described, flag, integer
+from ..bricks import VoxelSource, render_bricks
+from ..bricks.opening import Openable
 from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
+from ..engine.image import render_scene
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
 from ..march.transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
-from ..ray import check_arguments
+from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
-from ..scene.rendering import Rendering
-from ..scene.space import Space, median_node_distance
+from ..scene.rendering import BrickReport, Rendering
+from ..scene.space import median_node_distance
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
-from .lightings import simpler, smooth
-from .probe import Probe, Setting, Truth
+from .choices import (
+    LIT,
+    Part,
+    brightest_of,
+    cheapest_march,
+    has_variants,
+    proven_transforms,
+    seconds_of,
+    simplest_light,
+)
+from .memory import read_within, with_bricks
+from .probe import Probe, Setting
 from .storage import stored
-from .trials import COARSEST, RAY, Trial, Trials
+from .trials import COARSEST, Trials
 
 
 MARGIN = 0.95
@@ -37,53 +49,32 @@ ENDS = 1 / 16
 ROUNDED = 1 / 8
 """Part of it that voxels of a smaller type may take, of what all else has left."""
 
-LIT = 1 / 2
-"""Part of what is left that is for light, where there is any."""
-
 GRADIENTS_END = 1e-4
 """Transmittance at which rays may end where gradients count."""
 
-EMPTY = 0.05
-"""Part of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
-
 OPAQUE = 0.01
 """Part of the pixels that become opaque, below which there is nothing to end early."""
-
-WORTHWHILE = 16
-"""Samples of a pixel, by the midpoint rule, below which cells that are integrated save no more than 16 %,
-even if they are four times as long; they may be longer where steps are shorter than FAIR voxels."""
-
-FAIR = 0.5
-
-TOGETHER = 0.4
-"""What a sample takes in an image, of what it takes in patches, which lie apart and so share no cached
-voxels: the median of 21 images of `experiments.planning`, between 0.18 and 0.72."""
-
-HALVED = 3
-"""How often the step is halved at most because light changes along a ray."""
 
 DECIDED = AdaptiveSampling, EarlyTermination, SpaceLeaping
 """Transforms that a plan decides on, besides `AlphaCorrection` at the exit."""
 
 
-class Part(NamedTuple):
-    """A part of a plan: what it is, whether it was kept or left out, and why."""
-
-    name: str
-    kept: bool
-    why: str
-
-
 class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
-    - `march`, `volume`, `lighting`: what to pass to `render`.
+    - `march`, `volume`, `lighting`, `compositing`: what to pass to `render`. Where `bricks` is given,
+      `volume` is only the copy that was planned with.
     - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels; where
       nothing could be proven to be within the tolerance, just above it.
     - `seconds`: predicted for one image on this machine, once compiled, to within a factor of some 2.
       `samples`: predicted for each pixel.
     - `parts`: what was kept or left out, and why.
     - `probed`: seconds that planning took, compilation included.
+    - `source`, `memory`: the volume and the budget, bytes, if there was one.
+    - `stride`: of the copy of every n-th voxel that was planned with, to which `error`, `seconds` and
+      `samples` belong; 1 where the volume fits.
+    - `bricks`: what to expect of `render_bricks`, of which nothing is read yet: at most `needed` bricks will
+      be, for this camera and others of as many pixels. None where the volume fits.
     """
 
     march: March
@@ -95,11 +86,31 @@ class Plan(NamedTuple):
     samples: float
     parts: tuple[Part, ...]
     probed: float
+    compositing: Compositing[Any] = Over()
+    source: VoxelSource | None = None
+    memory: int | None = None
+    stride: int = 1
+    bricks: BrickReport | None = None
 
     @property
     def within(self) -> bool:
         """Whether the predicted error is within the tolerance."""
         return self.error <= self.tolerance
+
+    def render(self, transfer: Transfer | Any, camera: Camera | Any, **options: Any) -> Rendering:
+        """The image as planned.
+
+        **Arguments:** `transfer`, `camera`: as for the plan. `options`: `outputs` and `devices`, as for
+        `render`.
+
+        **Returns:** as `render`.
+        """
+        how = {"compositing": self.compositing, "lighting": self.lighting, **options}
+        if self.bricks is not None:
+            return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
+        check_arguments("render(transfer, camera)", transfer=transfer, camera=camera)
+        scene = Scene(self.volume, transfer, camera, self.march, self.compositing, self.lighting)
+        return render_scene(scene, options.get("outputs", "all"), "replay", devices=options.get("devices"))
 
     def __str__(self) -> str:
         transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
@@ -110,17 +121,31 @@ class Plan(NamedTuple):
             f"{rmse}, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a pixel; "
             f"some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
         )
-        wide = max(len(part.name) for part in self.parts)
+        wide = max((len(part.name) for part in self.parts), default=0)
         lines = [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
-        return "\n".join([head, *lines])
+        return "\n".join([*self._memory_lines(), head, *lines])
+
+    def _memory_lines(self) -> list[str]:
+        if self.source is None or self.memory is None:
+            return []
+        size, given = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
+        if self.bricks is None:
+            return [f"in memory: {size} of voxels, and what is made of them, fit into {given}"]
+        return [
+            f"{' x '.join(map(str, self.bricks.counts))} bricks: {size} of voxels, and what is made of them, "
+            f"do not fit into {given}; at most {self.bricks.needed} are read. Planned on a copy of one voxel "
+            f"in {self.stride} along each axis, at 1/{self.stride} of its step; error and time below are the "
+            "copy's"
+        ]
 
 
 def plan(
-    volume: Volume | Any,
+    volume: Volume | Openable,
     transfer: Transfer | Any,
     camera: Camera | Any,
     tolerance: float | Any,
     *,
+    memory: int | Any | None = None,
     transforms: tuple[Transform, ...] | Any = (),
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
@@ -151,6 +176,12 @@ def plan(
       the first of several cheaper ones, of what was given and of that without its noise that is within
       the tolerance, compared with the last (as many templates as were given, blended: their own noise does
       not count); the step is halved as long as that changes the lit image by more than what is left.
+    - **bricks**: a volume that does not fit into `memory`, with what `render` makes of it (IN_MEMORY bytes
+      for each byte of voxels), is rendered by `render_bricks`. The march is planned on a copy of every n-th
+      voxel along each axis, and its step divided by n. That is cautious where the volume is smooth, but the
+      error is that of the copy: detail finer than n voxels has been seen in samples only. A copy does not
+      prove what is empty, so that `AlphaCorrection` and `SpaceLeaping` are kept. Where the smallest bricks,
+      with what a ray may read around them, do not fit, the step is halved, up to four times.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
     estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
@@ -160,8 +191,11 @@ def plan(
 
     **Arguments:**
 
-    - `volume`, `transfer`, `camera`: the scene. An image of another camera needs a plan of its own.
+    - `volume`: a `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
+    - `transfer`, `camera`: as for `render`. An image of another camera needs a plan of its own.
     - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
+    - `memory`: bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
+      quarter of the device's memory otherwise.
     - `transforms`: those that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
       kept.
     - `compositing`, `lighting`: as for `render`.
@@ -178,23 +212,28 @@ def plan(
     takes images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
 
     **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
-    (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
+    (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides; for a source that
+    `bricks.source_of` refuses; and for less memory than a copy or the smallest bricks take.
     """
     begun = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
-    check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
+    check_arguments(order, transfer=transfer, camera=camera, lighting=lighting)
     gradients = flag("gradients", gradients)
     once = flag("once", once)
+    source, room, stride = None, None, 1
+    if memory is not None or not isinstance(volume, Volume):
+        volume, source, room, stride = read_within(volume, memory)
+    check_arguments(order, volume=volume)
     scene = Setting(volume, transfer, compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, (scene, camera))
-    choice = lighting if lighting is not None and _has_variants(lighting) else None
+    choice = lighting if lighting is not None and has_variants(lighting) else None
     setting = scene if choice is None else scene._replace(lighting=None)
     space = March(1.0, given).locate(volume)
     visible = _occupied(setting, given)
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
 
     over = isinstance(setting.compositing, Over)
-    proven, parts = _proven(visible, space, given)
+    proven, parts = proven_transforms(visible, space, given, copy=stride > 1)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
     voxel = float(median_node_distance(space, visible.shape))
 
@@ -209,16 +248,17 @@ def plan(
     opaque = probe.mean(seen.rgba[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     goal = MARGIN * tolerance - share
-    trials = trials_of(ends / _brightest(seen), goal)
-    chosen, truth = _marched(trials, parts, lit=lighting is not None, once=once)
-    brightest, lit, light_error, light_seconds = _brightest(truth.image), lighting, 0.0, 0.0
+    trials = trials_of(ends / brightest_of(seen), goal)
+    chosen, truth = cheapest_march(trials, parts, lit=lighting is not None, once=once)
+    brightest, lit, light_error, light_seconds = brightest_of(truth.image), lighting, 0.0, 0.0
     if choice is not None:
-        chosen, lit, light_error, light_seconds, brightest = _lit(
+        chosen, lit, light_error, light_seconds, brightest = simplest_light(
             trials, chosen, choice, goal, parts, gradients=gradients
         )
     elif lighting is not None:
         parts.append(Part("light: as given", True, "none is simpler; it is in the images that were compared"))
-    march, name = _without(chosen.march, EarlyTermination), "EarlyTermination"
+    kept = tuple(each for each in chosen.march.transforms if not isinstance(each, EarlyTermination))
+    march, name = March(chosen.march.step, kept, chosen.march.quadrature), "EarlyTermination"
     if share:
         ending = EarlyTermination(share / brightest)
         march, name = March(march.step, (*march.transforms, ending), march.quadrature), _written(ending)
@@ -230,18 +270,27 @@ def plan(
         allowed = min(ROUNDED * tolerance, max(tolerance - error, 0))
         setting, rounding, said = stored(probe, setting._replace(lighting=lit), chosen.march, allowed)
     parts += [Part(*each) for each in said]
-    seconds = _seconds(trials, chosen) + light_seconds
-    taken = time.perf_counter() - begun
+    seconds = seconds_of(trials, chosen) + light_seconds
+    bricks = None
+    if source is not None and room is not None and stride > 1:
+        how = room, stride, scene.compositing, lit
+        march, bricks = with_bricks(source, transfer, camera, march, *how)
     return Plan(
-        march, setting.volume, lit, tolerance, error + rounding, seconds, chosen.samples, tuple(parts), taken
+        march=march,
+        volume=setting.volume,
+        lighting=lit,
+        tolerance=tolerance,
+        error=error + rounding,
+        seconds=seconds,
+        samples=chosen.samples,
+        parts=tuple(parts),
+        probed=time.perf_counter() - begun,
+        compositing=scene.compositing,
+        source=source,
+        memory=room,
+        stride=stride,
+        bricks=bricks,
     )
-
-
-def _brightest(image: Rendering) -> float:
-    """The brightest colour, 1 or more: by so much of what is left of a ray its early end may err."""
-    rgba = np.asarray(image.rgba, np.float64)
-    seen = rgba[:, 3] > 1e-3
-    return float(max(1.0, np.max(rgba[seen, :3] / rgba[seen, 3:], initial=0.0)))
 
 
 def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[Transform, ...]]:
@@ -267,162 +316,12 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     return number, given
 
 
-def _has_variants(lighting: Lighting) -> bool:
-    """Whether there is a choice of lightings that look nearly the same."""
-    return bool(simpler(lighting)) or smooth(lighting) is not lighting
-
-
 def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
     """The blocks that may change a pixel."""
     volume, transfer, mode, _ = setting
     if mode.resolves:
         transfer, _ = mode.marched(transfer, March(1.0, given), volume)
     return mode.occupied(transfer, Blocks.of(volume, slopes=transfer.reads_gradient))
-
-
-def _proven(
-    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...]
-) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that proofs decide on, from the blocks that may hold anything visible."""
-    found: list[Transform] = []
-    parts = []
-    at_faces = space.visible_at_faces(visible)
-    faces = sum(map(bool, at_faces))
-    if any(isinstance(each, AlphaCorrection) for each in given):
-        parts.append(Part("AlphaCorrection", True, "part of the scene"))
-    elif faces:
-        cut = "" if len(at_faces) == 6 else " and cuts"
-        why = f"something may be visible at {faces} of the volume's {len(at_faces)} faces{cut}"
-        parts.append(Part("AlphaCorrection", True, why))
-        found.append(AlphaCorrection())
-    else:
-        parts.append(Part("AlphaCorrection", False, "nothing is visible at the volume's faces: proven"))
-    empty = float(np.mean(~np.asarray(visible)))
-    leaps = empty >= EMPTY
-    parts.append(Part("SpaceLeaping", leaps, f"{empty:.1%} of the blocks hold nothing visible"))
-    return (*found, *((SpaceLeaping(),) if leaps else ())), parts
-
-
-def _marched(trials: Trials, parts: list[Part], *, lit: bool, once: bool) -> tuple[Trial, Truth]:
-    """The cheapest march within the goal. `lit`: whether it is for an image with light, along which
-    adaptive sampling cannot know how samples change. `once`: as for `plan`."""
-    uniform, truth = trials.uniform()
-    step, samples = float(uniform.march.step) / trials.voxel, uniform.samples
-    name = f"step {float(uniform.march.step):.4g}"
-    if not math.isfinite(uniform.error):
-        parts.append(Part(name, True, "the image is not finite, or rays use up their samples"))
-        return uniform, truth
-    if uniform.error > trials.goal:
-        why = f"{step:.2g} voxels, the shortest tried: not proven to be within the tolerance"
-        parts.append(Part(name, True, why))
-        return uniform, truth
-    parts.append(Part(name, True, f"{step:.3g} voxels, {uniform.kind}: RMSE {uniform.error:.2g}"))
-    if uniform.kind == "preintegrated":
-        parts.append(Part("preintegrated", True, "the midpoint rule would be slower within the tolerance"))
-        return uniform, truth
-    if samples <= WORTHWHILE and step >= FAIR:
-        why = f"{samples:.1f} samples a pixel: too few to save any"
-        parts.append(Part("preintegrated, AdaptiveSampling", False, why))
-        return uniform, truth
-    if once:
-        why = "not tried for one image: a program of its own takes longer to compile than it saves"
-        parts.append(Part("preintegrated, AdaptiveSampling", False, why))
-        return uniform, truth
-    others = {
-        "preintegrated": trials.integrated(step, truth),
-        "AdaptiveSampling": "it does not know light" if lit else trials.adaptive(step, truth),
-    }
-    found = [uniform, *(other for other in others.values() if isinstance(other, Trial))]
-    best = min(found, key=lambda each: each.cost)
-    for name, other in others.items():
-        why = other
-        if isinstance(other, Trial):
-            fewer = f"{other.samples:.1f} samples a pixel for {samples:.1f}"
-            why = f"step {float(other.march.step):.4g}, {fewer}: cost {other.cost / uniform.cost:.2f}"
-        assert isinstance(why, str)
-        parts.append(Part(name, other is best, why))
-    return best, truth
-
-
-def _lit(
-    trials: Trials, chosen: Trial, lighting: Lighting, goal: float, parts: list[Part], *, gradients: bool
-) -> tuple[Trial, Lighting, float, float, float]:
-    """The march, the cheapest lighting within what is left of the goal, its error, the seconds that it adds
-    to an image, and the brightest colour."""
-    probe, setting = trials.probe, trials.setting
-
-    def rendered(march: March, lighting: Lighting) -> Rendering:
-        return probe.render(setting._replace(lighting=lighting), march)
-
-    without_noise = smooth(lighting)
-    truth = rendered(chosen.march, without_noise)
-    tried = [(each.lighting, each.what) for each in simpler(lighting) if each.has_gradient or not gradients]
-    left, found = goal - chosen.error, []
-    for other, what in (*tried, (lighting, "as given"), (without_noise, "as given, without its noise")):
-        error = probe.distance(rendered(chosen.march, other), truth)
-        found.append((error if math.isfinite(error) else math.inf, other, what))
-        if error <= left:
-            break
-    error, lit, used = min(found, key=lambda each: each[0])
-    if error <= left:
-        error, lit, used = found[-1]
-    for each, _, what in found:
-        why = f"RMSE {each:.2g}"
-        if what == used and error > left:
-            why += ", the least of these: not within the tolerance"
-        parts.append(Part(f"light: {what}", what == used, why))
-    # how light changes along a ray is not known before: shorter steps must not change the image
-    march, change = chosen.march, math.inf
-    allowed = goal - error if error <= left else goal * (1 - LIT)
-    image = rendered(march, lit)
-    for _ in range(HALVED):
-        half = March(march.step / 2, march.transforms, march.quadrature)
-        finer = rendered(half, lit)
-        change = 4 / 3 * probe.distance(image, finer)
-        if change <= allowed:
-            break
-        longer = f"step {float(march.step):.4g}"
-        parts[:] = [part._replace(kept=part.kept and part.name != longer) for part in parts]
-        why = f"halved: with light, twice as long steps change the image by {change:.2g}"
-        parts.append(Part(f"step {float(half.step):.4g}", True, why))
-        image, march, change = finer, half, change / 3
-    samples = probe.mean(image.samples)
-    marched = Trial(march, max(chosen.error, change), samples, chosen.kind)
-    unlit, with_light = (_fastest(probe, setting._replace(lighting=each), march) for each in (None, lit))
-    pixels = probe.pixels * probe.share / probe.inside.size
-    return marched, lit, error, max(with_light - unlit, 0.0) * pixels, _brightest(image)
-
-
-def _without(march: March, kind: type[Transform]) -> March:
-    kept = tuple(each for each in march.transforms if not isinstance(each, kind))
-    return March(march.step, kept, march.quadrature)
-
-
-def _fastest(probe: Probe, setting: Setting, march: March) -> float:
-    """Seconds to render the patches, once compiled."""
-
-    def once() -> float:
-        begun = time.perf_counter()
-        jax.block_until_ready(probe.render(setting, march).rgba)
-        return time.perf_counter() - begun
-
-    once()
-    return min(once() for _ in range(2))
-
-
-def _seconds(trials: Trials, chosen: Trial) -> float:
-    """Time of an image on this machine, to within a factor of some 2. What a sample costs is taken from two
-    steps, so that calls, which take as long for a few pixels as for an image, do not count. The program of
-    their images was compiled for another one before."""
-    times, samples = [], []
-    for step in trials.steps("midpoint"):
-        times.append(trials.seconds["midpoint", step])
-        samples.append(float(np.asarray(trials.image(step, "midpoint").samples, np.float64).sum()))
-    pixels = trials.probe.pixels
-    if samples[0] <= 1.1 * samples[1]:  # nothing is seen
-        return times[1] * pixels * trials.probe.share / trials.probe.inside.size
-    a_sample = max(times[0] - times[1], 0.0) / (samples[0] - samples[1])
-    return TOGETHER * a_sample * (chosen.cost - RAY * (1 - trials.probe.share)) * pixels
 
 
 def _written(transform: Transform) -> str:

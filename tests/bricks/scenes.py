@@ -146,9 +146,9 @@ class _Bent(Space):
         return x, y, z - self._down(x)
 
     def least_distances(self, low, high):
-        x, y, z, bend = (np.asarray(each) for each in (*self.flat.spacing, self.bend))
-        aside = max(abs(float(end[0] * x + self.flat.low[0] - self.flat.middle[0])) for end in (low, high))
-        return jnp.asarray(x), jnp.asarray(y), jnp.asarray(z / np.hypot(1, 2 * bend * aside), x.dtype)
+        x, y, z = self.flat.spacing
+        aside = [jnp.abs(end[0] * x + self.flat.low[0] - self.flat.middle[0]) for end in (low, high)]
+        return x, y, z / jnp.sqrt(1 + (2 * self.bend * jnp.maximum(*aside)) ** 2)
 
     def _below(self, origin, direction, level):
         """Between which depths a ray is below a level of the grid."""

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import re
 
 import equinox as eqx
 import jax
@@ -12,12 +11,11 @@ import pytest
 
 import jaxvol as jv
 from experiments import bricks_paper
-from jaxvol.bricks import BrickGrid, Summary, overlap_of, share, source_of, split as splitting
-from jaxvol.bricks.cells import Turn
-from jaxvol.bricks.choice import cheapest, counts, visible
-from jaxvol.bricks.render import _scene_of, bricks_of
-from jaxvol.bricks.split import Margin, TooLittleMemory, check_smallest, fits, nodes_within, split, stored_of
-from jaxvol.bricks.stream import _curved
+from jaxvol.bricks import BrickGrid, Summary, overlap_of, share, source_of
+from jaxvol.bricks.cells import Visit
+from jaxvol.bricks.render import _scene_of
+from jaxvol.bricks.split import Margin, cheapest, fits, nodes_within, split, stored_of
+from jaxvol.bricks.traversal import _curved
 from jaxvol.engine.brick_march import begin_rays
 from jaxvol.engine.tiling import RenderOptions, Tiling
 
@@ -91,15 +89,15 @@ def test_a_brick_is_visible_if_any_of_its_blocks_is(size):
     shape = (97, 128, 100)
     summary, occupied = summary_with(shape, np.s_[2:4, 5:6, :3])
     grid = BrickGrid(shape, size)
-    found = visible(grid, summary, counts(occupied))
+    found = summary.bricks_with(occupied)(grid)
     for brick in range(grid.number):
         low, high = grid.cells(brick)
         part = tuple(slice(a // CELL, -(-b // CELL)) for a, b in zip(low, high, strict=True))
         assert found[brick] == occupied[part].any()
 
 
-def read_of(grid, summary, occupied):
-    return visible(grid, summary, counts(occupied)).sum() * math.prod(stored_of(grid, MARGIN, None))
+def read_of(grid, visible):
+    return visible(grid).sum() * math.prod(stored_of(grid, MARGIN))
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -107,31 +105,33 @@ def test_bricks_follow_what_is_visible(axis):
     """Bricks along a rod leave out what is beside it."""
     box, memory = tuple(slice(None) if a == axis else slice(4, 7) for a in range(3)), 2**22
     summary, occupied = summary_with(CUBE, box)
-    first = split(CUBE, np.uint8, memory, MARGIN, None)
-    best = cheapest(first, nothing(CUBE), summary, counts(occupied), MARGIN, memory, 0)
-    assert fits(stored_of(best, MARGIN, None), np.dtype(np.uint8), MARGIN, memory)
-    assert read_of(best, summary, occupied) < 0.7 * read_of(first, summary, occupied)
+    visible = summary.bricks_with(occupied)
+    first = split(CUBE, np.uint8, memory, MARGIN)
+    best = cheapest(first, nothing(CUBE), visible, MARGIN, memory, 0)
+    assert fits(stored_of(best, MARGIN), np.dtype(np.uint8), MARGIN, memory)
+    assert read_of(best, visible) < 0.7 * read_of(first, visible)
     # nothing that fits into as many bricks reads less
     for parts in itertools.product(range(1, 9), repeat=3):
         x, y, z = (-(-256 // p // 16) * 16 for p in parts)
         other = BrickGrid(CUBE, (x, y, z))
-        fitting = fits(stored_of(other, MARGIN, None), np.dtype(np.uint8), MARGIN, memory)
+        fitting = fits(stored_of(other, MARGIN), np.dtype(np.uint8), MARGIN, memory)
         if fitting and other.number <= 2 * first.number:
-            assert read_of(best, summary, occupied) <= read_of(other, summary, occupied)
+            assert read_of(best, visible) <= read_of(other, visible)
 
 
-def test_devices_that_own_bricks_take_one_each_at_a_time():
+def test_devices_that_share_bricks_take_one_each_at_a_time():
     """A rod, of which a single long brick would do, and leave seven devices idle."""
     summary, rod = summary_with(CUBE, np.s_[4:6, 4:6, :])
-    given = nothing(CUBE), summary, counts(rod), MARGIN, 2**26, 0
-    one, eight = (cheapest(split(CUBE, np.uint8, 2**26, MARGIN, None, n), *given, n) for n in (1, 8))
-    assert visible(eight, summary, counts(rod)).sum() > visible(one, summary, counts(rod)).sum()
+    visible = summary.bricks_with(rod)
+    given = nothing(CUBE), visible, MARGIN, 2**26, 0
+    one, eight = (cheapest(split(CUBE, np.uint8, 2**26, MARGIN, n), *given, n) for n in (1, 8))
+    assert visible(eight).sum() > visible(one).sum()
 
 
 def test_a_brick_has_fewer_voxels_than_a_volume_may_have():
     shape, margin = (1600, 1600, 1600), Margin((11, 11, 11), 11, 11.0, 0.0, 1, False)
-    grid = split(shape, np.uint8, 20 * 2**30, margin, None)
-    stored = stored_of(grid, margin, None)
+    grid = split(shape, np.uint8, 20 * 2**30, margin)
+    stored = stored_of(grid, margin)
     assert math.prod(stored) < 2**31
     assert grid.counts == (2, 1, 1)  # and no more than that takes
     with pytest.raises(
@@ -139,24 +139,8 @@ def test_a_brick_has_fewer_voxels_than_a_volume_may_have():
     ):
         jv.render_bricks(nothing(shape), TRANSFER, CAMERA, PLAIN, bricks=(1, 1, 1))
     # no axis is split along which bricks would be read whole
-    grid = split((65, 49, 65), np.uint8, 125_000, Margin((1, 20, 2), 1, 1.0, 0.0, 1, False), None)
+    grid = split((65, 49, 65), np.uint8, 125_000, Margin((1, 20, 2), 1, 1.0, 0.0, 1, False))
     assert grid.counts[1] == 1
-
-
-def test_the_least_memory_that_is_named_holds_bricks():
-    """It is no more than what a march takes that reads little around a brick."""
-    data = np.random.default_rng(0).uniform(size=(64, 64, 64)).astype(np.float32)
-    with pytest.raises(TooLittleMemory) as refused:
-        check_smallest(data.shape, data.dtype, 1)
-    least = int(re.findall(r"\d+", str(refused.value))[0])
-    check_smallest(data.shape, data.dtype, least)
-    stream = bricks_of(source_of(data), TRANSFER, CAMERA, jv.March(1e-3), memory=10**9)
-    for too_little in (
-        lambda: check_smallest(data.shape, data.dtype, least - 1),
-        lambda: split(data.shape, data.dtype, least - 1, stream.margin, None),
-    ):
-        with pytest.raises(TooLittleMemory):
-            too_little()
 
 
 # ---- what is read around bricks ----
@@ -186,21 +170,9 @@ def coordinates_of(space, points):
     return jax.vmap(lambda p: jnp.stack(space.coordinate((p[0], p[1], p[2]))))(points)
 
 
-@pytest.fixture
-def few_programs(monkeypatch):
-    """Distances between nodes are found by one program, and not one of each operation."""
-    least = eqx.filter_jit(lambda space, low, high: space.least_distances(low, high))
-
-    def distances(space, low, high):
-        ends = (tuple(jnp.asarray(c, jnp.float32) for c in end.tolist()) for end in (low, high))
-        return tuple(map(float, least(space, *ends)))
-
-    monkeypatch.setattr(splitting, "_distances", distances)
-
-
 @pytest.mark.parametrize("length", [0.3, 2.0, 12.0])
 @pytest.mark.parametrize("kind", PROBES)
-def test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes(kind, length, few_programs):
+def test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes(kind, length):
     """Found by walking from points in random boxes, in random directions of the world."""
     space, rng, last = space_of(kind), np.random.default_rng(0), np.array(SHAPE) - 1
     for _ in range(20):
@@ -217,7 +189,7 @@ def test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes(kind, length
         assert np.any(nodes < SHAPE)
 
 
-def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other(few_programs):
+def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other():
     """From a node 13.4 mm from the apex, in random directions: 12 mm are an angle of asin(12 / 13.4), and not
     12 / 13.4."""
     space, length, at = space_of("near apex"), 12.0, np.array([20.0, 2.0, 12.0])
@@ -230,15 +202,14 @@ def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other(f
 
 def test_cells_of_curved_rays_are_found_under_64_bits():
     """Traced only: a loop whose state changes its type is an error then."""
-    place = np.ones(3, np.float32), np.zeros(3, np.float32)
-    scene = _scene_of(source_of(fog()), place, SHEETS, FROM_THE_SIDE, CURVED, "over", None)
+    scene = _scene_of(source_of(fog()), SHEETS, FROM_THE_SIDE, CURVED, "over", None)
 
     def cells_of(scene):
         underway = begin_rays(scene, RenderOptions("all", Tiling.of_backend(None)))
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
-        turn = Turn(jnp.asarray(0, jnp.int32), empty, empty.at[0].set(True), empty)
+        visit = Visit(jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty)
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
-        return _curved(None, grid, 11, scene.march, underway.rays, underway.at, reached, turn)
+        return _curved(None, grid, 11, scene.march, underway.rays, underway.at, reached, visit)
 
     with in_float64():
         found = eqx.filter_eval_shape(cells_of, to_float64(scene))

@@ -166,7 +166,7 @@ def test_other_transformations_say_what_to_do():
 
     for how, message in (
         ({"compositing": jv.Isosurface(0.5)}, "compositing by Isosurface has no gradient through bricks"),
-        ({"method": each_at_once}, "turns of your own have no gradient"),
+        ({"method": each_at_once}, "a schedule of your own has no gradient"),
     ):
         with pytest.raises(ValueError, match=message):
             jax.vjp(partial(shown, how), at)
@@ -198,7 +198,8 @@ def test_bricks_look_like_the_whole_where_rays_leave_them_and_come_back(method):
 ARRAY = np.ascontiguousarray(balls())
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"memory": 1000}, "memory must be at least .* got 1000"),
-    ({"memory": -1}, "memory must be an integer of at least 1; got -1"),
+    ({"memory": -1}, "memory must be an integer of at least 1, a number of bytes; got -1"),
+    ({"memory": "512M"}, "memory must be an integer of at least 1, a number of bytes; got '512M'"),
     ({"bricks": (2, 2)}, "bricks must be three numbers"),
     ({"bricks": (0, 1, 1)}, r"bricks must be three numbers .*, each .* at least 1.*; got \(0, 1, 1\)"),
     ({"bricks": (2, 1.5, 2)}, "bricks must be three numbers .* got .*1.5"),

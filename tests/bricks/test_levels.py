@@ -52,8 +52,6 @@ def test_an_axis_along_which_levels_are_as_fine_does_not_count():
         for f in (1, 2)
     ]
     assert level_for(flat, camera(150)) == 1
-    with pytest.raises(ValueError, match=r"levels must have spacing and origin; level 1 \(array\) has none"):
-        level_for([flat[0], VoxelSource(np.zeros((4, 4, 4), np.uint8))], camera(1))
 
 
 def test_an_image_of_ome_zarr_takes_the_level_of_its_pixels_or_the_one_that_is_asked_for(tmp_path):

@@ -79,10 +79,10 @@ def test_voxels_outside_of_the_ranges_found_before_are_refused(value, tmp_path):
     """As where another process writes to a map."""
     data = np.memmap(tmp_path / "a", np.uint8, "w+", shape=(24, 25, 26))
     data[:] = 100
-    stream = bricks_of(source_of(data), TRANSFER, CAMERA, PLAIN, memory=10**6)
+    traversal = bricks_of(source_of(data), TRANSFER, CAMERA, PLAIN, memory=10**6)
 
     def read():
-        return stream.read(0, *stream.around(0))[1].result()
+        return traversal.read(0, *traversal.around(0))[1].result()
 
     np.testing.assert_array_equal(read(), data)
     data[20, 20, 20] = value

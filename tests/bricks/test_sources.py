@@ -44,11 +44,11 @@ def boxes(shape, count=12):
 
 
 def assert_reads(source, data):
-    """In any order of axes, and in another thread."""
+    """In any order of axes."""
     assert (source.shape, source.dtype) == (data.shape, data.dtype)
     for (low, high), axes in zip(boxes(data.shape), itertools.cycle(ORDERS), strict=False):
         box = data[tuple(map(slice, low, high))]
-        plain = source.read_async(low, high).result()
+        plain = source.read(low, high)
         for found, expected in ((source.read(low, high, axes), box.transpose(axes)), (plain, box)):
             assert found.flags.c_contiguous
             assert found.dtype == data.dtype
@@ -112,6 +112,14 @@ def kinds_of_arrays(data, folder):
     with h5py.File(folder / "a.h5", "w") as file:
         yield file.create_dataset("a", data=turned, chunks=(8, 9, 10)), {"axes": "zxy"}
         yield file.create_dataset("b", data=turned), {"axes": "zxy"}
+
+
+def test_an_array_of_a_file_that_is_closed_is_refused(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        array = file.create_dataset("a", data=voxels())
+    with pytest.raises(ValueError, match=r"source must be an array that can be read; .*Keep its file open"):
+        source_of(array)
 
 
 def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatch):
@@ -212,7 +220,7 @@ def test_memory_maps_are_read_and_not_held(tmp_path):
 
 def test_spacing_and_origin(tmp_path):
     path = x_fastest(tmp_path / "data_23x17x31_uint8.raw", voxels())
-    assert source_of(path).spacing is None
+    assert (source_of(path).spacing, source_of(path).origin) == ((1, 1, 1), (0, 0, 0))
     path.with_name(f"{path.name}.json").write_text('{"spacing": [1, 2, 3], "origin": [4, 5, 6]}')
     assert (source_of(path).spacing, source_of(path).origin) == ((1, 2, 3), (4, 5, 6))
     source = source_of(path, spacing=(0.1, 0.2, 0.3))
@@ -328,6 +336,5 @@ def test_a_file_that_is_cut_or_written_to_after_opening_is_an_error(change, tmp_
     sources_ = source_of(mapped), source_of(path, shape=SHAPE, dtype="uint8")
     change(path)
     for source in sources_:
-        for read in (source.read, lambda *box, source=source: source.read_async(*box).result()):
-            with pytest.raises(ValueError, match="changed after it was opened as a source"):
-                read((0, 0, 0), (1, 1, 1))
+        with pytest.raises(ValueError, match="changed after it was opened as a source"):
+            source.read((0, 0, 0), (1, 1, 1))

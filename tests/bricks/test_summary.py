@@ -53,10 +53,7 @@ def test_faults_of_a_pass():
     data = np.zeros(SHAPE, np.float32)
     data[22, 17, 32] = np.nan
     with pytest.raises(ValueError, match=r"must be finite.*\(22, 17, 32\)"):
-        scan(source_of(data), memory=10_000)
-    for cell in (0, -1, 4.0, None):
-        with pytest.raises(ValueError, match="cell must be"):
-            scan(source_of(data), cell)
+        scan(source_of(data), 4, memory=10_000)
 
 
 # ---- kept ----
@@ -93,6 +90,18 @@ def test_a_pass_that_is_interrupted_is_begun_anew(tmp_path):
     assert_ranges(summary_of(source, memory=10_000, progress=lambda *numbers: told.append(numbers)), data)
     assert told[-1] == (data.size, data.size)
     assert len(told) > 3
+
+
+def test_a_plane_that_exceeds_the_memory_is_read_in_rows(monkeypatch):
+    data, read, sizes = voxels("uint8", (3, 40, 500)), VoxelSource.read, []
+
+    def sized(self, low, high, axes):
+        sizes.append(np.prod(np.subtract(high, low)))
+        return read(self, low, high, axes)
+
+    monkeypatch.setattr(VoxelSource, "read", sized)
+    assert_ranges(scan(source_of(data), 4, memory=8 * 2000), data)
+    assert max(sizes) <= 2000
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float16"])

@@ -186,17 +186,17 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
     image = ome_written(path, levels, version, axes=axes)
     for number, (source, data) in enumerate(zip(levels_of(path), levels, strict=True)):
         assert_reads(source, data)
-        np.testing.assert_allclose(source.spacing or (), np.array([0.3, 0.4, 2.0]) * 2**number)
-        np.testing.assert_allclose(source.origin or (), np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
+        np.testing.assert_allclose(source.spacing, np.array([0.3, 0.4, 2.0]) * 2**number)
+        np.testing.assert_allclose(source.origin, np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
     # a user's spacing and origin move all levels
     second = levels_of(path, spacing=(3, 4, 10), origin=(1, 1, 1))[1]
-    np.testing.assert_allclose((second.spacing or (), second.origin or ()), ((6, 8, 20), (2.5, 3, 6)))
+    np.testing.assert_allclose((second.spacing, second.origin), ((6, 8, 20), (2.5, 3, 6)))
     # transformations of all levels come after their own
     outer = [{"type": "scale", "scale": [10] * len(axes)}]
     outer += [{"type": "translation", "translation": [3] * len(axes)}]
     write_image(path, image | {"coordinateTransformations": outer}, version)
     second = levels_of(path)[1]
-    np.testing.assert_allclose((second.spacing or (), second.origin or ()), ((6, 8, 40), (4.5, 5, 13)))
+    np.testing.assert_allclose((second.spacing, second.origin), ((6, 8, 40), (4.5, 5, 13)))
 
 
 UNITS = (("z", "meter"), ("y", "micrometer"), ("x", "micrometer"))

@@ -19,7 +19,7 @@ import pytest
 from jax.sharding import Mesh, PartitionSpec as P
 
 import jaxvol as jv
-from jaxvol.bricks.owned import bounds_of
+from jaxvol.bricks.distributed import bounds_of
 
 from ..bricks import scenes
 from ..scenes import anisotropic_noise, around, soft_transfer

@@ -41,7 +41,7 @@ FAULTS = [
     ),
     Fault(
         "owned bricks: a device begins where its bricks do, rather than where those before it end",
-        "bricks.owned:Share.of_brick",
+        "bricks.distributed:Share.of_brick",
         _all_of_its_cells,
         (DEVICES,),
     ),
@@ -59,8 +59,8 @@ FAULTS = [
     ),
     Fault(
         "bricks: none takes what rays meet in another one that was read before",
-        "bricks.stream:Stream.found",
-        lambda found: lambda self, brick, _, *given, **more: found(self, brick, {brick}, *given, **more),
+        "bricks.traversal:Traversal.cells_of",
+        lambda of: lambda self, brick, _, *given, **more: of(self, brick, {brick}, *given, **more),
         (CURVED,),
     ),
     Fault(

@@ -11,8 +11,9 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
 from jaxvol.metrics import rmse
 from jaxvol.planning import trials
+from jaxvol.planning.choices import proven_transforms
 from jaxvol.planning.lightings import smooth
-from jaxvol.planning.plan import _checked, _proven
+from jaxvol.planning.plan import _checked
 from jaxvol.scene.occupancy import Blocks
 from jaxvol.scene.space import Affine
 
@@ -104,7 +105,7 @@ def test_a_full_cube_in_empty_space_is_aligned_where_it_touches_a_face():
         data = np.zeros(SPHERE.shape, np.float32)
         data[8:16, 8:16, 8:16] = 0.5
         cube = jv.Volume(np.roll(data, shift, axis), SPHERE.spacing)
-        proven, parts = _proven(visible(cube), Affine(cube), ())
+        proven, parts = proven_transforms(visible(cube), Affine(cube), ())
         assert [type(each).__name__ for each in proven] == ["AlphaCorrection", "SpaceLeaping"]
         assert parts[0].why == "something may be visible at 1 of the volume's 6 faces"
 
@@ -113,7 +114,7 @@ def test_transforms_that_are_part_of_the_scene_are_kept():
     clip, borders = jv.Clip((-1, 1, -1, 1, -1, 1)), jv.AlphaCorrection(labels=True)
     tolerance, given = _checked(0.1, (clip, borders), SPHERE)
     assert (tolerance, given) == (0.1, (clip, borders))
-    proven, (aligned, *_) = _proven(visible(), Affine(SPHERE), given)
+    proven, (aligned, *_) = proven_transforms(visible(), Affine(SPHERE), given)
     assert (aligned.kept, aligned.why) == (True, "part of the scene")
     assert not any(isinstance(each, jv.AlphaCorrection) for each in proven)
 
@@ -122,7 +123,7 @@ def test_transforms_that_are_part_of_the_scene_are_kept():
 def test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible(inside_out):
     for side, cuts in ((0.1, True), (0.9, False)):
         clip = jv.Clip((-side, side, -0.9, 0.9, -0.9, 0.9), inside_out=inside_out)
-        proven, (aligned, *_) = _proven(visible(), jv.March(1.0, (clip,)).locate(SPHERE), (clip,))
+        proven, (aligned, *_) = proven_transforms(visible(), jv.March(1.0, (clip,)).locate(SPHERE), (clip,))
         assert aligned.kept == cuts == (type(proven[0]) is jv.AlphaCorrection)
         if cuts:
             assert aligned.why == "something may be visible at 2 of the volume's 12 faces and cuts"

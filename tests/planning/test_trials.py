@@ -3,7 +3,6 @@
 No ray is marched: errors and numbers of samples are formulas of the march.
 """
 
-import importlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -16,9 +15,9 @@ from hypothesis import given, settings, strategies
 import jaxvol as jv
 from jaxvol.compositing.blending import Over
 from jaxvol.compositing.projections import Average
-from jaxvol.planning import trials
+from jaxvol.planning import choices, trials
+from jaxvol.planning.choices import Part, brightest_of, cheapest_march, simplest_light
 from jaxvol.planning.lightings import Simpler
-from jaxvol.planning.plan import Part, _brightest, _lit, _marched
 from jaxvol.planning.probe import Probe, Setting
 from jaxvol.planning.trials import Trial, Trials
 from jaxvol.scene.rendering import Details
@@ -26,7 +25,6 @@ from jaxvol.scene.rendering import Details
 from ..scenes import scaled_phantom, soft_transfer
 
 
-PLAN = importlib.import_module("jaxvol.planning.plan")
 VOLUME = scaled_phantom("sphere")
 Formula = Callable[[float], float]
 
@@ -117,7 +115,7 @@ def test_the_longest_step_within_the_goal_is_found(exponent, power):
 
 def marched(known: Known, *, goal: float = 1e-2, lit=False, once=False, **scene: Any):
     parts: list[Part] = []
-    chosen, _ = _marched(trials_of(known, goal, **scene), parts, lit=lit, once=once)
+    chosen, _ = cheapest_march(trials_of(known, goal, **scene), parts, lit=lit, once=once)
     return chosen, parts
 
 
@@ -195,9 +193,9 @@ def lit(known: Known, light: Light, *, goal: float = 1e-2, gradients: bool = Fal
     parts = [Part("step 1", True, "of a voxel")]
     chosen = Trial(march, 1e-3, 100.0, "midpoint")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PLAN, "smooth", Light.smooth)
-        patch.setattr(PLAN, "simpler", Light.simpler)
-        return _lit(found, chosen, light, goal, parts, gradients=gradients), parts
+        patch.setattr(choices, "smooth", Light.smooth)
+        patch.setattr(choices, "simpler", Light.simpler)
+        return simplest_light(found, chosen, light, goal, parts, gradients=gradients), parts
 
 
 def test_the_first_light_within_the_goal_is_taken():
@@ -239,4 +237,4 @@ def test_steps_are_halved_where_light_changes_along_rays():
 
 def test_brightness_counts_where_anything_is_seen():
     rgba = jnp.asarray(np.asarray([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]], np.float32))
-    assert _brightest(jv.Rendering(rgba, jnp.zeros(3, bool))) == pytest.approx(2)
+    assert brightest_of(jv.Rendering(rgba, jnp.zeros(3, bool))) == pytest.approx(2)

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from ...bricks import VoxelSource, levels_of
-from ...bricks.plan import IN_MEMORY, copied
 from ...io.formats import files_of, load
+from ...planning.memory import IN_MEMORY
 from ...scene.volume import Volume
 from ..automatic.sampling import SAMPLED
 
@@ -72,7 +72,6 @@ def copy_of(source: VoxelSource, memory: int) -> Volume:
     stride = 1
     while math.prod(-(-n // stride) for n in source.shape) > most and min(source.shape) // (stride + 1) >= 2:
         stride += 1
-    copy = copied(source, stride)
-    spacing = source.spacing or (1.0, 1.0, 1.0)
-    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, spacing, copy.shape, strict=True)]
+    copy = source.subsampled(stride)
+    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, source.spacing, copy.shape, strict=True)]
     return Volume(copy.data, whole, copy.origin)

@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 
 import jax
 
-from ...bricks import BudgetPlan, VoxelSource, plan, render_bricks
+from ...bricks import VoxelSource, render_bricks
 from ...compositing.blending import Compositing
 from ...lighting import Lighting
 from ...march.march import March
 from ...march.transforms.alpha_correction import AlphaCorrection
 from ...march.transforms.early_termination import EarlyTermination
 from ...march.transforms.space_leaping import SpaceLeaping
-from ...planning import Plan
+from ...planning import Plan, plan
 from ...render import PLANNED, render
 from ...scene.camera import Camera
 from ...scene.rendering import Rendering
@@ -56,7 +56,7 @@ def planning(options: argparse.Namespace) -> str:
 
 def planned(
     options: argparse.Namespace, scene: Scene, camera: Camera | None = None, *, once: bool = True
-) -> Plan | BudgetPlan:
+) -> Plan:
     """The cheapest way to render the scene within the tolerance that is asked for. `once`: of one image."""
     how: dict[str, Any] = {
         "transforms": scene.clip,
@@ -65,9 +65,8 @@ def planned(
         "once": once,
     }
     seen = scene.transfer, scene.camera if camera is None else camera
-    if scene.source is None:
-        return plan(scene.volume, *seen, tolerance_of(options), **how)
-    return plan(scene.source, *seen, tolerance_of(options), memory=options.memory, **how)
+    volume = scene.volume if scene.source is None else scene.source
+    return plan(volume, *seen, tolerance_of(options), memory=options.memory, **how)
 
 
 def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camera] = ()) -> Frames:
@@ -86,10 +85,7 @@ def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camer
             plans.append(planned(options, scene, camera, once=len(seen) == 1))
             told(len(plans), len(seen))
     found = min(plans, key=lambda plan: float(plan.march.step))
-    source = None
-    if isinstance(found, BudgetPlan):
-        source = found.source if found.counts is not None else None
-        found = found.plan
+    source = None if found.bricks is None else found.source
     if not found.within:
         print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
     return Frames(found.volume, transfer, found.march, mode, found.lighting, source, options.memory)

@@ -1,16 +1,16 @@
-"""Bricks owned by devices: each device reads and renders its own, of all rays, and the partial images are
-combined front to back.
+"""Bricks distributed over devices: each device reads and renders its own, of all rays, and the partial images
+are combined front to back.
 
 Devices get consecutive bricks of the order front to back. Where rays are straight, each ray meets them in
-this order, and so passes from what the first device owns to what the second one does, and never back. From
-where it does, found from its geometry alone, each device marches its cells as if nothing lay in front; and
-the operator "over" is associative. All devices take a brick each in turn, in one program.
+this order, and so passes from the bricks of the first device to those of the second, and never back. Where it
+does follows from its geometry alone. So each device marches its cells as if nothing lay in front, and the
+operator "over", which is associative, joins them. All devices take a brick each at a time, in one program.
 """
 
 from collections.abc import Iterator
 from concurrent.futures import Future
-from itertools import pairwise
-from typing import Any, NamedTuple
+from itertools import pairwise, zip_longest
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -30,9 +30,13 @@ from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
 from ..xla.compiling import compiled
 from ..xla.trees import PyTree
-from .cells import behind_straight, of_straight
+from .cells import first_behind, straight_cells
 from .grid import BrickGrid, Node
-from .stream import Stream
+from .traversal import Traversal
+
+
+Reading: TypeAlias = dict[int, tuple[Node, "Future[np.ndarray]"]]
+"""By device, the first node and the voxels of the brick that this process reads for it."""
 
 
 class Share(eqx.Module):
@@ -45,40 +49,32 @@ class Share(eqx.Module):
     def of_brick(self, grid: BrickGrid, scene: Scene, brick: Int[Array, ""]) -> CellRange:
         """The cells that lie in one of the bricks; none in the brick -1."""
         rays, alive = self.underway.rays, ~self.underway.at.finished & (brick >= 0)
-        cells = of_straight(grid, scene.march, rays, alive, jnp.maximum(brick, 0))
+        cells = straight_cells(grid, scene.march, rays, alive, jnp.maximum(brick, 0))
         first, until = jnp.maximum(cells.first, self.own.first), jnp.minimum(cells.until, self.own.until)
         some = first < until
         return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
 
 
-class Turn(NamedTuple):
-    """The next brick of each device, -1 for none, and the voxels that this process reads of them: by device,
-    the first node and what is read."""
-
-    bricks: np.ndarray
-    reading: dict[int, tuple[Node, "Future[np.ndarray]"]]
-
-
-def render_owned(stream: Stream, mesh: Mesh) -> Rendering:
-    """The image of a stream's scene. Rays are straight, and nothing that shows on a ray depends on what lies
-    in front but by its transmittance."""
-    scene, options, grid = stream.scene, stream.options, stream.grid
-    order = jnp.asarray(stream.order, jnp.int32)
-    underway = _set_out(mesh, scene, options)
-    # a brick outside of the view is nobody's work
-    wanted = stream.visible & np.asarray(_in_view(mesh, grid, scene, underway))
-    bounds = bounds_of(wanted[stream.order], mesh.size)
-    share = _divided(mesh, grid, scene, underway, order, jnp.asarray(bounds, jnp.int32))
-    lists = [[b for b in stream.order[i:j] if wanted[b]] for i, j in bounds]
-    newest = [share]
-    turns = _turns(stream, mesh, lists, newest)
-    turn = next(turns, None)
-    while turn is not None:
+def render_distributed(traversal: Traversal, mesh: Mesh) -> Rendering:
+    """The image of a traversal's scene. Rays are straight, and nothing that shows on a ray depends on what
+    lies in front but by its transmittance."""
+    scene, options, grid = traversal.scene, traversal.options, traversal.grid
+    share = _set_out(mesh, scene, options)
+    every = jnp.broadcast_to(jnp.arange(grid.number, dtype=jnp.int32), (mesh.size, grid.number))
+    in_view = np.asarray(_met(mesh, grid, scene, share, every))[0]
+    wanted = traversal.visible & in_view
+    bounds = bounds_of(wanted[traversal.order], mesh.size)
+    order = jnp.asarray(traversal.order, jnp.int32)
+    share = _divided(mesh, grid, scene, share, order, jnp.asarray(bounds, jnp.int32))
+    own = [[brick for brick in traversal.order[i:j] if wanted[brick]] for i, j in bounds]
+    remaining = zip_longest(*own, fillvalue=-1)
+    load = _next_load(traversal, mesh, share, remaining)
+    while load is not None:
         jax.block_until_ready(share)  # or two bricks, and what is made of both, would be in memory
-        placed, number = _placed(stream, mesh, turn), len(turn.reading)
-        turn = next(turns, None)
-        newest[0] = share = _march(mesh, grid, scene, options, share, *placed)
-        stream.finish(number, int(wanted.sum()))
+        placed, number = _placed(traversal, mesh, *load), len(load[1])
+        load = _next_load(traversal, mesh, share, remaining)
+        share = _march(mesh, grid, scene, options, share, *placed)
+        traversal.finish(number, int(wanted.sum()))
     return _join(mesh, scene, options, share)
 
 
@@ -89,34 +85,41 @@ def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[in
     return list(pairwise([0, *ends, len(wanted)]))
 
 
-def _turns(stream: Stream, mesh: Mesh, lists: list[list[int]], newest: list[Share]) -> Iterator[Turn]:
-    """A brick for each device that any of its rays still needs, each from when it is planned to be read."""
+def _next_load(
+    traversal: Traversal, mesh: Mesh, share: Share, remaining: Iterator[tuple[int, ...]]
+) -> tuple[np.ndarray, Reading] | None:
+    """The next brick of each device, -1 where none of its rays needs one, and the voxels as they are read.
+    `remaining`: bricks of the devices that are still to come, one of each at a time."""
     here = jax.process_index()
-    for i in range(max(map(len, lists))):
-        bricks = np.asarray([own[i] if i < len(own) else -1 for own in lists], np.int32)
-        needed = np.asarray(_needed(mesh, stream.grid, stream.scene, newest[0], jnp.asarray(bricks)))
-        bricks = np.where(needed, bricks, -1)
-        mine = [d for d, device in enumerate(mesh.devices) if device.process_index == here and needed[d]]
+    for each in remaining:
+        bricks = np.asarray(each, np.int32)
+        met = _met(mesh, traversal.grid, traversal.scene, share, jnp.asarray(bricks)[:, None])
+        needed = np.asarray(met)[:, 0]
+        local = [d for d, device in enumerate(mesh.devices) if device.process_index == here and needed[d]]
         if needed.any():
-            yield Turn(bricks, {d: stream.read(int(bricks[d]), *stream.around(int(bricks[d]))) for d in mine})
+            reading = {d: traversal.read(each[d], *traversal.around(each[d])) for d in local}
+            return np.where(needed, bricks, -1), reading
+    return None
 
 
-def _placed(stream: Stream, mesh: Mesh, turn: Turn) -> tuple[Array, Array, Array]:
+def _placed(
+    traversal: Traversal, mesh: Mesh, bricks: np.ndarray, reading: Reading
+) -> tuple[Array, Array, Array]:
     """The bricks, their first nodes and their voxels, each on its device."""
-    shape = permuted(stream.stored, stream.source.order)
-    nothing, first = np.zeros(shape, stream.source.dtype), np.zeros((mesh.size, 3), np.int32)
+    shape = permuted(traversal.stored, traversal.source.order)
+    nothing, first = np.zeros(shape, traversal.source.dtype), np.zeros((mesh.size, 3), np.int32)
     voxels = []
     for d, device in enumerate(mesh.devices):
         if device.process_index != jax.process_index():
             continue
         part = nothing
-        if d in turn.reading:
-            first[d], coming = turn.reading[d]
+        if d in reading:
+            first[d], coming = reading[d]
             part = coming.result()
         voxels.append(jax.device_put(part[None], device))
     sharding = NamedSharding(mesh, SHARDED)
     return (
-        jnp.asarray(turn.bricks),
+        jnp.asarray(bricks),
         jax.make_array_from_callback(first.shape, sharding, lambda index: first[index]),
         jax.make_array_from_single_device_arrays((mesh.size, *shape), sharding, voxels),
     )
@@ -134,22 +137,31 @@ def _on_each(mesh: Mesh, one: Any, *shares: PyTree, whole: bool = False) -> PyTr
 
 
 @compiled
-def _set_out(mesh: Mesh, scene: Scene, options: RenderOptions) -> RayStates:
-    return _on_each(mesh, lambda _: begin_rays(scene, options), jnp.arange(mesh.size))
+def _set_out(mesh: Mesh, scene: Scene, options: RenderOptions) -> Share:
+    """All rays at their entries, and all of their cells."""
+
+    def one(_: Array) -> Share:
+        underway = begin_rays(scene, options)
+        none = jnp.zeros(underway.rays.length.shape, jnp.int32)
+        return Share(underway, CellRange(none, jnp.full_like(none, jnp.iinfo(jnp.int32).max)))
+
+    return _on_each(mesh, one, jnp.arange(mesh.size))
 
 
 @compiled
-def _in_view(mesh: Mesh, grid: BrickGrid, scene: Scene, underway: RayStates) -> Bool[Array, " bricks"]:
-    """For each brick, whether any ray meets it."""
+def _met(
+    mesh: Mesh, grid: BrickGrid, scene: Scene, share: Share, bricks: Int[Array, "devices n"]
+) -> Bool[Array, "devices n"]:
+    """Whether any ray of a device needs each of its bricks: the answers of all devices."""
 
-    def met(underway: RayStates) -> Bool[Array, " bricks"]:
-        def one(brick: Int[Array, ""]) -> Bool[Array, ""]:
-            cells = of_straight(grid, scene.march, underway.rays, underway.rays.length > 0, brick)
+    def one(share: Share, bricks: Int[Array, " n"]) -> Bool[Array, "devices n"]:
+        def met(brick: Int[Array, ""]) -> Bool[Array, ""]:
+            cells = share.of_brick(grid, scene, brick)
             return jnp.any(cells.until > cells.first)
 
-        return jax.lax.map(one, jnp.arange(grid.number, dtype=jnp.int32))
+        return jax.lax.all_gather(jax.lax.map(met, bricks), AXIS)
 
-    return _on_each(mesh, met, underway, whole=True)
+    return _on_each(mesh, one, share, bricks, whole=True)
 
 
 @compiled
@@ -157,30 +169,18 @@ def _divided(
     mesh: Mesh,
     grid: BrickGrid,
     scene: Scene,
-    underway: RayStates,
+    share: Share,
     order: Int[Array, " bricks"],
     bounds: Int[Array, "devices 2"],
 ) -> Share:
     """Each device's own cells. `bounds`: its first brick in the order, and the one behind its last."""
 
-    def one(underway: RayStates, bounds: Int[Array, "2"]) -> Share:
-        first, until = (behind_straight(grid, scene.march, underway.rays, order, end) for end in bounds)
-        return Share(underway, CellRange(first, until))
+    def one(share: Share, bounds: Int[Array, "2"]) -> Share:
+        rays = share.underway.rays
+        first, until = (first_behind(grid, scene.march, rays, order, end) for end in bounds)
+        return Share(share.underway, CellRange(first, until))
 
-    return _on_each(mesh, one, underway, bounds)
-
-
-@compiled
-def _needed(
-    mesh: Mesh, grid: BrickGrid, scene: Scene, share: Share, bricks: Int[Array, " devices"]
-) -> Bool[Array, " devices"]:
-    """Whether any ray of a device needs its brick: the answers of all devices."""
-
-    def one(share: Share, brick: Int[Array, ""]) -> Bool[Array, " devices"]:
-        cells = share.of_brick(grid, scene, brick)
-        return jax.lax.all_gather(jnp.any(cells.until > cells.first), AXIS)
-
-    return _on_each(mesh, one, share, bricks, whole=True)
+    return _on_each(mesh, one, share, bounds)
 
 
 @compiled

@@ -1,15 +1,17 @@
-"""Of which type are the voxels of a source once they are read?
+"""Of which type are the voxels of a source once they are read? As in a `Volume`, but decided before any is
+read."""
 
-The same types as in a `Volume`, decided before any voxel is read, where a `Volume` looks at all of them.
-"""
+from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 
+from .._util.axes import Axes
 from .._util.voxels import DTYPES, WHOLE, check_type
 
 
-Box = tuple[tuple[int, int, int], tuple[int, int, int]]
+Box: TypeAlias = tuple[tuple[int, int, int], tuple[int, int, int]]
+"""First voxel along x, y and z, and the one behind the last."""
 
 
 def voxel_type(stored: np.dtype) -> np.dtype:
@@ -28,23 +30,20 @@ def voxel_type(stored: np.dtype) -> np.dtype:
     return np.dtype(np.float32) if stored.kind in "iu" else np.dtype(jnp.result_type(float))
 
 
+def comparable(voxels: np.ndarray) -> np.ndarray:
+    """16-bit floats as float32, of which NumPy finds extremes many times faster."""
+    return voxels if voxels.dtype.kind in "iu" or voxels.itemsize > 2 else voxels.astype(np.float32)
+
+
 def range_of(voxels: np.ndarray) -> tuple[float, float]:
     """Least and greatest voxel; NaN if any is, and infinite if any is: unlike a mask, they take no memory."""
-    # NumPy compares 16-bit floats one by one: as float32, layer by layer, in a fraction of the time
-    layers = (layer.astype(np.float32) for layer in voxels) if is_half(voxels.dtype) else (voxels,)
     with np.errstate(invalid="ignore"):
-        low, high = zip(*((layer.min(), layer.max()) for layer in layers), strict=True)
-        return float(np.min(low)), float(np.max(high))
+        ranges = [(layer.min(), layer.max()) for layer in map(comparable, voxels)]
+        return float(np.min(ranges)), float(np.max(ranges))
 
 
-def is_half(dtype: np.dtype) -> bool:
-    """Whether it is float16 or bfloat16."""
-    return dtype.itemsize == 2 and dtype.kind not in "iu"
-
-
-def converted(voxels: np.ndarray, box: Box, axes: tuple[int, int, int], what: str) -> np.ndarray:
-    """Voxels as `voxel_type` says, and C-contiguous. `box`: what they were read from. `axes`: of the box, in
-    their order.
+def converted(voxels: np.ndarray, box: Box, axes: Axes, name: str) -> np.ndarray:
+    """Voxels as `voxel_type` says, and C-contiguous. `box`: where they were read. `axes`: of the array.
 
     **Raises:** `ValueError` for NaN, infinity, and integers that float32 does not hold exactly, with the
     place of the first.
@@ -55,7 +54,7 @@ def converted(voxels: np.ndarray, box: Box, axes: tuple[int, int, int], what: st
         low, high = int(voxels.min()), int(voxels.max())
         if low < least or high > most:
             raise ValueError(
-                f"{what}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; "
+                f"{name}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; "
                 f"got {voxels.dtype} from {low} to {high} in the box {box[0]} to {box[1]}. Subtract an "
                 "offset, or rescale them."
             )
@@ -68,7 +67,7 @@ def converted(voxels: np.ndarray, box: Box, axes: tuple[int, int, int], what: st
         first = np.unravel_index(np.argmax(wrong), voxels.shape)
         place = tuple(start + int(first[axes.index(axis)]) for axis, start in enumerate(box[0]))
         raise ValueError(
-            f"{what}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite in the "
+            f"{name}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite in the "
             f"box {box[0]} to {box[1]}, the first at {place}. Replace them first."
         )
     return voxels
