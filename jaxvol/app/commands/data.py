@@ -1,8 +1,7 @@
-"""Which options say what a volume file holds, where the file and its name do not?"""
+"""Reads the volume that the options name, whole or in parts."""
 
 import argparse
 import math
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped
@@ -12,21 +11,6 @@ from ...bricks.plan import IN_MEMORY, copied
 from ...io.formats import files_of, load
 from ...scene.volume import Volume
 from ..automatic.sampling import SAMPLED
-
-
-def add_data_options(parser: argparse.ArgumentParser) -> None:
-    """Add the file and its options to a parser."""
-    parser.add_argument(
-        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
-    )
-    data = parser.add_argument_group("data", "needed if the file and its name do not specify it")
-    data.add_argument(
-        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
-    )
-    data.add_argument("--dtype", help="such as uint8 or uint16le")
-    data.add_argument(
-        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
-    )
 
 
 def volume_of(options: argparse.Namespace) -> Volume:

@@ -44,7 +44,7 @@ BAD = [
         "jaxvol render: error: unrecognized arguments: --sise 9 9. Did you mean --size? (jaxvol render -",
     ),
     (["info", "x.raw", "y.raw"], "jaxvol info: error: unrecognized arguments: y.raw (jaxvol info --help"),
-    (["datasets", "fetch"], "datasets fetch: error: the following arguments are required: NAME"),
+    (["datasets"], "datasets: error: the following arguments are required: action"),
     (["paint"], "jaxvol: error: argument COMMAND: invalid choice: 'paint' (choose from"),
 ]
 

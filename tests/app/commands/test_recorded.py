@@ -8,15 +8,15 @@ import zlib
 import equinox as eqx
 import numpy as np
 import pytest
+from jaxvol.app.commands.checksum import checksum
+from jaxvol.app.commands.settings import parsed
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import _parser, main
-from jaxvol.app.commands.checksum import checksum
 from jaxvol.app.commands.recorded import KEYWORD, MOST
-from jaxvol.app.commands.settings import parsed
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]

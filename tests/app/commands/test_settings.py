@@ -3,9 +3,9 @@
 import re
 
 import pytest
+from jaxvol.app.commands.settings import parsed
 
 from jaxvol.app.cli import _parser, main
-from jaxvol.app.commands.settings import parsed
 
 
 def options(*words):
