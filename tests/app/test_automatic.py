@@ -16,11 +16,9 @@ from jaxvol.app.automatic import (
     upright,
     visible_points,
 )
-from jaxvol.app.automatic.body import is_body
 from jaxvol.app.automatic.framing import MARGIN
+from jaxvol.app.automatic.histogram import SAMPLED, is_body, thresholds
 from jaxvol.app.automatic.labels import INSIDE
-from jaxvol.app.automatic.sampling import SAMPLED
-from jaxvol.app.automatic.thresholds import thresholds
 from jaxvol.app.commands.data import copy_of, middle_of
 from jaxvol.app.commands.orbit import turned
 from jaxvol.bricks import source_of
@@ -183,7 +181,7 @@ def test_a_framed_camera_just_sees_all_points():
     for parallel in (False, True):
         for size in ((32, 32), (48, 32), (16, 32)):
             camera = jv.Camera.looking_at(volume, (1, -1, 0.3), view_angle=40, parallel=parallel, size=size)
-            seen = in_picture(framed(camera, points), points)
+            seen = in_picture(framed(camera, points, [camera]), points)
             low, high = seen.min(axis=0), seen.max(axis=0)
             # both sides of the tighter axis are at the margin, and the other is as far inside on both sides
             assert max(high) == pytest.approx(1 / MARGIN, abs=1e-4)

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Shaped
 
+from ..._util.srgb import from_srgb
 from ...scene.labels import LabelTransferFunction
 from ...scene.transfer import TransferFunction, extinction_of
 from ...scene.volume import Volume
-from .colors import linear
-from .sampling import unit_of
+from .histogram import unit_of
 
 
 FEWEST_FLAT = 0.8
@@ -42,15 +42,16 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
         labels = np.searchsorted(kinds, data).astype(np.uint8)
     inside = gaussian_filter(np.where(labels > 0, np.float32(INSIDE), np.float32(0)), LABEL_BLUR)
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
-    shown = Volume(
-        *((inside + 0.5).astype(np.uint8), volume.spacing, volume.origin, beyond),
-        direction=volume.direction,
-    )
-    functions = {}
-    for label in range(1, len(kinds)):
-        color = linear(COLORS[(label - 1) % len(COLORS)])
-        opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
-        functions[label] = TransferFunction([0, 0.35 * INSIDE, 0.65 * INSIDE], [color] * 3, opacity)
+    place = volume.spacing, volume.origin
+    shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
+    colors = np.asarray(from_srgb(np.array(COLORS) / 255))
+    opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
+    functions = {
+        label: TransferFunction(
+            [0, 0.35 * INSIDE, 0.65 * INSIDE], [colors[(label - 1) % len(COLORS)]] * 3, opacity
+        )
+        for label in range(1, len(kinds))
+    }
     return shown, LabelTransferFunction(functions)
 
 

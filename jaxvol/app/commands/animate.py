@@ -44,8 +44,8 @@ def _animate(options: argparse.Namespace) -> None:
         )
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise ImportError(
-            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a folder '
-            "of PNGs."
+            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a '
+            "folder of PNGs."
         )
     if kind == ".mp4" and any(side % 2 for side in options.size):
         width, height = options.size
@@ -97,10 +97,8 @@ def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
     """H.264 with colours at half the resolution, which every player shows."""
     import imageio
 
-    how = {"macro_block_size": 2, "ffmpeg_log_level": "error"}
-    with imageio.get_writer(
-        path, fps=fps, codec="libx264", pixelformat="yuv420p", quality=8, **how
-    ) as writer:
+    how = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 2}
+    with imageio.get_writer(path, fps=fps, ffmpeg_log_level="error", **how) as writer:
         for image in images:
             writer.append_data(image)
 

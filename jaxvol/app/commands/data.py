@@ -10,7 +10,7 @@ from ...bricks import VoxelSource, levels_of
 from ...bricks.plan import IN_MEMORY, copied
 from ...io.formats import files_of, load
 from ...scene.volume import Volume
-from ..automatic.sampling import SAMPLED
+from ..automatic.histogram import SAMPLED
 
 
 def volume_of(options: argparse.Namespace) -> Volume:

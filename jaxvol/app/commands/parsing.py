@@ -123,7 +123,7 @@ def parsed(
     for source in (*sources, given):
         settings = _without_overridden(settings, source) | source
     if missing := [o for o in command.options if o.required and o.key not in settings]:
-        names = (option.values if option.group == ARGUMENT else f"--{option.name}" for option in missing)
+        names = (option.name if option.group == ARGUMENT else f"--{option.name}" for option in missing)
         child.error(f"the following arguments are required: {', '.join(names)}")
     return command, argparse.Namespace(**FIXED | defaults_of(command.options) | settings)
 

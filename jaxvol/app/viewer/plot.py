@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...scene.volume import Volume
-from ..automatic.sampling import sampled
+from ..automatic.histogram import sampled
 from .curve import Curve
 from .look import Color, Ranged
 

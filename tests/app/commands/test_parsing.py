@@ -3,13 +3,13 @@
 import re
 
 import pytest
-from jaxvol.app.commands.settings import parsed
 
-from jaxvol.app.cli import _parser, main
+from jaxvol.app.cli import main, parser_of_all
+from jaxvol.app.commands.parsing import parsed
 
 
 def options(*words):
-    return parsed(_parser, [str(word) for word in words])
+    return parsed(parser_of_all(), [str(word) for word in words])[1]
 
 
 @pytest.fixture
