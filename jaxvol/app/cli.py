@@ -4,8 +4,8 @@ is interrupted."""
 import argparse
 import os
 import sys
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 
@@ -60,7 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command, options = parsed(parser_of_all(), words)
         jax.config.update("jax_compilation_cache_dir", str(options.programs))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-        _run_in_thread(command.run, options)
+        # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
+        ThreadPoolExecutor(1).submit(command.run, options).result()
         sys.stdout.flush()
     except BrokenPipeError:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end
@@ -83,24 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         os._exit(INTERRUPTED)
     return 0
-
-
-def _run_in_thread(run: Callable[[argparse.Namespace], None], options: argparse.Namespace) -> None:
-    """Run a command in a thread of its own. Python delivers signals to the main thread, which only waits and
-    so can handle them while XLA is busy."""
-    faults: list[BaseException] = []
-
-    def catch() -> None:
-        try:
-            run(options)
-        except BaseException as fault:
-            faults.append(fault)
-
-    thread = threading.Thread(target=catch, daemon=True)
-    thread.start()
-    thread.join()
-    if faults:
-        raise faults[0]
 
 
 def parser_of_all() -> argparse.ArgumentParser:

@@ -85,12 +85,12 @@ def _values_along(
 ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "rays points"]]:
     """For some rays, preferably those that hit the volume: whether they hit, and the values along them, NaN
     in gaps."""
-    pixel = (jnp.zeros((), jnp.int32),) * 2
+    zero = jnp.zeros((), jnp.int32)
 
     @jax.jit
     @jax.vmap
     def entered(origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Ray:
-        return enter(space, apart(origin), apart(direction), pixel)
+        return enter(space, apart(origin), apart(direction), (zero, zero))
 
     @jax.jit
     @jax.vmap

@@ -1,5 +1,6 @@
 """Where is what a transfer function shows, from how far does a camera see all of it, and which way is up?"""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,6 +30,8 @@ REACH = 3
 MARGIN = 1.06
 """By how much more than what is visible the picture shows, in each direction."""
 
+CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+"""Of the unit cube."""
 
 CUT_LEAST = 0.1
 """Part of a face of the grid that an object covers from which on the face cuts it."""
@@ -54,7 +57,7 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
         extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
         seen = -np.expm1(-extinction * unit_of(volume)) > SEEN
     if not seen.any():
-        return _in_world(volume, _corners(np.zeros(3), np.array(volume.shape) - 1.0))
+        return _in_world(volume, CORNERS * (np.array(volume.shape) - 1))
     found: Any = label(maximum_filter(seen, REACH))  # scipy's types allow a number, too
     pieces = seen * found[0]
     sizes = np.bincount(pieces.ravel())
@@ -64,14 +67,8 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     rows = shown.any(axis=2)  # of voxels along z: only their ends can be farthest from the middle
     ends = shown.argmax(axis=2)[rows], shown.shape[2] - 1 - shown[..., ::-1].argmax(axis=2)[rows]
     voxels = np.concatenate([np.column_stack([*np.nonzero(rows), z]) for z in ends]).astype(np.float64)
-    around = (stride_of(volume.shape) * voxels[:, None] + _corners(-np.ones(3), np.ones(3))).reshape(
-        -1, 3
-    )  # a voxel ends at the next
-    return _in_world(volume, np.clip(around, 0, np.array(volume.shape) - 1))
-
-
-def _corners(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Float[np.ndarray, "8 3"]:
-    return np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    around = stride_of(volume.shape) * voxels[:, None] + 2 * CORNERS - 1  # a voxel ends at the next
+    return _in_world(volume, np.clip(around.reshape(-1, 3), 0, np.array(volume.shape) - 1))
 
 
 def _in_world(volume: Volume, grid: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

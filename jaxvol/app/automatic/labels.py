@@ -1,5 +1,7 @@
 """Are the voxels of a volume labels, and in which colours are they shown?"""
 
+from typing import cast
+
 import numpy as np
 from jaxtyping import Shaped
 
@@ -30,6 +32,8 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     **Returns:** a volume in the same place, whose values are smooth, 255 inside of all labels, and whose
     labels reach two voxels beyond; and a transfer function that shows what is inside, each label in its own
     colour."""
+    import matplotlib
+    from matplotlib.colors import ListedColormap
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     data = np.asarray(volume.data)
@@ -44,11 +48,13 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
     place = volume.spacing, volume.origin
     shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
-    colors = np.asarray(from_srgb(np.array(COLORS) / 255))
+    tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
+    dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
+    colors = np.asarray(from_srgb(dark_then_light))
     opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
     functions = {
         label: TransferFunction(
-            [0, 0.35 * INSIDE, 0.65 * INSIDE], [colors[(label - 1) % len(COLORS)]] * 3, opacity
+            [0, 0.35 * INSIDE, 0.65 * INSIDE], [colors[(label - 1) % len(colors)]] * 3, opacity
         )
         for label in range(1, len(kinds))
     }
@@ -57,13 +63,6 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
 
 LABEL_BLUR = 0.8
 """Voxels by which the border of what has a label is smoothed, so that it has a gradient."""
-
-COLORS = (
-    *((31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75)),
-    *((227, 119, 194), (188, 189, 34), (23, 190, 207), (174, 199, 232), (255, 187, 120), (152, 223, 138)),
-    *((255, 152, 150), (197, 176, 213), (196, 156, 148), (247, 182, 210), (219, 219, 141), (158, 218, 229)),
-)
-"""Colours of labels, 8-bit sRGB: those of matplotlib's tab20 without its greys, one of each pair first."""
 
 
 def _kinds(data: Shaped[np.ndarray, "nx ny nz"]) -> Shaped[np.ndarray, " n"] | None:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -95,12 +96,11 @@ def _write_gif(path: Path, images: Iterator[Picture], fps: float, count: int) ->
 
 def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
     """H.264 with colours at half the resolution, which every player shows."""
-    import imageio
+    from imageio.v3 import imopen
 
-    how = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 2}
-    with imageio.get_writer(path, fps=fps, ffmpeg_log_level="error", **how) as writer:
-        for image in images:
-            writer.append_data(image)
+    how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 2}
+    with imopen(path, "w", plugin="FFMPEG") as file:
+        file.write(images, is_batch=True, fps=fps, ffmpeg_log_level="error", **how)
 
 
 _OUTPUT = "what to write: .gif, .mp4 (needs jaxvol[video]), or a folder, of one .png for each frame"

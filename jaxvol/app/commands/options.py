@@ -2,6 +2,7 @@
 and the settings in pictures derive (`parsing.py`). Here are those that several subcommands share."""
 
 import argparse
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -55,16 +56,10 @@ class Command(NamedTuple):
 
 def memory_size(text: str | int) -> int:
     """A number of bytes, such as 1000000, 256M or 2G (powers of 1024)."""
-    number = str(text).strip().upper()
-    power = "KMG".find(number[-1:]) + 1 if number else 0
-    try:
-        count = int(float(number[:-1] if power else number) * 1024**power)
-    except (ValueError, OverflowError) as fault:
-        raise argparse.ArgumentTypeError(
-            f"must be a number of bytes, such as 256M or 2G; got {text!r}"
-        ) from fault
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([KMG]?)", str(text).strip().upper())
+    count = int(float(found[1]) * 1024 ** " KMG".index(found[2] or " ")) if found else 0
     if count < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1 byte; got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a number of bytes, such as 256M or 2G; got {text!r}")
     return count
 
 

@@ -3,7 +3,6 @@ stands later in this order overrides what stands before."""
 
 import argparse
 import re
-import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -84,9 +83,8 @@ def _add(section: Any, option: Option) -> None:
         "choices": option.choices or None,
         "help": text,
     }
-    if (
-        option.group == ARGUMENT
-    ):  # may be in a file instead; its default is None, for argparse converts SUPPRESS
+    if option.group == ARGUMENT:
+        # a file may give it; None, because argparse would convert its own SUPPRESS
         section.add_argument(option.key, **how | {"nargs": "?", "default": None})
     else:
         flags = ["-o"] if option.name == "output" else []
@@ -94,15 +92,13 @@ def _add(section: Any, option: Option) -> None:
         section.add_argument(*flags, f"--{option.name}", action=action, **how)
 
 
-def parsed(
-    parser: argparse.ArgumentParser, words: Sequence[str] | None = None
-) -> tuple[Command, argparse.Namespace]:
-    """The command and its options, from all sources. `words`: of the command line, by default the process's.
+def parsed(parser: argparse.ArgumentParser, words: Sequence[str]) -> tuple[Command, argparse.Namespace]:
+    """The command and its options, from all sources. `words`: of the command line.
 
     **Raises:** `ValueError` for a file that cannot be read, and, naming file and option, for an option that
     the command does not have, or whose value is of another kind. `SystemExit` for faults in the words.
     """
-    found, unknown = parser.parse_known_args(sys.argv[1:] if words is None else list(words))
+    found, unknown = parser.parse_known_args(words)
     given = {name: value for name, value in vars(found).items() if value is not None}
     command, child = given.pop("command"), given.pop("parser")
     if unknown:
@@ -175,10 +171,9 @@ def _checked(
         option = by_name[name]
         if option.repeated and not isinstance(value, list):
             raise ValueError(f"{where}: {name} must be a list of lists; got {shortened(value)}.")
-        rows = [
-            _converted(option, row, f"{where}: {name}") for row in (value if option.repeated else [value])
-        ]
-        found[option.key] = rows if option.repeated else rows[0]
+        rows = value if option.repeated else [value]
+        converted = [_converted(option, row, f"{where}: {name}") for row in rows]
+        found[option.key] = converted if option.repeated else converted[0]
     _refuse_rivals(found, f"{where}: ")
     return found
 

@@ -22,9 +22,6 @@ from .progress import show_progress
 KEYWORD = "jaxvol"
 """Of the text in a PNG."""
 
-MOST = 2**20
-"""Bytes of settings that are read, at most."""
-
 
 class Recorded(NamedTuple):
     """What a picture says of how it was made by `jaxvol render`: options by name, the volume's file as it was
@@ -75,7 +72,7 @@ def recorded_in(path: Path) -> Recorded:
     write. Options are checked where they are used.
     """
     damaged = f"{path}: the settings in it are damaged"
-    text = _text_in(path, damaged)
+    text = _text_in(path)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as fault:
@@ -97,7 +94,7 @@ def recorded_in(path: Path) -> Recorded:
     return Recorded(content["settings"], file, sha256, transfer)
 
 
-def _text_in(path: Path, damaged: str) -> str:
+def _text_in(path: Path) -> str:
     from PIL import Image
 
     if not path.is_file():
@@ -115,8 +112,6 @@ def _text_in(path: Path, damaged: str) -> str:
             f"{path} holds no settings of jaxvol, only a picture of {size[0]} x {size[1]} pixels. Pictures "
             "that the command jaxvol writes as .png hold them, unless another program has saved them again."
         )
-    if len(text) > MOST:
-        raise ValueError(f"{damaged}: they take {len(text)} letters.")
     return text
 
 

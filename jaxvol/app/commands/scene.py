@@ -62,20 +62,16 @@ def scene_of(options: argparse.Namespace, *, turn: float = 0.0, orbit: float | N
     """The scene that the options describe. The automatic camera shows all that is visible when it is turned
     by `turn` degrees, or everywhere on an orbit of so many."""
     mode, background, clip = _compositing(options), background_of(options), _clip(options)
-    transfer, automatic = transfer_given(options), is_automatic(options)
-    source, points = None, None
+    automatic, source, points = is_automatic(options), None, None
     with show_progress(f"reading {options.file}"):
         if options.memory is None:
             volume = volume_of(options)
+            shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
+            volume, transfer = shown
         else:
             source = source_of(options)
             volume = copy_of(source, options.memory)
-        labels = labels_shown(volume) if automatic and source is None else None
-        if labels is not None:
-            volume, transfer = labels
-        elif transfer is None:
-            part = middle_of(source) if automatic and source is not None else None
-            transfer = transfer_of(options, volume, part)
+            transfer = transfer_of(options, volume, middle_of(source))
         if automatic:
             points = visible_points(volume, transfer)
     camera = _camera(options, volume)
@@ -131,44 +127,29 @@ def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting |
     return Phong() if shade else None
 
 
-def transfer_given(options: argparse.Namespace) -> Transfer | None:
-    """The transfer function of the options, checked before the volume is read; None where it depends on the
-    volume's values."""
-    if options.transfer is not None or options.recorded_transfer is not None:
+def transfer_of(
+    options: argparse.Namespace, volume: Volume, part: Shaped[np.ndarray, "nx ny nz"] | None = None
+) -> Transfer:
+    """The transfer function for a volume. `part`: of the voxels as they are, where the volume is a copy."""
+    if is_automatic(options):
+        return automatic_transfer(volume) if part is None else transfer_by_copy(volume, part)
+    path, recorded = options.transfer, options.recorded_transfer
+    if path is not None or recorded is not None:
         for name in ("clim", "opacity", "unit_distance"):
             if getattr(options, name) is not None:
                 raise ValueError(
                     f"--{name.replace('_', '-')} is for presets and colormaps; a transfer function from a "
                     "file or a picture needs none."
                 )
-        return options.recorded_transfer or read_transfer(options.transfer)
-    if is_automatic(options):
-        return None
-    if options.preset is None:
-        over_range = _colormap(options, options.clim or (0, 1))
-        return over_range if options.clim else None
-    if options.opacity is not None:
-        raise ValueError("--opacity is for colormaps; a preset has its own.")
-    return preset(options.preset, options.clim, _unit_distance(options))
-
-
-def transfer_of(
-    options: argparse.Namespace, volume: Volume, part: Shaped[np.ndarray, "nx ny nz"] | None = None
-) -> Transfer:
-    """The transfer function for a volume, where the options alone do not give one. `part`: of the voxels as
-    they are, where the volume is a copy."""
-    if is_automatic(options):
-        return automatic_transfer(volume) if part is None else transfer_by_copy(volume, part)
-    return _colormap(options, (float(volume.data.min()), float(volume.data.max())))
-
-
-def _unit_distance(options: argparse.Namespace) -> float:
-    return 1.0 if options.unit_distance is None else options.unit_distance
-
-
-def _colormap(options: argparse.Namespace, clim: tuple[float, float]) -> Transfer:
+        return read_transfer(path) if recorded is None else recorded
+    unit = 1.0 if options.unit_distance is None else options.unit_distance
+    if options.preset is not None:
+        if options.opacity is not None:
+            raise ValueError("--opacity is for colormaps; a preset has its own.")
+        return preset(options.preset, options.clim, unit)
+    clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
-    return colormap(cmap, clim, options.opacity or "linear", _unit_distance(options))
+    return colormap(cmap, clim, options.opacity or "linear", unit)
 
 
 def _camera(options: argparse.Namespace, volume: Volume) -> Camera:

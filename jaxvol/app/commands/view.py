@@ -7,14 +7,12 @@ import webbrowser
 from ..viewer import serve
 from .data import volume_of
 from .options import DATA, TRANSFER, Command, Option
-from .scene import is_automatic, transfer_given, transfer_of
+from .scene import is_automatic, transfer_of
 
 
 def _view(options: argparse.Namespace) -> None:
-    transfer = transfer_given(options)
     volume = volume_of(options)
-    if transfer is None and not is_automatic(options):
-        transfer = transfer_of(options, volume)
+    transfer = None if is_automatic(options) else transfer_of(options, volume)
     page = serve(volume, transfer, lit=options.shade, port=options.port, title=options.file.name)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:

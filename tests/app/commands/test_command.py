@@ -34,7 +34,10 @@ BAD = [
         ["render", "x.raw", "--memory", "lots"],
         "render: error: argument --memory: must be a number of bytes, such as 256M or 2G; got 'lots'",
     ),
-    (["render", "x.raw", "--memory", "0"], "argument --memory: must be at least 1 byte; got '0'"),
+    (
+        ["render", "x.raw", "--memory", "0"],
+        "--memory: must be a number of bytes, such as 256M or 2G; got '0'",
+    ),
     (
         ["fit", "x.raw", "--images", "a.png", "--cameras", "c.json", "--solver", "newton"],
         "fit: error: argument --solver: invalid choice: 'newton'",

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -36,7 +37,7 @@ def test_the_page_holds_the_code_that_made_its_pictures(tmp_path, capsys, monkey
     assert set(re.findall(r'src="([^"]+)"', (folder / "index.html").read_text("utf-8"))) == names
     assert len(codes(folder)) == 2
     for name, code in zip(("head", "grain"), codes(folder), strict=True):
-        defined = {"Path": Path}
+        defined: dict[str, Any] = {"Path": Path}
         exec(code, defined)
         defined[name](tmp_path, (40, 30), 24)
     assert eqx.tree_equal(drawn.scenes[:3], drawn.scenes[3:])

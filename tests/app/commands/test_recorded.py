@@ -15,7 +15,7 @@ from skimage.io import imread
 import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.parsing import parsed
-from jaxvol.app.commands.recorded import KEYWORD, MOST, checksum
+from jaxvol.app.commands.recorded import KEYWORD, checksum
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
@@ -170,7 +170,7 @@ BAD = {
     "of another program": (lambda p: png(p, "x", "Software"), "holds no settings of jaxvol"),
     "no JSON": ("import os; os.remove('x')", "damaged: they are not JSON"),
     "long number": ("9" * 5000, "damaged"),
-    "long": ('"' + "x" * MOST + '"', "PNG"),
+    "long": ('"' + "x" * 2**20 + '"', "PNG"),
     "command": (
         said({"size": [9, 9]}, command="demo"),
         "was not made by jaxvol render, but, as it says, by jaxvol 'demo'",

@@ -286,7 +286,7 @@ BAD = {
     "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
     "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--parallel goes with --direction"),
     "no file": (["nowhere.raw"], "error: there is no file"),
-    "cmap": (["nowhere.raw", "--cmap", "moon"], "cmap must be"),
+    "cmap": (["FILE", "--cmap", "moon"], "cmap must be"),
     "background": (
         ["nowhere.raw", "--background", "200", "0", "nan"],
         "--background must be three numbers from 0 to 1 (linear RGB); got 200 0 nan.",
