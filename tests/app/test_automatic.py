@@ -181,7 +181,7 @@ def test_a_framed_camera_just_sees_all_points():
     for parallel in (False, True):
         for size in ((32, 32), (48, 32), (16, 32)):
             camera = jv.Camera.looking_at(volume, (1, -1, 0.3), view_angle=40, parallel=parallel, size=size)
-            seen = in_picture(framed(camera, points, [camera]), points)
+            seen = in_picture(framed(camera, points), points)
             low, high = seen.min(axis=0), seen.max(axis=0)
             # both sides of the tighter axis are at the margin, and the other is as far inside on both sides
             assert max(high) == pytest.approx(1 / MARGIN, abs=1e-4)

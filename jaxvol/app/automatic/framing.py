@@ -76,7 +76,7 @@ def _in_world(volume: Volume, grid: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
     return np.asarray(volume.origin, np.float64) + (grid * np.asarray(volume.spacing, np.float64)) @ turn.T
 
 
-def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera]) -> Camera:
+def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:
     """A camera with the directions, the angle and the size of another, placed so that the points just fill
     its picture, the whole window.
 
@@ -85,9 +85,10 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
     angle. So D must be at least the mean of max(x / t + z) and max(-x / t + z), if f is shifted so that both
     sides are as free. For parallel rays, z does not count, and D is the half height of the view.
 
-    `views`: the camera turned about its focal point in all ways that are to show the points. The focal point
-    of several is the middle of the points, without a shift.
+    `views`: the camera turned about its focal point in all ways that are to show the points, by default as it
+    is. The focal point of several is the middle of the points, without a shift.
     """
+    views = views or [camera]
     width, height = camera.size
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     perspective = camera.parallel_scale is None

@@ -71,7 +71,7 @@ def scene_of(options: argparse.Namespace, *, turn: float = 0.0, orbit: float | N
         else:
             source = source_of(options)
             volume = copy_of(source, options.memory)
-            transfer = transfer_of(options, volume, middle_of(source))
+            transfer = transfer_of(options, volume, middle_of(source) if automatic else None)
         if automatic:
             points = visible_points(volume, transfer)
     camera = _camera(options, volume)

@@ -74,7 +74,7 @@ def begin(
     seen: Any = whole if camera is None else camera
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-        seen = framed(seen, visible_points(volume, transfer), [seen]) if camera is None else seen
+        seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
     given = March(1.0) if march is None else march
     check_arguments(
         "view(volume, transfer, camera, march)",

@@ -63,6 +63,11 @@ def test_invalid_options_are_named_in_one_line(capsys):
         assert "--help lists the options" in printed
 
 
+def test_datasets_are_fetched_by_name(capsys):
+    assert main(["datasets", "fetch"]) == 2
+    assert capsys.readouterr().err.startswith("jaxvol datasets: error: fetch needs a NAME")
+
+
 def test_too_little_memory_is_told_in_one_line(volume_file, tmp_path, monkeypatch, capsys):
     def full(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 16 bytes.")
