@@ -70,8 +70,6 @@ def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camer
     """How to render images of the scene: with the given step; without one, by the shortest step of those that
     are planned for the cameras."""
     if options.step is not None:
-        if options.tolerance is not None:
-            raise ValueError("--tolerance finds a step; leave out --step.")
         march = March(options.step, (*scene.clip, *FAST), "midpoint")
         return Frames(scene, scene.volume, march, scene.lighting, scene.source, options.memory)
     found = min(plans_of(options, scene, cameras), key=lambda plan: float(plan.march.step))

@@ -28,7 +28,7 @@ OVERRIDES = {
     "step": {"tolerance"},
     "tolerance": {"step"},
 }
-"""Options of earlier sources that do not count where a later source gives this one."""
+"""Options that exclude this one: in one source both are an error, and a later source overrides an earlier."""
 
 FIXED = {"compositing": "over", "recorded_transfer": None}
 """Where no option says so. `recorded_transfer`: the transfer function that a picture holds."""
@@ -114,10 +114,10 @@ def parsed(parser: argparse.ArgumentParser, words: Sequence[str]) -> tuple[Comma
             raise ValueError(f"--like: {fault}") from fault
     if "config" in given:
         sources.append(_of_toml(command, given["config"]))
-    _refuse_rivals(given, "")
     settings: dict[str, Any] = {}
     for source in (*sources, given):
         settings = _without_overridden(settings, source) | source
+    _refuse_conflicts(settings)
     if missing := [o for o in command.options if o.required and o.key not in settings]:
         names = (option.name if option.group == ARGUMENT else f"--{option.name}" for option in missing)
         child.error(f"the following arguments are required: {', '.join(names)}")
@@ -174,14 +174,17 @@ def _checked(
         rows = value if option.repeated else [value]
         converted = [_converted(option, row, f"{where}: {name}") for row in rows]
         found[option.key] = converted if option.repeated else converted[0]
-    _refuse_rivals(found, f"{where}: ")
+    _refuse_conflicts(found, f"{where}: ")
     return found
 
 
-def _refuse_rivals(given: Mapping[str, Any], where: str) -> None:
-    both = [name for name in ("preset", "cmap", "transfer") if name in given]
-    if len(both) > 1:
-        raise ValueError(f"{where}one of {' and '.join(both)} excludes the other; leave one out.")
+def _refuse_conflicts(settings: Mapping[str, Any], where: str = "") -> None:
+    on = {name for name, value in settings.items() if value is not None and value is not False}
+    for name in sorted(on):
+        for other in sorted(on & OVERRIDES.get(name, set())):
+            both = " and ".join(f"--{each.replace('_', '-')}" for each in (name, other))
+            both = both.replace("--recorded-transfer", "the transfer function in the picture")
+            raise ValueError(f"{where}{both} exclude each other; leave one out.")
 
 
 def _converted(option: Option, value: Any, where: str) -> Any:

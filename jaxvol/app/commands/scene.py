@@ -133,19 +133,12 @@ def transfer_of(
     """The transfer function for a volume. `part`: of the voxels as they are, where the volume is a copy."""
     if is_automatic(options):
         return automatic_transfer(volume) if part is None else transfer_by_copy(volume, part)
-    path, recorded = options.transfer, options.recorded_transfer
-    if path is not None or recorded is not None:
-        for name in ("clim", "opacity", "unit_distance"):
-            if getattr(options, name) is not None:
-                raise ValueError(
-                    f"--{name.replace('_', '-')} is for presets and colormaps; a transfer function from a "
-                    "file or a picture needs none."
-                )
-        return read_transfer(path) if recorded is None else recorded
+    if options.recorded_transfer is not None:
+        return options.recorded_transfer
+    if options.transfer is not None:
+        return read_transfer(options.transfer)
     unit = 1.0 if options.unit_distance is None else options.unit_distance
     if options.preset is not None:
-        if options.opacity is not None:
-            raise ValueError("--opacity is for colormaps; a preset has its own.")
         return preset(options.preset, options.clim, unit)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
@@ -154,12 +147,6 @@ def transfer_of(
 
 def _camera(options: argparse.Namespace, volume: Volume) -> Camera:
     """Where the volume is looked at from, all of it unless the position is given."""
-    if options.camera and options.parallel:
-        raise ValueError(
-            "--parallel goes with --direction, which shows the whole volume; leave out --camera."
-        )
-    if options.camera and options.direction:
-        raise ValueError("--camera sets the position; leave out --direction.")
     up, side = options.view_up, options.direction
     free = up is side is options.camera is None
     if free and not says_where_it_lies(options.file) and (found := upright(volume)) is not None:

@@ -64,7 +64,7 @@ def test_a_picture_is_made_again_bit_by_bit(picture, volume_file, tmp_path, draw
     assert (found.preset, found.frames) == ("engine", 3)
 
 
-def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path, monkeypatch, drawn):
+def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path, monkeypatch, drawn, capsys):
     monkeypatch.chdir(tmp_path)
     jv.write_transfer("t.json", jv.preset("engine"))
     words = ["--size", "16", "16", "--step", "0.4", "--no-shade", "--transfer", "t.json"]
@@ -75,6 +75,8 @@ def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path
     assert text_in("b.png") == text_in("a.png")
     assert like("c.png", "--preset", "engine") == 0
     assert "transfer" not in text_in("c.png")
+    assert like("d.png", "--clim", "0", "1") == 2
+    assert "the transfer function in the picture and --clim exclude each other" in capsys.readouterr().err
 
 
 def test_the_volume_may_lie_beside_the_picture_and_must_be_the_same(picture, volume_file, tmp_path, capsys):
@@ -177,7 +179,7 @@ BAD = {
     ),
     "option": (said({"evil": 1}), "the settings in it: jaxvol render has no option"),
     "a file": (said({"transfer": "/dev/zero"}), "has no option 'transfer'"),
-    "rivals": (said({"preset": "head", "cmap": "hot"}), "one of preset and cmap excludes the other"),
+    "rivals": (said({"preset": "head", "cmap": "hot"}), "--cmap and --preset exclude each other"),
     "programs": (said({"programs": "/"}), "has no option 'programs'"),
     "kind": (said({"step": "1"}), "step must be a number; got '1'"),
     "file": (said(file="/etc/passwd"), "file must have a name and a SHA-256"),
