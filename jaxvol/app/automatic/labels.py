@@ -14,7 +14,7 @@ from .histogram import unit_of
 
 FEWEST_FLAT = 0.8
 """Part of the voxels, of those that are not the lowest, whose neighbour has the same value: above it, whole
-numbers are taken for labels. It was 0.92 in a segmented frog, 0.25 at most in twelve scans and simulations,
+numbers count as labels. It was 0.92 in a segmented frog, 0.25 at most in twelve scans and simulations,
 and 0.46 at most in phantoms."""
 
 MOST_LABELS = 64
@@ -24,14 +24,11 @@ INSIDE = 255
 
 
 def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
-    """How a volume is shown whose voxels are labels; None if they seem to be none.
+    """A volume and a transfer function that show each label in its own colour; None if there are no labels.
 
-    Voxels are taken for labels if they are whole numbers of few kinds, and nearly all of a kind lie beside
-    others of it. The lowest is what is around.
-
-    **Returns:** a volume in the same place, whose values are smooth, 255 inside of all labels, and whose
-    labels reach two voxels beyond; and a transfer function that shows what is inside, each label in its own
-    colour."""
+    Voxels count as labels if they are whole numbers of few kinds, and nearly all have an equal neighbour. The
+    lowest is the background. The volume returned is smooth, 255 inside of all labels, and its labels reach
+    two voxels beyond."""
     import matplotlib
     from matplotlib.colors import ListedColormap
     from scipy.ndimage import gaussian_filter, maximum_filter

@@ -28,15 +28,15 @@ def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, one of
     its slices, or one of the others."""
     slices = files_of(options.file) if options.file.is_dir() else []
-    kept = {"the volume": [options.file], "a slice of the volume": slices}
+    used = {"the volume": [options.file], "a slice of the volume": slices}
     for name in names:
         path = getattr(options, name)
         if path is None:
             continue
-        for what, others in kept.items():
+        for what, others in used.items():
             if path.resolve() in [other.resolve() for other in others]:
                 raise ValueError(f"--{name}: {path} is {what}, which it would replace. Write another file.")
-        kept[f"what --{name} writes"] = [path]
+        used[f"what --{name} writes"] = [path]
 
 
 MIDDLE = 128

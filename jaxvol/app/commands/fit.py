@@ -21,19 +21,19 @@ from .scene import background_of
 def _fit(options: argparse.Namespace) -> None:
     refuse_to_replace(options, "output", "checkpoint")
     output_file("--output", options.output)
-    # what is wrong with these is told before the volume is read
+    # these are checked before the volume is read
     views = read_views(options.images, options.cameras)
     start = read_transfer(options.start) if options.start else None
     background = background_of(options)
     with show_progress(f"reading {options.file}"):
         volume = volume_of(options)
-    # half a voxel
-    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
+    half_a_voxel = float(volume.spacing.min()) / 2
+    step = half_a_voxel if options.step is None else options.step
     march = March(step, FAST, "midpoint")
     if start is None:
         start = flat_grey(volume, options.points, options.clim)
     with show_progress("fitting, steps") as report, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=UNDETERMINED)  # told below, of points
+        warnings.filterwarnings("ignore", message=UNDETERMINED)  # reported below, by point
         result = fit(
             ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
             start,

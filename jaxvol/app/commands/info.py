@@ -28,7 +28,7 @@ def _info(options: argparse.Namespace) -> None:
 
 def described_volume(volume: Volume, *, assumed: bool = False) -> str:
     """Lines of text about a volume: its voxels, its place in the world, its values. `assumed`: whether its
-    spacing was not told.
+    spacing is an assumption.
 
     The bars are a histogram of 64 bins from the least to the greatest value, each as high as the logarithm of
     its count.
