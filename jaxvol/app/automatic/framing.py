@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     direction; the corners of the volume where nothing is visible. Transfer functions are those made by
     `automatic_transfer` and `labels_shown`."""
     from scipy.ndimage import label, maximum_filter
+    from scipy.spatial import ConvexHull, QhullError
 
     data = sampled(volume)
     if isinstance(transfer, LabelTransferFunction):
@@ -67,6 +69,8 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     rows = shown.any(axis=2)  # of voxels along z: only their ends can be farthest from the middle
     ends = shown.argmax(axis=2)[rows], shown.shape[2] - 1 - shown[..., ::-1].argmax(axis=2)[rows]
     voxels = np.concatenate([np.column_stack([*np.nonzero(rows), z]) for z in ends]).astype(np.float64)
+    with suppress(QhullError):  # voxels in a plane have no hull, and all are kept
+        voxels = voxels[ConvexHull(voxels).vertices]
     around = stride_of(volume.shape) * voxels[:, None] + 2 * CORNERS - 1  # a voxel ends at the next
     return _in_world(volume, np.clip(around.reshape(-1, 3), 0, np.array(volume.shape) - 1))
 
