@@ -16,11 +16,9 @@ from jaxvol.app.automatic import (
     upright,
     visible_points,
 )
-from jaxvol.app.automatic.body import is_body
 from jaxvol.app.automatic.framing import MARGIN
+from jaxvol.app.automatic.histogram import SAMPLED, is_body, thresholds
 from jaxvol.app.automatic.labels import INSIDE
-from jaxvol.app.automatic.sampling import SAMPLED
-from jaxvol.app.automatic.thresholds import thresholds
 from jaxvol.app.commands.data import copy_of, middle_of
 from jaxvol.app.commands.orbit import turned
 from jaxvol.bricks import source_of

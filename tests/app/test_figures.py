@@ -8,7 +8,8 @@ from skimage.io import imread
 
 from experiments import record
 from experiments.marches import BOTH
-from jaxvol.app import cli, figures
+from jaxvol.app import cli
+from jaxvol.app.commands import figures
 from paper_figs import common, contents, fig09, index, kim_table1, kisti_table, table1
 
 
@@ -57,7 +58,7 @@ def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_pat
     assert str(tmp_path / "made" / "index.html") in capsys.readouterr().out
     assert cli.main(["figures", "--quick"]) == 2
     assert "--quick goes with --run" in capsys.readouterr().err
-    monkeypatch.setattr(figures, "__file__", str(tmp_path / "site-packages" / "jaxvol" / "figures.py"))
+    monkeypatch.setattr(figures, "__file__", str(tmp_path / "site-packages/jaxvol/app/commands/figures.py"))
     monkeypatch.chdir(ROOT)
     assert figures.checkout() == ROOT
     monkeypatch.chdir(tmp_path)

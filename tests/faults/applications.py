@@ -53,7 +53,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "command: a picture is made again of a volume that has changed",
-        "app.commands.checksum:checksum",
+        "app.commands.recorded:checksum",
         lambda _: lambda path: 64 * "0",
         ("app/commands/test_recorded.py::test_the_volume_may_lie_beside_the_picture_and_must_be_the_same",),
     ),

@@ -1,17 +1,19 @@
-"""Where is what a transfer function shows, and from how far does a camera see all of it?"""
+"""Where is what a transfer function shows, from how far does a camera see all of it, and which way is up?"""
 
+import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ...scene.camera import Camera, axes_of
 from ...scene.labels import LabelTransferFunction
 from ...scene.transfer import Transfer, TransferFunction
 from ...scene.volume import Volume
+from .histogram import faces, sampled, stride_of, thresholds, unit_of
 from .labels import INSIDE
-from .sampling import sampled, stride_of, unit_of
 
 
 SEEN = 0.1
@@ -29,14 +31,25 @@ REACH = 3
 MARGIN = 1.06
 """By how much more than what is visible the picture shows, in each direction."""
 
+CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+"""Of the unit cube."""
+
+CUT_LEAST = 0.1
+"""Part of a face of the grid that an object covers from which on the face cuts it."""
+
+OTHERS_MOST = 0.25
+"""Part of that, at most, which it covers of any other face."""
+
+FRONT = (0.5, -1.0, 0.4)
+"""From the volume to the camera, where z is up: to the right, in front, and higher."""
+
 
 def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3"]:
-    """Corners in the world of the hull of what a transfer function shows, specks left out; those of the whole
-    volume where nothing is visible.
-
-    A piece is what hangs together within REACH voxels, of every n-th in a large volume. Transfer functions
-    are those made by `automatic_transfer` and `labels_shown`."""
+    """Points in the world around what a transfer function shows, specks left out, which reach as far in each
+    direction; the corners of the volume where nothing is visible. Transfer functions are those made by
+    `automatic_transfer` and `labels_shown`."""
     from scipy.ndimage import label, maximum_filter
+    from scipy.spatial import ConvexHull, QhullError
 
     data = sampled(volume)
     if isinstance(transfer, LabelTransferFunction):
@@ -46,35 +59,20 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
         extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
         seen = -np.expm1(-extinction * unit_of(volume)) > SEEN
     if not seen.any():
-        return _in_world(volume, _corners(np.zeros(3), np.array(volume.shape) - 1.0))
+        return _in_world(volume, CORNERS * (np.array(volume.shape) - 1))
     found: Any = label(maximum_filter(seen, REACH))  # scipy's types allow a number, too
     pieces = seen * found[0]
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
     kept = sizes >= SPECK * sizes.max()
-    corners = stride_of(volume.shape) * _hull(kept[pieces])
-    around = (corners[:, None] + _corners(-np.ones(3), np.ones(3))).reshape(-1, 3)  # a voxel ends at the next
-    return _in_world(volume, np.clip(around, 0, np.array(volume.shape) - 1))
-
-
-def _hull(seen: Bool[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
-    """Corners of the convex hull of voxels, or all of them where they lie in a plane."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    # of a row along z, only its ends can be corners
-    rows = seen.any(axis=2)
-    x, y = np.nonzero(rows)
-    ends = [seen[..., ::step].argmax(axis=2)[rows] for step in (1, -1)]
-    ends[1] = seen.shape[2] - 1 - ends[1]
-    points = np.concatenate([np.stack([x, y, z], axis=1) for z in ends]).astype(np.float64)
-    try:
-        return points[ConvexHull(points).vertices]
-    except QhullError:
-        return points
-
-
-def _corners(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Float[np.ndarray, "8 3"]:
-    return np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    shown = kept[pieces]
+    rows = shown.any(axis=2)  # of voxels along z: only their ends can be farthest from the middle
+    ends = shown.argmax(axis=2)[rows], shown.shape[2] - 1 - shown[..., ::-1].argmax(axis=2)[rows]
+    voxels = np.concatenate([np.column_stack([*np.nonzero(rows), z]) for z in ends]).astype(np.float64)
+    with suppress(QhullError):  # voxels in a plane have no hull, and all are kept
+        voxels = voxels[ConvexHull(voxels).vertices]
+    around = stride_of(volume.shape) * voxels[:, None] + 2 * CORNERS - 1  # a voxel ends at the next
+    return _in_world(volume, np.clip(around.reshape(-1, 3), 0, np.array(volume.shape) - 1))
 
 
 def _in_world(volume: Volume, grid: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -82,21 +80,19 @@ def _in_world(volume: Volume, grid: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
     return np.asarray(volume.origin, np.float64) + (grid * np.asarray(volume.spacing, np.float64)) @ turn.T
 
 
-def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] | None = None) -> Camera:
+def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:
     """A camera with the directions, the angle and the size of another, placed so that the points just fill
     its picture, the whole window.
 
     From a perspective camera at distance D from its focal point f, a point that lies x to the right of f, and
     z nearer to the camera than f, is in the picture if |x| <= t (D - z), where t is the tangent of half the
-    angle. So D must be at least max(x / t + z) and max(-x / t + z), and a shift of f to the right by t / 2
-    times their difference makes both equal to their mean. In the same way upwards; the greater mean is taken,
-    and f shifted so that on both sides as much is left free. For parallel rays, z does not count, and D is
-    the half height of the view.
+    angle. So D must be at least the mean of max(x / t + z) and max(-x / t + z), if f is shifted so that both
+    sides are as free. For parallel rays, z does not count, and D is the half height of the view.
 
     `views`: the camera turned about its focal point in all ways that are to show the points, by default as it
     is. The focal point of several is the middle of the points, without a shift.
     """
-    views = [camera] if views is None else views
+    views = views or [camera]
     width, height = camera.size
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     perspective = camera.parallel_scale is None
@@ -109,10 +105,9 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
         axes = np.stack([right, up], axis=1)
         across, nearer = (points - middle) @ axes / t, -(points - middle) @ forward * perspective
         one, other = ((nearer[:, None] + side * across).max(axis=0) for side in (1, -1))
-        alone = len(views) == 1
-        distance = max(distance, float(nearer.max()) + free)
-        distance = max(distance, *((one + other) / 2 if alone else np.maximum(one, other)).tolist())
-        if alone:
+        needed = (one + other) / 2 if len(views) == 1 else np.maximum(one, other)
+        distance = max(distance, float(nearer.max()) + free, *needed.tolist())
+        if len(views) == 1:
             depth = distance - nearer if perspective else np.ones(len(points))
             focal = middle + axes @ (t * [_centering(each, depth) for each in across.T])
     away = np.asarray(camera.position - camera.focal_point, np.float64)
@@ -135,3 +130,28 @@ def _centering(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) 
         return float(seen.max() + seen.min())
 
     return float(brentq(excess, across.min(), across.max()))  # pyright: ignore[reportArgumentType]
+
+
+def upright(volume: Volume) -> Float[np.ndarray, "3"] | None:
+    """The axis of the grid that is up, with its sign; None if nothing tells.
+
+    What a single face of the grid cuts, stands on that face: a head on its neck, a plant on its pot, a
+    machine on its plate. The object is what lies above the first of the histogram's two thresholds. It is a
+    guess: of 14 scans and simulations it was right for the five that one face cuts, and made none for the
+    others.
+    """
+    data = sampled(volume)
+    first, _ = thresholds(data.ravel().astype(np.float32))
+    covered = np.array([(face > first).mean() for face in faces(data)])
+    others, foot = np.sort(covered)[-2:]
+    if foot < CUT_LEAST or others > OTHERS_MOST * foot:
+        return None
+    axis, end = divmod(int(covered.argmax()), 2)
+    return np.eye(3)[axis] * (-1 if end else 1)
+
+
+def front_of(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """`FRONT`, turned with z to an axis that is up."""
+    into = np.array([0.0, 0.0, -up[1]]) if up[1] else np.array([0.0, 1.0, 0.0])
+    right, behind, above = FRONT
+    return right * np.cross(into, up) + behind * into + above * up

@@ -1,18 +1,20 @@
 """Are the voxels of a volume labels, and in which colours are they shown?"""
 
+from typing import cast
+
 import numpy as np
 from jaxtyping import Shaped
 
+from ..._util.srgb import from_srgb
 from ...scene.labels import LabelTransferFunction
 from ...scene.transfer import TransferFunction, extinction_of
 from ...scene.volume import Volume
-from .colors import linear
-from .sampling import unit_of
+from .histogram import unit_of
 
 
 FEWEST_FLAT = 0.8
 """Part of the voxels, of those that are not the lowest, whose neighbour has the same value: above it, whole
-numbers are taken for labels. It was 0.92 in a segmented frog, 0.25 at most in twelve scans and simulations,
+numbers count as labels. It was 0.92 in a segmented frog, 0.25 at most in twelve scans and simulations,
 and 0.46 at most in phantoms."""
 
 MOST_LABELS = 64
@@ -22,14 +24,13 @@ INSIDE = 255
 
 
 def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
-    """How a volume is shown whose voxels are labels; None if they seem to be none.
+    """A volume and a transfer function that show each label in its own colour; None if there are no labels.
 
-    Voxels are taken for labels if they are whole numbers of few kinds, and nearly all of a kind lie beside
-    others of it. The lowest is what is around.
-
-    **Returns:** a volume in the same place, whose values are smooth, 255 inside of all labels, and whose
-    labels reach two voxels beyond; and a transfer function that shows what is inside, each label in its own
-    colour."""
+    Voxels count as labels if they are whole numbers of few kinds, and nearly all have an equal neighbour. The
+    lowest is the background. The volume returned is smooth, 255 inside of all labels, and its labels reach
+    two voxels beyond."""
+    import matplotlib
+    from matplotlib.colors import ListedColormap
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     data = np.asarray(volume.data)
@@ -42,27 +43,23 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
         labels = np.searchsorted(kinds, data).astype(np.uint8)
     inside = gaussian_filter(np.where(labels > 0, np.float32(INSIDE), np.float32(0)), LABEL_BLUR)
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
-    shown = Volume(
-        *((inside + 0.5).astype(np.uint8), volume.spacing, volume.origin, beyond),
-        direction=volume.direction,
-    )
-    functions = {}
-    for label in range(1, len(kinds)):
-        color = linear(COLORS[(label - 1) % len(COLORS)])
-        opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
-        functions[label] = TransferFunction([0, 0.35 * INSIDE, 0.65 * INSIDE], [color] * 3, opacity)
+    place = volume.spacing, volume.origin
+    shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
+    tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
+    dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
+    colors = np.asarray(from_srgb(dark_then_light))
+    opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
+    functions = {
+        label: TransferFunction(
+            [0, 0.35 * INSIDE, 0.65 * INSIDE], [colors[(label - 1) % len(colors)]] * 3, opacity
+        )
+        for label in range(1, len(kinds))
+    }
     return shown, LabelTransferFunction(functions)
 
 
 LABEL_BLUR = 0.8
 """Voxels by which the border of what has a label is smoothed, so that it has a gradient."""
-
-COLORS = (
-    *((31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75)),
-    *((227, 119, 194), (188, 189, 34), (23, 190, 207), (174, 199, 232), (255, 187, 120), (152, 223, 138)),
-    *((255, 152, 150), (197, 176, 213), (196, 156, 148), (247, 182, 210), (219, 219, 141), (158, 218, 229)),
-)
-"""Colours of labels, 8-bit sRGB: those of matplotlib's tab20 without its greys, one of each pair first."""
 
 
 def _kinds(data: Shaped[np.ndarray, "nx ny nz"]) -> Shaped[np.ndarray, " n"] | None:

@@ -4,16 +4,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 
 from ..._util.checks import described
+from ..._util.srgb import from_srgb
 from ...scene.transfer import TransferFunction, extinction_of
 from ...scene.volume import Volume
 from ...xla.platform import is_traced
-from .body import is_body
-from .colors import linear
-from .sampling import sampled, unit_of
-from .thresholds import thresholds
+from .histogram import faces, is_body, sampled, thresholds, unit_of
 
 
 CUT = 0.25
@@ -49,38 +47,28 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
             "jax.vmap and jax.grad, and pass what it returns."
         )
     with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
-        return _of_histogram(volume, np.asarray(volume.data))
+        return transfer_by_copy(volume, np.asarray(volume.data))
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
     """The same for a volume of which there is a copy of every n-th voxel, in the same place, and a part as it
     is: whether values are grain, a copy does not tell."""
-    return _of_histogram(copy, part)
-
-
-def _of_histogram(volume: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
-    values = sampled(volume).ravel().astype(np.float32)
+    values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
-        ends = [low, low + max(abs(low), 1.0)]
-        return TransferFunction(ends, [linear(TISSUE)] * 2, extinction_of([0.5] * 2, unit_of(volume)))
-    first, second = thresholds(values)
-    faces = _faces(np.asarray(volume.data))
-    whole = np.mean(faces > first) < CUT and is_body(part, first, second)
-    points = _shell(low, first, second, high) if whole else _dense(first, second, high)
+        points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
+    else:
+        first, second = thresholds(values)
+        outer = np.concatenate([face.ravel() for face in faces(np.asarray(copy.data))]).astype(np.float32)
+        whole = np.mean(outer > first) < CUT and is_body(part, first, second)
+        points = _shell(low, first, second, high) if whole else _dense(first, second, high)
     at, colors, opacities = zip(*points, strict=True)
-    return TransferFunction(
-        np.array(at), np.array([linear(c) for c in colors]), extinction_of(opacities, unit_of(volume))
-    )
+    linear = np.asarray(from_srgb(np.array(colors) / 255))
+    return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
 
 
-EDGE, SKIN, TISSUE, DENSE, BRIGHT = (
-    (70, 30, 18),
-    (214, 130, 92),
-    (190, 92, 62),
-    (236, 208, 160),
-    (255, 246, 226),
-)
+EDGE, SKIN, TISSUE = (70, 30, 18), (214, 130, 92), (190, 92, 62)
+DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 """Colours, 8-bit sRGB: of the border's foot, the border, the object, what is dense, and what is densest."""
 
 
@@ -105,9 +93,3 @@ def _dense(first: float, second: float, high: float) -> list[tuple[float, Any, f
         (second, DENSE, 0.45),
         (max((second + high) / 2, second + d / 2), BRIGHT, 0.9),
     ]
-
-
-def _faces(data: Shaped[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, " n"]:
-    faces = [data[end].ravel() for end in (0, -1)] + [data[:, end].ravel() for end in (0, -1)]
-    faces += [data[..., end].ravel() for end in (0, -1)]
-    return np.concatenate(faces).astype(np.float32)

@@ -1,11 +1,10 @@
 """`jaxvol animate`: a volume file seen from a camera that turns about it, as GIF, MP4 or a folder of PNGs."""
 
 import argparse
-import importlib
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,12 @@ from jaxtyping import UInt8
 from ..._util.checks import integer, output_file
 from ..._util.whole_files import whole_file, whole_folder
 from ...io.display import displayed, save_image
-from .checksum import checksum
 from .frames import frames_of
-from .options import add_output, scene_options, view_options
-from .orbit import angles_of, axis_of, turned, views_of
-from .progress import working
-from .recorded import settings_of, text_of, transfer_from_file
+from .options import SCENE, Command, Option, output
+from .orbit import angles_of
+from .progress import show_progress
+from .recorded import checksum, text_of
+from .render import RENDER, orbit_views
 from .scene import Scene, scene_of
 
 
@@ -27,27 +26,6 @@ Picture = UInt8[np.ndarray, "height width 3"]
 
 GIF_FPS = 50
 """Frames a second of a GIF, at most: browsers show those of less than 2/100 s for 10/100 s."""
-
-OWN = frozenset({"frames", "degrees", "fps"})
-"""Options that the command render has not."""
-
-
-def add_animate(commands: Any, shared: argparse.ArgumentParser) -> None:
-    """Add the subcommand. `commands`: what `add_subparsers` returned."""
-    parser = commands.add_parser(
-        "animate",
-        parents=[shared, scene_options(), view_options()],
-        help="render a volume file from a camera that turns about it",
-        description="Render a volume file from a camera that turns about it.",
-    )
-    kinds = ".gif, .mp4 (needs jaxvol[video]), or a folder, of one .png for each frame"
-    add_output(parser, "orbit.gif", f"what to write: {kinds}")
-    parser.add_argument("--frames", type=int, default=36, help="number of images (default: 36)")
-    parser.add_argument(
-        "--degrees", type=float, default=360, help="angle that the camera turns about --axis (default: 360)"
-    )
-    parser.add_argument("--fps", type=float, default=12, help="frames a second (default: 12)")
-    parser.set_defaults(run=_animate)
 
 
 def _animate(options: argparse.Namespace) -> None:
@@ -65,9 +43,15 @@ def _animate(options: argparse.Namespace) -> None:
         raise ValueError(
             f"--fps: a .gif has {GIF_FPS} frames a second at most; got {options.fps:g}. Write an .mp4."
         )
-    if kind == ".mp4":
-        _check_mp4(options.size)
-    scene = scene_of(options)
+    if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise ImportError(
+            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a '
+            "folder of PNGs."
+        )
+    if kind == ".mp4" and any(side % 2 for side in options.size):
+        width, height = options.size
+        raise ValueError(f"--size: an .mp4 has an even number of pixels on each side; got {width} {height}.")
+    scene = scene_of(options, orbit=options.degrees)
     begun = time.perf_counter()
     with whole_folder(options.output) if not kind else whole_file(options.output) as part:
         images = _images(options, scene, count, part if not kind else None)
@@ -83,21 +67,19 @@ def _animate(options: argparse.Namespace) -> None:
 
 
 def _images(options: argparse.Namespace, scene: Scene, count: int, folder: Path | None) -> Iterator[Picture]:
-    """The frames, one after the other; written into the folder if one is given."""
-    frames = frames_of(options, scene, views_of(options, scene.camera, options.degrees))
-    digest = checksum(options.file) if folder else ""
-    axis = axis_of(options, scene.camera)
-    with working(f"rendering {options.output}, frames") as told:
+    """The frames, one after the other; written into the folder if one is given, each with the options by
+    which `jaxvol render` makes it."""
+    frames = frames_of(options, scene, orbit_views(scene, options.degrees))
+    sha256 = checksum(options.file) if folder else None
+    with show_progress(f"rendering {options.output}, frames") as report:
         for number, angle in enumerate(angles_of(options.degrees, count)):
-            image = frames.render(turned(scene.camera, angle, axis)).image(scene.background)
+            image = frames.render(scene.view(angle)).image(scene.background)
             if folder is not None:
-                turn = {"turn": angle, "orbit": options.degrees}
-                held = transfer_from_file(options, scene.transfer)
-                settings = settings_of(options, OWN) | turn
-                text = text_of("render", settings, options.file, digest, held)
+                settings = vars(options) | {"turn": angle, "orbit": options.degrees}
+                text = text_of(RENDER.options, settings, scene.transfer, sha256)
                 save_image(folder / f"frame_{number:04d}.png", image, text=text)
             yield displayed(np.asarray(image, np.float32))
-            told(number + 1, count)
+            report(number + 1, count)
 
 
 def _write_gif(path: Path, images: Iterator[Picture], fps: float, count: int) -> None:
@@ -112,41 +94,26 @@ def _write_gif(path: Path, images: Iterator[Picture], fps: float, count: int) ->
     first.save(path, save_all=True, append_images=pictures, duration=milliseconds, loop=0, disposal=1)
 
 
-def _ffmpeg() -> ModuleType:
-    try:
-        return importlib.import_module("imageio_ffmpeg")
-    except ImportError as fault:
-        raise ImportError(
-            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a '
-            "folder of PNGs."
-        ) from fault
-
-
-def _check_mp4(size: Any) -> None:
-    _ffmpeg()
-    if any(side % 2 for side in size):
-        raise ValueError(
-            f"--size: an .mp4 has an even number of pixels on each side; got {size[0]} {size[1]}."
-        )
-
-
 def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
     """H.264 with colours at half the resolution, which every player shows."""
-    first = next(images)
-    height, width, _ = first.shape
-    writer = _ffmpeg().write_frames(
-        *(str(path), (width, height)),
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        quality=8,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    try:
-        writer.send(np.ascontiguousarray(first))
-        for image in images:
-            writer.send(np.ascontiguousarray(image))
-    finally:
-        writer.close()
+    from imageio.v3 import imopen
+
+    how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 2}
+    with imopen(path, "w", plugin="FFMPEG", legacy_mode=True) as file:
+        file.write(images, is_batch=True, fps=fps, ffmpeg_log_level="error", **how)
+
+
+_OUTPUT = "what to write: .gif, .mp4 (needs jaxvol[video]), or a folder, of one .png for each frame"
+
+ANIMATE = Command(
+    "animate",
+    "render a volume file from a camera that turns about it",
+    (
+        *SCENE,
+        output("orbit.gif", _OUTPUT),
+        Option("frames", "number of images", int, default=36),
+        Option("degrees", "angle that the camera turns about --axis", float, default=360.0),
+        Option("fps", "frames a second", float, default=12.0),
+    ),
+    _animate,
+)

@@ -1,8 +1,7 @@
-"""Which options say what a volume file holds, where the file and its name do not?"""
+"""Reads the volume that the options name, whole or in parts."""
 
 import argparse
 import math
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped
@@ -11,22 +10,7 @@ from ...bricks import VoxelSource, levels_of
 from ...io.formats import files_of, load
 from ...planning.memory import IN_MEMORY
 from ...scene.volume import Volume
-from ..automatic.sampling import SAMPLED
-
-
-def add_data_options(parser: argparse.ArgumentParser) -> None:
-    """Add the file and its options to a parser."""
-    parser.add_argument(
-        "file", type=Path, help="volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
-    )
-    data = parser.add_argument_group("data", "needed if the file and its name do not specify it")
-    data.add_argument(
-        "--shape", type=int, nargs=3, metavar=("X", "Y", "Z"), help="voxels, x fastest in the file"
-    )
-    data.add_argument("--dtype", help="such as uint8 or uint16le")
-    data.add_argument(
-        "--spacing", type=float, nargs=3, metavar=("X", "Y", "Z"), help="world length between voxels"
-    )
+from ..automatic.histogram import SAMPLED
 
 
 def volume_of(options: argparse.Namespace) -> Volume:
@@ -44,15 +28,15 @@ def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, one of
     its slices, or one of the others."""
     slices = files_of(options.file) if options.file.is_dir() else []
-    kept = {"the volume": [options.file], "a slice of the volume": slices}
+    used = {"the volume": [options.file], "a slice of the volume": slices}
     for name in names:
         path = getattr(options, name)
         if path is None:
             continue
-        for what, others in kept.items():
+        for what, others in used.items():
             if path.resolve() in [other.resolve() for other in others]:
                 raise ValueError(f"--{name}: {path} is {what}, which it would replace. Write another file.")
-        kept[f"what --{name} writes"] = [path]
+        used[f"what --{name} writes"] = [path]
 
 
 MIDDLE = 128

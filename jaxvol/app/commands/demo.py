@@ -1,52 +1,134 @@
-"""`jaxvol demo`: what the toolkit does, on one page. It runs the code that stands on the page."""
+"""`jaxvol demo`: what the toolkit does, on one page: pictures, and the functions below that make them."""
 
 import argparse
-import contextlib
+import html
+import inspect
 import time
 import warnings
-from typing import Any
+from pathlib import Path
 
 from ..._util.checks import integer, output_file
 from ..._util.whole_files import whole_folder
-from .demo_page import SECTIONS, page
-from .options import add_output, add_size
-from .progress import working
+from .options import SHARED, SIZE, Command, Option, output
+from .progress import show_progress
 
 
-def add_demo(commands: Any, shared: argparse.ArgumentParser) -> None:
-    """Add the subcommand. `commands`: what `add_subparsers` returned."""
-    text = "Render a shaded head, wood grain before and after, and a fit by gradients, and a page of them."
-    parser = commands.add_parser(
-        "demo", parents=[shared], help="show what the toolkit does", description=text
+def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
+    """A shaded volume: a phantom of a head, the skull under translucent skin and muscle, shaded by the
+    gradient of the values."""
+    import numpy as np
+    from scipy.ndimage import gaussian_filter
+
+    import jaxvol as jv
+
+    phantom = jv.phantom("head", resolution)
+    # 16 bits hold 128 levels for each of the phantom's
+    smooth = gaussian_filter(128 * np.asarray(phantom.data, np.float32), 1.5)
+    volume = jv.Volume(np.round(smooth).astype(np.uint16), phantom.spacing, phantom.origin)
+    fast = (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination())
+    rendering = jv.render(
+        volume,
+        jv.preset("head", (0, 128 * 255), unit_distance=0.01),
+        jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=size).zoom(1.65),
+        jv.March(float(volume.spacing[0]) / 3, fast, "preintegrated"),
+        lighting=jv.lighting.Phong(),
     )
-    add_output(parser, "jaxvol-demo", "where to write", "FOLDER")
-    add_size(parser)
-    parser.add_argument("--resolution", type=int, default=320, help="voxels per axis of the head")
-    parser.add_argument(
-        "--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="some of the pictures"
-    )
-    parser.set_defaults(run=_demo)
+    jv.save_png(folder / "head.png", rendering.image(background=(1, 1, 1)))
+
+
+def grain(folder: Path, size: tuple[int, int], resolution: int) -> None:
+    """Wood grain, before and after: a translucent cube at far too long a step. Each ray's last cell reaches
+    past the cube by another fraction of a step, which shows as terraces. AlphaCorrection cuts that cell where
+    the ray leaves the cube, and makes the same step exact there; nothing else is changed."""
+    import jaxvol as jv
+
+    cube = jv.phantom("linear", 64)
+    transfer = jv.TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
+    camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=size).zoom(1.05)
+    for name, transforms in (("before", ()), ("after", (jv.AlphaCorrection(),))):
+        rendering = jv.render(cube, transfer, camera, jv.March(0.25, transforms))
+        jv.save_png(folder / f"{name}.png", rendering.image(background=(0, 0, 0)))
+
+
+def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
+    """A fit by gradients, in seconds. Given were two images of an engine, of 48 x 48 pixels, but not the
+    transfer function that made them. From flat grey, the method of Levenberg and Marquardt finds one by
+    derivatives of the renderer. The view below was in none of the images: at the start, as found, and in
+    truth."""
+    import jaxvol as jv
+
+    engine = jv.phantom("engine", 48)
+    true = jv.preset("engine", unit_distance=0.04)
+    fast = (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination())
+    march = jv.March(float(engine.spacing[0]) / 2, fast, "midpoint")
+    sides = (0.5, -1, 0.4), (-1, -0.3, 0.5)
+    cameras = [jv.Camera.looking_at(engine, side, size=(48, 48)).zoom(1.4) for side in sides]
+    views = [(c, jv.render(engine, true, c, march).image(background=(1, 1, 1))) for c in cameras]
+    residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
+    grey = jv.flat_grey(engine, points=8)
+    found = jv.fit(residual, grey, max_steps=12)
+    new_view = jv.Camera.looking_at(engine, (0.8, 0.9, 0.7), size=size).zoom(1.4)
+    for name, transfer in (("start", grey), ("found", found.parameters), ("true", true)):
+        image = jv.render(engine, transfer, new_view, march).image(background=(1, 1, 1))
+        jv.save_png(folder / f"fit_{name}.png", image)
+
+
+SECTIONS = {
+    head: ("head",),
+    grain: ("before", "after"),
+    fit: ("fit_start", "fit_found", "fit_true"),
+}
+"""The functions, and the pictures that each writes, from left to right."""
+
+PAGE = """\
+<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>jaxvol demo</title><style>
+body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; margin: 2rem auto; padding: 0
+1rem } section { border-top: 1px solid #ddd; margin-top: 2rem; padding-top: 1rem }
+div { display: flex; gap: 1rem } img { min-width: 0; max-width: 32rem; flex: 0 1 auto; align-self: start }
+pre { background: #f5f5f5; padding: 0.8rem 1rem; overflow-x: auto; font-size: 0.85rem }
+</style></head><body>
+<h1>What jaxvol does</h1>
+<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render FILE</code>, and
+<code>jaxvol animate FILE</code>.</p>
+"""
 
 
 def _demo(options: argparse.Namespace) -> None:
     output_file("--output", options.output / "index.html")
-    size = tuple(integer("--size", side, 1) for side in options.size)
-    chosen = {
-        name: SECTIONS[name].with_numbers(integer("--resolution", options.resolution, 8), size)
-        for name in options.only
-    }
-    took: dict[str, float] = {}
+    width, height = (integer("--size", side, 1) for side in options.size)
+    resolution = integer("--resolution", options.resolution, 8)
+    page = PAGE
     with whole_folder(options.output) as folder:
-        for name, section in chosen.items():
+        for section, pictures in SECTIONS.items():
+            if section.__name__ not in options.only:
+                continue
             begun = time.perf_counter()
-            with (
-                working(f"compiling and rendering {name}"),
-                contextlib.chdir(folder),
-                warnings.catch_warnings(),
-            ):
+            with show_progress(f"compiling and rendering {section.__name__}"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # two images leave open what no image shows
-                exec(compile(section.code, f"{name}.py", "exec"), {"__name__": name})
-            took[name] = time.perf_counter() - begun
-            print(f"{options.output}: {', '.join(section.pictures)} in {took[name]:.1f} s")
-        (folder / "index.html").write_text(page(chosen, took), encoding="utf-8")
+                section(folder, (width, height), resolution)
+            took = f"{time.perf_counter() - begun:.1f} s"
+            print(f"{options.output}: {', '.join(pictures)} in {took}")
+            images = "".join(f'<img src="{name}.png" alt="{name}">' for name in pictures)
+            code = html.escape(inspect.getsource(section))
+            text = html.escape(inspect.getdoc(section) or "")
+            page += f"<section><p>{text} {took}, compilation included.</p><div>{images}</div>"
+            page += f"<pre>{code}</pre></section>\n"
+        (folder / "index.html").write_text(f"{page}</body></html>\n", encoding="utf-8")
     print(f"open {options.output / 'index.html'}")
+
+
+_NAMES = tuple(section.__name__ for section in SECTIONS)
+
+DEMO = Command(
+    "demo",
+    "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them",
+    (
+        *SHARED,
+        output("jaxvol-demo", "where to write", "FOLDER"),
+        SIZE,
+        Option("resolution", "voxels per axis of the head", int, default=320),
+        Option("only", "some of the pictures", values="NAME...", default=_NAMES, choices=_NAMES),
+    ),
+    _demo,
+)

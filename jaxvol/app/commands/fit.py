@@ -4,7 +4,7 @@ import argparse
 import re
 import warnings
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 from ..._util.checks import output_file
 from ...fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
@@ -13,65 +13,27 @@ from ...fitting.uncertainty import Uncertainty
 from ...march.march import March
 from .data import refuse_to_replace, volume_of
 from .frames import FAST
-from .options import add_clim, add_output, scene_options
-from .progress import working
+from .options import CLIM, DATA, SAMPLING, Command, Option, grouped, output
+from .progress import show_progress
 from .scene import background_of
-
-
-def add_fit(commands: Any, shared: argparse.ArgumentParser) -> None:
-    """Add the subcommand. `commands`: what `add_subparsers` returned."""
-    parser = commands.add_parser(
-        "fit",
-        parents=[shared, scene_options()],
-        help="fit a transfer function to images of a volume",
-        description="Fit a transfer function to images of a volume.",
-    )
-    parser.add_argument("--images", type=Path, nargs="+", required=True, metavar="IMAGE", help="sRGB, as PNG")
-    parser.add_argument(
-        "--cameras",
-        type=Path,
-        required=True,
-        metavar="JSON",
-        help="a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
-        "parallel_scale, window",
-    )
-    add_output(parser, "transfer.json", "JSON to write")
-    start = parser.add_argument_group("start")
-    start.add_argument(
-        "--start", type=Path, metavar="JSON", help="a transfer function written by this command"
-    )
-    start.add_argument(
-        "--points", type=int, default=8, help="else, flat grey with this many points (default: 8)"
-    )
-    add_clim(start, "range of their values (default: all)")
-    solver = parser.add_argument_group("solver")
-    solver.add_argument("--solver", choices=get_args(Solver), default="levenberg_marquardt")
-    solver.add_argument("--max-steps", type=int, default=100)
-    solver.add_argument(
-        "--checkpoint",
-        type=Path,
-        metavar="FILE",
-        help="save every step here; resume from here after an interruption",
-    )
-    parser.set_defaults(run=_fit)
 
 
 def _fit(options: argparse.Namespace) -> None:
     refuse_to_replace(options, "output", "checkpoint")
     output_file("--output", options.output)
-    # what is wrong with these is told before the volume is read
+    # these are checked before the volume is read
     views = read_views(options.images, options.cameras)
     start = read_transfer(options.start) if options.start else None
     background = background_of(options)
-    with working(f"reading {options.file}"):
+    with show_progress(f"reading {options.file}"):
         volume = volume_of(options)
-    # half a voxel
-    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
+    half_a_voxel = float(volume.spacing.min()) / 2
+    step = half_a_voxel if options.step is None else options.step
     march = March(step, FAST, "midpoint")
     if start is None:
         start = flat_grey(volume, options.points, options.clim)
-    with working("fitting, steps") as told, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=UNDETERMINED)  # told below, of points
+    with show_progress("fitting, steps") as report, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=UNDETERMINED)  # reported below, by point
         result = fit(
             ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
             start,
@@ -79,7 +41,7 @@ def _fit(options: argparse.Namespace) -> None:
             max_steps=options.max_steps,
             checkpoint=options.checkpoint,
             checkpoint_seconds=0,  # Ctrl-C may come at any time, and a checkpoint is small
-            callback=lambda step, parameters, loss: told(step, options.max_steps),
+            callback=lambda step, parameters, loss: report(step, options.max_steps),
         )
     path = write_transfer(options.output, result.parameters)
     error = (2 * result.loss) ** 0.5
@@ -96,3 +58,36 @@ def _undetermined(found: Uncertainty | None) -> list[int]:
     """Points of a transfer function with numbers that the images do not determine."""
     names = [] if found is None else [name for each in found.undetermined for name in each]
     return sorted({int(index) for name in names for index in re.findall(r"\[(\d+)", name)})
+
+
+_CAMERAS = (
+    "a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
+    "parallel_scale, window"
+)
+
+_CHECKPOINT = "save every step here; resume from here after an interruption"
+
+FIT = Command(
+    "fit",
+    "fit a transfer function to images of a volume",
+    (
+        *DATA,
+        *SAMPLING,
+        Option("images", "sRGB, as PNG", Path, "IMAGE...", required=True),
+        Option("cameras", _CAMERAS, Path, "JSON", required=True),
+        output("transfer.json", "JSON to write"),
+        *grouped(
+            "start",
+            Option("start", "a transfer function written by this command", Path, "JSON"),
+            Option("points", "else, flat grey with this many points", int, default=8),
+            CLIM,
+        ),
+        *grouped(
+            "solver",
+            Option("solver", "how to minimise", default="levenberg_marquardt", choices=get_args(Solver)),
+            Option("max-steps", "at most", int, default=100),
+            Option("checkpoint", _CHECKPOINT, Path, "FILE"),
+        ),
+    ),
+    _fit,
+)

@@ -7,7 +7,8 @@ import numpy as np
 
 from ...io.formats import says_its_spacing
 from ...scene.volume import Volume
-from .data import add_data_options, volume_of
+from .data import volume_of
+from .options import DATA, Command
 
 
 BARS = " ▁▂▃▄▅▆▇█"
@@ -15,18 +16,6 @@ BARS = " ▁▂▃▄▅▆▇█"
 BINS = 64
 
 SHARES = (1, 25, 50, 75, 99)
-
-
-def add_info(commands: Any, shared: argparse.ArgumentParser) -> None:
-    """Add the subcommand. `commands`: what `add_subparsers` returned."""
-    parser = commands.add_parser(
-        "info",
-        parents=[shared],
-        help="print shape, type, place and values of a volume file",
-        description="Print shape, type, place in the world and values of a volume file, as jaxvol loads it.",
-    )
-    add_data_options(parser)
-    parser.set_defaults(run=_info)
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -37,7 +26,7 @@ def _info(options: argparse.Namespace) -> None:
 
 def described_volume(volume: Volume, *, assumed: bool = False) -> str:
     """Lines of text about a volume: its voxels, its place in the world, its values. `assumed`: whether its
-    spacing was not told.
+    spacing is an assumption.
 
     The bars are a histogram of 64 bins from the least to the greatest value, each as high as the logarithm of
     its count.
@@ -86,3 +75,11 @@ def _bars(data: np.ndarray) -> str:
 
 def _numbers(values: Any) -> str:
     return " ".join(f"{value:.6g}" for value in np.asarray(values))
+
+
+INFO = Command(
+    "info",
+    "print shape, type, place in the world and values of a volume file, as jaxvol loads it",
+    DATA,
+    _info,
+)

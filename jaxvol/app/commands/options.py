@@ -1,228 +1,215 @@
-"""Which options do several commands share? Where programs are kept, what a scene is, how it is looked at."""
+"""The options of the command `jaxvol`: rows of a table, from which flags, `--help`, the keys of TOML files
+and the settings in pictures derive (`parsing.py`). Here are those that several subcommands share."""
 
 import argparse
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from ...compositing.modes import MODES
 from ...scene.presets import PRESETS, SHADED
 from ...xla.persistent_cache import default_programs
-from .data import add_data_options
 
 
-def shared_options() -> argparse.ArgumentParser:
-    """Options of every command."""
-    shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument(
-        "--config",
-        type=Path,
-        metavar="TOML",
-        help="a file of options, by their names without dashes in front; those given here as well count",
-    )
-    shared.add_argument(
-        "--programs",
-        type=Path,
-        default=default_programs(),
-        metavar="FOLDER",
-        help="cache of compiled programs (default: %(default)s)",
-    )
-    return shared
+class Option(NamedTuple):
+    """An option of a command.
+
+    - `name`: without dashes. An argument without a flag is in the group `ARGUMENT`.
+    - `values`: what follows the flag, as `--help` shows it. Several words stand for as many values, and dots
+      for one or more.
+    - `type`: of each value, made from its text; `bool` for a switch, which `--no-NAME` turns off.
+    """
+
+    name: str
+    help: str
+    type: Callable[..., Any] = str
+    values: str = ""
+    default: Any = None
+    choices: tuple[str, ...] = ()
+    repeated: bool = False
+    required: bool = False
+    group: str = ""
+
+    @property
+    def key(self) -> str:
+        """The name in Python."""
+        return self.name.replace("-", "_")
+
+    @property
+    def nargs(self) -> int | str | None:
+        """How many values follow the flag, as argparse takes it."""
+        if self.values.endswith("..."):
+            return "+"
+        words = self.values.split()
+        return len(words) if len(words) > 1 else None
 
 
-def add_output(parser: argparse.ArgumentParser, default: str, kind: str, metavar: str = "FILE") -> None:
-    """Add where a command writes. `kind`: what it writes, for the help."""
-    text = f"{kind} (default: %(default)s)"
-    parser.add_argument("-o", "--output", type=Path, default=Path(default), metavar=metavar, help=text)
+class Command(NamedTuple):
+    """A subcommand."""
+
+    name: str
+    help: str
+    options: tuple[Option, ...]
+    run: Callable[[argparse.Namespace], None]
 
 
-def add_size(parser: argparse.ArgumentParser) -> None:
-    """Add the size of an image."""
-    parser.add_argument("--size", type=int, nargs=2, default=(512, 512), metavar=("W", "H"), help="pixels")
-
-
-def add_clim(group: argparse._ArgumentGroup, text: str) -> None:
-    """Add a range of values. `text`: of what, for the help."""
-    group.add_argument("--clim", type=float, nargs=2, metavar=("LOW", "HIGH"), help=text)
-
-
-def scene_options() -> argparse.ArgumentParser:
-    """Options of all commands that render a volume file."""
-    scene = argparse.ArgumentParser(add_help=False)
-    add_data_options(scene)
-    scene.add_argument(
-        "--step",
-        type=float,
-        help="distance between samples, world length (default: half a voxel for fit; as planned for render)",
-    )
-    scene.add_argument(
-        "--background",
-        type=float,
-        nargs=3,
-        metavar=("R", "G", "B"),
-        help="linear RGB (default: white; black behind maximum, minimum and average)",
-    )
-    return scene
-
-
-def view_options() -> argparse.ArgumentParser:
-    """Options of all commands that look at a volume through a camera."""
-    view = argparse.ArgumentParser(add_help=False, parents=[transfer_options()])
-    add_size(view)
-    view.add_argument(
-        "--like",
-        type=Path,
-        metavar="PNG",
-        help="a picture that jaxvol wrote: take its options, and its volume unless another is named",
-    )
-    view.add_argument(
-        "--memory",
-        type=memory_size,
-        metavar="BYTES",
-        help="read the volume in bricks, with so much memory for them, such as 256M or 2G: files of .raw, "
-        ".npy and Zarr",
-    )
-    view.add_argument(
-        "--tolerance",
-        type=float,
-        help="RMSE of the image's linear colours, by which step and transforms are chosen "
-        "(default: 1/255; not with --step)",
-    )
-    _appearance(view)
-    _camera(view)
-    _clip(view)
-    return view
-
-
-def memory_size(text: str) -> int:
+def memory_size(text: str | int) -> int:
     """A number of bytes, such as 1000000, 256M or 2G (powers of 1024)."""
-    number, factor = text.strip(), 1
-    for power, letter in enumerate("KMG", 1):
-        if number[-1:].upper() == letter:
-            number, factor = number[:-1], 1024**power
-    try:
-        count = int(float(number) * factor)
-    except (ValueError, OverflowError) as fault:
-        raise argparse.ArgumentTypeError(
-            f"must be a number of bytes, such as 256M or 2G; got {text!r}"
-        ) from fault
+    found = re.fullmatch(r"(\d{1,15}\.?\d*|\.\d+)([KMG]?)", str(text).strip().upper())
+    count = int(float(found[1]) * 1024 ** " KMG".index(found[2] or " ")) if found else 0
     if count < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1 byte; got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a number of bytes, such as 256M or 2G; got {text!r}")
     return count
 
 
-def transfer_options() -> argparse.ArgumentParser:
-    """Options of all commands that show a volume: its transfer function."""
-    look = argparse.ArgumentParser(add_help=False)
-    group = look.add_argument_group("transfer function")
-    kinds = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
-    transfer = group.add_mutually_exclusive_group()
-    transfer.add_argument(
-        "--preset", metavar="NAME", help=f"{kinds} (default: what the volume's histogram suggests)"
-    )
-    transfer.add_argument(
-        "--cmap",
-        metavar="NAME",
-        help="a matplotlib colormap, or a colour, over --clim (default with --clim, --opacity, and modes "
-        "other than over: gray; isosurfaces: white)",
-    )
-    transfer.add_argument(
-        "--transfer", type=Path, metavar="JSON", help="a transfer function written by jaxvol fit"
-    )
-    group.add_argument("--opacity", metavar="RAMP", help="with --cmap: linear (default) or sigmoid")
-    add_clim(group, "range of values that it covers")
-    group.add_argument("--unit-distance", type=float, help="length to which opacities refer (default: 1)")
-    return look
+def output(default: str, help: str, values: str = "FILE") -> Option:
+    """Where a command writes."""
+    return Option("output", help, Path, values, Path(default))
 
 
-def _appearance(view: argparse.ArgumentParser) -> None:
-    group = view.add_argument_group("appearance")
-    group.add_argument(
-        "--compositing",
-        choices=(*MODES, "isosurface"),
+def grouped(title: str, *options: Option) -> tuple[Option, ...]:
+    """Options under a title in `--help`."""
+    return tuple(option._replace(group=title) for option in options)
+
+
+ARGUMENT = "arguments"
+"""The group of options without a flag."""
+
+SHARED = (
+    Option("config", "a file of options, by their names without dashes; those given here win", Path, "TOML"),
+    Option("programs", "cache of compiled programs", Path, "FOLDER", default_programs()),
+)
+"""Options of every command."""
+
+_FILE = "volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
+
+DATA = (
+    *SHARED,
+    Option("file", _FILE, Path, "FILE", required=True, group=ARGUMENT),
+    *grouped(
+        "data: needed if the file and its name do not specify it",
+        Option("shape", "voxels, x fastest in the file", int, "X Y Z"),
+        Option("dtype", "such as uint8 or uint16le"),
+        Option("spacing", "world length between voxels", float, "X Y Z"),
+    ),
+)
+"""Options of commands that read a volume."""
+
+SIZE = Option("size", "pixels", int, "W H", (512, 512))
+
+_STEP = "distance between samples, world length (default: half a voxel for fit; as planned for render)"
+
+_BACKGROUND = "linear RGB (default: white; black behind maximum, minimum and average)"
+
+SAMPLING = Option("step", _STEP, float), Option("background", _BACKGROUND, float, "R G B")
+"""Options of commands that render images."""
+
+CLIM = Option("clim", "range of values that it covers (default: all)", float, "LOW HIGH")
+
+_PRESETS = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
+
+TRANSFER = grouped(
+    "transfer function",
+    Option("preset", f"{_PRESETS} (default: what the histogram suggests)", values="NAME"),
+    Option(
+        "cmap",
+        "a matplotlib colormap, or a colour, over --clim (default with --clim, --opacity, and modes other "
+        "than over: gray; isosurfaces: white)",
+        values="NAME",
+    ),
+    Option("transfer", "a transfer function written by jaxvol fit", Path, "JSON"),
+    Option("opacity", "with --cmap: linear (default) or sigmoid", values="RAMP"),
+    CLIM,
+    Option("unit-distance", "length to which opacities refer (default: 1)", float),
+)
+
+APPEARANCE = grouped(
+    "appearance",
+    Option(
+        "compositing",
+        "how samples become a pixel: over, by emission and absorption; maximum, minimum, average: that value "
+        "of the ray, as classified; isosurface: where --isovalue is first crossed",
         default="over",
-        help="how samples become a pixel: over (default), by emission and absorption; maximum, minimum, "
-        "average: that value of the ray, as classified; isosurface: where --isovalue is first crossed",
-    )
-    group.add_argument(
-        "--isovalue", type=float, metavar="VALUE", help="with --compositing isosurface: the value on it"
-    )
-    group.add_argument(
-        "--shade",
-        action=argparse.BooleanOptionalAction,
-        help="shade by the gradient of the values, under a light at the camera; by default isosurfaces, and "
-        "what is composited with the automatic transfer function or the presets "
-        f"{', '.join(sorted(SHADED))}",
-    )
+        choices=(*MODES, "isosurface"),
+    ),
+    Option("isovalue", "with --compositing isosurface: the value on it", float, "VALUE"),
+    Option(
+        "shade",
+        "shade by the gradient of the values, under a light at the camera; by default isosurfaces, and what "
+        f"is composited with the automatic transfer function or the presets {', '.join(sorted(SHADED))}",
+        bool,
+    ),
+)
 
+_CAMERA = "position and focal point in the world; the camera may be inside the volume"
 
-def _camera(view: argparse.ArgumentParser) -> None:
-    group = view.add_argument_group("camera")
-    group.add_argument(
-        "--camera",
-        type=float,
-        nargs=6,
-        metavar=("X", "Y", "Z", "FX", "FY", "FZ"),
-        help="position and focal point in the world; the camera may be inside the volume",
-    )
-    group.add_argument(
-        "--direction",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4, or as "
+_AXIS = "what the camera turns about, through its focal point (default: --view-up)"
+
+CAMERA = grouped(
+    "camera",
+    Option("camera", _CAMERA, float, "X Y Z FX FY FZ"),
+    Option(
+        "direction",
+        "without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4, or as "
         "--view-up has it)",
-    )
-    group.add_argument(
-        "--view-up",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="what is up in the image (default: 0 0 1; or, for files that do not say how they lie, shown as "
-        "the histogram suggests: away from the one face that cuts the object, if there is such a face)",
-    )
-    group.add_argument(
-        "--view-angle",
-        type=float,
-        default=30,
-        help="degrees from the lower to the upper edge of the image (default: 30)",
-    )
-    group.add_argument(
-        "--parallel",
-        action=argparse.BooleanOptionalAction,
-        default=False,
-        help="orthographic camera; use with --direction",
-    )
-    group.add_argument("--zoom", type=float, default=1, help="magnification of the image (default: 1)")
-    group.add_argument(
-        "--axis",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="what the camera turns about, through its focal point (default: --view-up)",
-    )
+        float,
+        "X Y Z",
+    ),
+    Option(
+        "view-up",
+        "what is up in the image (default: 0 0 1; or, for files that do not say how they lie, shown as the "
+        "histogram suggests: away from the one face that cuts the object, if there is such a face)",
+        float,
+        "X Y Z",
+    ),
+    Option("view-angle", "degrees from the lower to the upper edge of the image", float, default=30.0),
+    Option("parallel", "orthographic camera; use with --direction", bool, default=False),
+    Option("zoom", "magnification of the image", float, default=1.0),
+    Option("axis", _AXIS, float, "X Y Z"),
+)
+
+_PLANE = (
+    "show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) points; may "
+    "be given several times"
+)
+
+_OUTSIDE = "cut away what is inside the box and on that side of all planes, and show the rest"
+
+CLIP = grouped(
+    "clip: show a part of the volume; box and planes in world coordinates",
+    Option("clip-box", "show what is inside this box", float, "X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX"),
+    Option("clip-plane", _PLANE, float, "X Y Z NX NY NZ", (), repeated=True),
+    Option("clip-inside-out", _OUTSIDE, bool, default=False),
+)
+
+_LIKE = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
+
+SCENE = (
+    *DATA,
+    *SAMPLING,
+    SIZE,
+    Option("like", _LIKE, Path, "PNG"),
+    Option(
+        "memory",
+        "read the volume in bricks, with so much memory for them, such as 256M or 2G: .raw, .npy and Zarr",
+        memory_size,
+        "BYTES",
+    ),
+    Option(
+        "tolerance",
+        "RMSE of the image's linear colours, by which step and transforms are chosen (default: 1/255; not "
+        "with --step)",
+        float,
+    ),
+    *TRANSFER,
+    *APPEARANCE,
+    *CAMERA,
+    *CLIP,
+)
+"""Options of commands that look at a volume through a camera."""
 
 
-def _clip(view: argparse.ArgumentParser) -> None:
-    group = view.add_argument_group("clip", "show a part of the volume; box and planes in world coordinates")
-    group.add_argument(
-        "--clip-box",
-        type=float,
-        nargs=6,
-        metavar=("X_MIN", "X_MAX", "Y_MIN", "Y_MAX", "Z_MIN", "Z_MAX"),
-        help="show what is inside this box",
-    )
-    group.add_argument(
-        "--clip-plane",
-        type=float,
-        nargs=6,
-        action="append",
-        default=[],
-        metavar=("X", "Y", "Z", "NX", "NY", "NZ"),
-        help="show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) "
-        "points; may be given several times",
-    )
-    group.add_argument(
-        "--clip-inside-out",
-        action=argparse.BooleanOptionalAction,
-        default=False,
-        help="cut away what is inside the box and on that side of all planes, and show the rest",
-    )
+def defaults_of(options: Iterable[Option]) -> dict[str, Any]:
+    """What options are where nothing is given."""
+    return {option.key: option.default for option in options}

@@ -1,4 +1,4 @@
-"""How does a command show what it is doing? By a line on stderr, once that has taken two seconds."""
+"""Shows what a command is doing: a line on stderr, once that has taken two seconds."""
 
 import sys
 import threading
@@ -8,46 +8,43 @@ from contextlib import contextmanager
 
 
 PATIENCE, INTERVAL, IN_LOGS = 2.0, 0.25, 60.0
-"""Seconds before the line is shown, between its changes, and between lines where it is none of a terminal."""
+"""Seconds before the line is shown, between its changes on a terminal, and between lines elsewhere."""
 
-Told = Callable[[int, int], None]
+Report = Callable[[int, int], None]
 """Called with how many are done, and of how many."""
 
 
 @contextmanager
-def working(what: str) -> Iterator[Told]:
-    """Show `what` with the seconds that it has taken, on the terminal of stderr, until the context ends;
-    yields a function that adds how many are done of how many. Where stderr is no terminal, such as a log,
-    lines stay: `what` alone, and then, each minute, with what is done."""
-    begun, count = time.monotonic(), ""
+def show_progress(what: str) -> Iterator[Report]:
+    """Show `what` with the seconds that it has taken on stderr, until the context ends; yields a function
+    that adds how many are done of how many. A terminal's line is wiped away at the end. Where stderr is no
+    terminal, such as a log, there is one line at first, and then one each minute."""
+    begun, count, ended, terminal = time.monotonic(), "", threading.Event(), sys.stderr.isatty()
 
-    def told(done: int, of: int) -> None:
+    def report(done: int, of: int) -> None:
         nonlocal count
         count = f"{done} of {of}, "
 
-    def line() -> str:
-        return f"{what}: {count}{time.monotonic() - begun:.0f} s"
+    def show(text: str, start: str, end: str) -> None:
+        print(f"{start}{what}{text}", end=end, file=sys.stderr, flush=True)
 
-    ended, terminal = threading.Event(), sys.stderr.isatty()
-
-    def show() -> None:
+    def run() -> None:
         if ended.wait(PATIENCE):
             return
+        start, end, pause = ("\r\x1b[K", "", INTERVAL) if terminal else ("", "\n", IN_LOGS)
         if not terminal:
-            print(f"{what} ...", file=sys.stderr, flush=True)
-            while not ended.wait(IN_LOGS):
-                print(line(), file=sys.stderr, flush=True)
-            return
-        while True:
-            print(f"\r\x1b[K{line()}", end="", file=sys.stderr, flush=True)
-            if ended.wait(INTERVAL):
-                break
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            show(" ...", start, end)
+            ended.wait(pause)
+        while not ended.is_set():
+            show(f": {count}{time.monotonic() - begun:.0f} s", start, end)
+            ended.wait(pause)
+        if terminal:
+            print(start, end="", file=sys.stderr, flush=True)
 
-    thread = threading.Thread(target=show, daemon=True)
+    thread = threading.Thread(target=run, daemon=True)
     thread.start()
     try:
-        yield told
+        yield report
     finally:
         ended.set()
         thread.join()

@@ -4,7 +4,7 @@ import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 
 from ...bricks import VoxelSource
 from ...compositing.blending import Compositing, Over
@@ -31,16 +31,17 @@ from ..automatic import (
     visible_points,
 )
 from .data import copy_of, middle_of, source_of, volume_of
-from .orbit import views_shown
-from .progress import working
+from .orbit import angles_of, turned
+from .progress import show_progress
 
 
-Z = 0.0, 0.0, 1.0
+FRAMED_VIEWS = 24
+"""Views of an orbit, evenly spaced, in which all that is visible is to be in the picture."""
 
 
 class Scene(NamedTuple):
     """What is looked at, and how. Of a volume that is read in bricks from `source`, `volume` is a copy of
-    every n-th voxel in the same place."""
+    every n-th voxel in the same place. `axis`: what the camera turns about."""
 
     volume: Volume
     transfer: Transfer
@@ -50,36 +51,42 @@ class Scene(NamedTuple):
     background: tuple[float, float, float]
     clip: tuple[Transform, ...]
     source: VoxelSource | None
+    axis: Any
+
+    def view(self, degrees: float) -> Camera:
+        """The camera, turned about the axis."""
+        return turned(self.camera, degrees, self.axis)
 
 
-def scene_of(options: argparse.Namespace) -> Scene:
-    """The scene that the options describe."""
-    mode = _mode(options)
-    background = background_of(options)
-    clip = _clip(options)
-    given = transfer_given(options)
-    source = None
-    with working(f"reading {options.file}"):
+def scene_of(options: argparse.Namespace, *, turn: float = 0.0, orbit: float | None = None) -> Scene:
+    """The scene that the options describe. The automatic camera shows all that is visible when it is turned
+    by `turn` degrees, or everywhere on an orbit of so many."""
+    mode, background, clip = _compositing(options), background_of(options), _clip(options)
+    automatic, source, points = is_automatic(options), None, None
+    with show_progress(f"reading {options.file}"):
         if options.memory is None:
             volume = volume_of(options)
+            shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
+            volume, transfer = shown
         else:
             source = source_of(options)
             volume = copy_of(source, options.memory)
-        if is_automatic(options) and source is None and (shown := labels_shown(volume)) is not None:
-            volume, transfer = shown
-        else:
-            part = middle_of(source) if source is not None and is_automatic(options) else None
-            transfer = transfer_of(options, volume, part) if given is None else given
-        points = visible_points(volume, transfer) if is_automatic(options) else None
-    camera = _view(options, volume, points)
-    return Scene(volume, transfer, camera, mode, _lighting(options, mode), background, clip, source)
+            transfer = transfer_of(options, volume, middle_of(source) if automatic else None)
+        if automatic:
+            points = visible_points(volume, transfer)
+    camera = _camera(options, volume)
+    axis = next(v for v in (options.axis, options.view_up, camera.view_up) if v is not None)
+    if points is not None and options.camera is None:
+        angles = [turn] if orbit is None else angles_of(orbit, FRAMED_VIEWS)
+        camera = framed(camera, points, [turned(camera, angle, axis) for angle in angles])
+    camera = camera.zoom(options.zoom)
+    return Scene(volume, transfer, camera, mode, _lighting(options, mode), background, clip, source, axis)
 
 
 def is_automatic(options: argparse.Namespace) -> bool:
     """Whether nothing is said of the transfer function."""
-    names = ("preset", "cmap", "transfer", "kept_transfer", "opacity", "clim", "unit_distance")
-    said = any(getattr(options, name, None) is not None for name in names)
-    return getattr(options, "compositing", "over") == "over" and not said
+    names = ("preset", "cmap", "transfer", "recorded_transfer", "opacity", "clim", "unit_distance")
+    return options.compositing == "over" and all(getattr(options, name) is None for name in names)
 
 
 def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
@@ -87,29 +94,26 @@ def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
     the greatest could not be seen.
 
     **Raises:** `ValueError` for numbers that no image file can hold."""
-    if options.background is not None:
-        red, green, blue = options.background
-        if not all(0 <= each <= 1 for each in options.background):
-            raise ValueError(
-                "--background must be three numbers from 0 to 1 (linear RGB); "
-                f"got {red:g} {green:g} {blue:g}."
-            )
-        return red, green, blue
-    projects = getattr(options, "compositing", "over") in MODES.keys() - {"over"}
-    level = 0.0 if projects else 1.0
-    return level, level, level
+    if options.background is None:
+        level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
+        return level, level, level
+    red, green, blue = options.background
+    if not all(0 <= each <= 1 for each in options.background):
+        raise ValueError(
+            f"--background must be three numbers from 0 to 1 (linear RGB); got {red:g} {green:g} {blue:g}."
+        )
+    return red, green, blue
 
 
-def _mode(options: argparse.Namespace) -> Compositing[Any]:
-    """The compositing mode that the options name."""
-    shows_surface, value = options.compositing == "isosurface", options.isovalue
-    if shows_surface and value is None:
+def _compositing(options: argparse.Namespace) -> Compositing[Any]:
+    is_surface, value = options.compositing == "isosurface", options.isovalue
+    if is_surface and value is None:
         raise ValueError("--compositing isosurface needs the value on the surface: --isovalue VALUE.")
-    if value is not None and not shows_surface:
+    if value is not None and not is_surface:
         raise ValueError(
             f"--isovalue goes with --compositing isosurface; got --compositing {options.compositing}."
         )
-    return Isosurface(value) if shows_surface else compositing_of(options.compositing)
+    return Isosurface(value) if is_surface else compositing_of(options.compositing)
 
 
 def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
@@ -118,79 +122,43 @@ def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting |
     if shade and isinstance(mode, Average):
         raise ValueError("--shade needs a place that is shaded; leave it out with --compositing average.")
     if shade is None:
-        surfaces = options.preset in SHADED or is_automatic(options)
-        shade = (surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
+        shows_surfaces = options.preset in SHADED or is_automatic(options)
+        shade = (shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
     return Phong() if shade else None
-
-
-def transfer_given(options: argparse.Namespace) -> Transfer | None:
-    """The transfer function that the options give by themselves, before anything is read of the volume; None
-    where it depends on that. What is wrong with them is told in either case."""
-    kept = getattr(options, "kept_transfer", None)
-    if options.transfer or kept is not None:
-        for name in ("clim", "opacity", "unit_distance"):
-            if getattr(options, name) is not None:
-                raise ValueError(
-                    f"--{name.replace('_', '-')} is for presets and colormaps; a transfer function from a "
-                    "file or a picture needs none."
-                )
-        return read_transfer(options.transfer) if kept is None else kept
-    if is_automatic(options):
-        return None
-    if options.preset and options.opacity is not None:
-        raise ValueError("--opacity is for colormaps; a preset has its own.")
-    if options.preset:
-        return preset(options.preset, options.clim, _unit_distance(options))
-    over_range = _colormap(options, options.clim or (0, 1))
-    return over_range if options.clim else None
 
 
 def transfer_of(
     options: argparse.Namespace, volume: Volume, part: Shaped[np.ndarray, "nx ny nz"] | None = None
 ) -> Transfer:
-    """The transfer function for a volume, where the options alone do not give one. `part`: of the voxels as
-    they are, where the volume is a copy."""
+    """The transfer function for a volume. `part`: of the voxels as they are, where the volume is a copy."""
     if is_automatic(options):
         return automatic_transfer(volume) if part is None else transfer_by_copy(volume, part)
-    return _colormap(options, (float(volume.data.min()), float(volume.data.max())))
+    if options.recorded_transfer is not None:
+        return options.recorded_transfer
+    if options.transfer is not None:
+        return read_transfer(options.transfer)
+    unit = 1.0 if options.unit_distance is None else options.unit_distance
+    if options.preset is not None:
+        return preset(options.preset, options.clim, unit)
+    clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
+    cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    return colormap(cmap, clim, options.opacity or "linear", unit)
 
 
-def _unit_distance(options: argparse.Namespace) -> float:
-    return 1.0 if options.unit_distance is None else options.unit_distance
-
-
-def _colormap(options: argparse.Namespace, clim: tuple[float, float]) -> Transfer:
-    """The colormap that the options name, over a range of values."""
-    surface = getattr(options, "compositing", "over") == "isosurface"
-    cmap = options.cmap or ("white" if surface else "gray")
-    return colormap(cmap, clim, options.opacity or "linear", _unit_distance(options))
-
-
-def _view(options: argparse.Namespace, volume: Volume, points: Float[np.ndarray, "n 3"] | None) -> Camera:
-    """Where it is looked at from. `points`: what the camera is to show, by default the volume, unless its
-    position is given."""
-    if options.camera and options.parallel:
-        raise ValueError(
-            "--parallel goes with --direction, which shows the whole volume; leave out --camera."
-        )
-    if options.camera and options.direction:
-        raise ValueError("--camera sets the position; leave out --direction.")
+def _camera(options: argparse.Namespace, volume: Volume) -> Camera:
+    """Where the volume is looked at from, all of it unless the position is given."""
     up, side = options.view_up, options.direction
     free = up is side is options.camera is None
     if free and not says_where_it_lies(options.file) and (found := upright(volume)) is not None:
         up, side = found, front_of(found)
     view: dict[str, Any] = {
-        "view_up": Z if up is None else up,
+        "view_up": (0.0, 0.0, 1.0) if up is None else up,
         "view_angle": options.view_angle,
         "size": tuple(options.size),
     }
     if options.camera:
-        camera = Camera(options.camera[:3], options.camera[3:], **view)
-    else:
-        camera = Camera.looking_at(volume, FRONT if side is None else side, parallel=options.parallel, **view)
-        if points is not None:
-            camera = framed(camera, points, views_shown(options, camera))
-    return camera.zoom(options.zoom)
+        return Camera(options.camera[:3], options.camera[3:], **view)
+    return Camera.looking_at(volume, FRONT if side is None else side, parallel=options.parallel, **view)
 
 
 def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ...scene.transfer import TransferFunction
 from ...scene.transfer2d import TransferFunction2D
 from ...scene.volume import Volume
-from ..automatic.sampling import sampled
+from ..automatic.histogram import sampled
 from .editing import has_editable_points, opacities, point_color
 
 

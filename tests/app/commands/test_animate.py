@@ -101,7 +101,7 @@ BAD = {
     "fps": (["--fps", "0"], "--fps must be above 0"),
     "fps of a gif": (["--fps", "60"], "--fps: a .gif has 50 frames a second at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
-    "step and tolerance": (["--tolerance", "0.1"], "--tolerance finds a step"),
+    "step and tolerance": (["--tolerance", "0.1"], "--step and --tolerance exclude"),
     "odd mp4": (["-o", "a.mp4", "--size", "9", "8"], "--size: an .mp4 has an even number of pixels"),
     "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }

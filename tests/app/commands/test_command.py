@@ -34,7 +34,10 @@ BAD = [
         ["render", "x.raw", "--memory", "lots"],
         "render: error: argument --memory: must be a number of bytes, such as 256M or 2G; got 'lots'",
     ),
-    (["render", "x.raw", "--memory", "0"], "argument --memory: must be at least 1 byte; got '0'"),
+    (
+        ["render", "x.raw", "--memory", "0"],
+        "--memory: must be a number of bytes, such as 256M or 2G; got '0'",
+    ),
     (
         ["fit", "x.raw", "--images", "a.png", "--cameras", "c.json", "--solver", "newton"],
         "fit: error: argument --solver: invalid choice: 'newton'",
@@ -44,7 +47,7 @@ BAD = [
         "jaxvol render: error: unrecognized arguments: --sise 9 9. Did you mean --size? (jaxvol render -",
     ),
     (["info", "x.raw", "y.raw"], "jaxvol info: error: unrecognized arguments: y.raw (jaxvol info --help"),
-    (["datasets", "fetch"], "datasets fetch: error: the following arguments are required: NAME"),
+    (["datasets"], "datasets: error: the following arguments are required: action"),
     (["paint"], "jaxvol: error: argument COMMAND: invalid choice: 'paint' (choose from"),
 ]
 
@@ -58,6 +61,11 @@ def test_invalid_options_are_named_in_one_line(capsys):
         assert message in printed
         assert printed.count("\n") == 1
         assert "--help lists the options" in printed
+
+
+def test_datasets_are_fetched_by_name(capsys):
+    assert main(["datasets", "fetch"]) == 2
+    assert capsys.readouterr().err.startswith("jaxvol datasets: error: fetch needs a NAME")
 
 
 def test_too_little_memory_is_told_in_one_line(volume_file, tmp_path, monkeypatch, capsys):

@@ -5,6 +5,8 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -34,13 +36,14 @@ def test_the_page_holds_the_code_that_made_its_pictures(tmp_path, capsys, monkey
     assert {path.name for path in folder.iterdir()} == {*names, "index.html"}
     assert set(re.findall(r'src="([^"]+)"', (folder / "index.html").read_text("utf-8"))) == names
     assert len(codes(folder)) == 2
-    monkeypatch.chdir(tmp_path)
-    for code in codes(folder):
-        exec(code, {})
+    for name, code in zip(("head", "grain"), codes(folder), strict=True):
+        defined: dict[str, Any] = {"Path": Path}
+        exec(code, defined)
+        defined[name](tmp_path, (40, 30), 24)
     assert eqx.tree_equal(drawn.scenes[:3], drawn.scenes[3:])
     for name in names:
-        assert imread(name).shape == (30, 40, 3)
-        np.testing.assert_array_equal(imread(name), imread(folder / name))
+        assert imread(folder / name).shape == (30, 40, 3)
+        np.testing.assert_array_equal(imread(tmp_path / name), imread(folder / name))
 
 
 def test_nothing_is_left_where_the_code_fails(tmp_path, capsys, monkeypatch):

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from jaxvol.app.commands import progress
-from jaxvol.app.commands.progress import working
+from jaxvol.app.commands.progress import show_progress
 
 
 class Terminal(io.StringIO):
@@ -23,8 +23,8 @@ def shown(monkeypatch):
         monkeypatch.setattr(progress, "INTERVAL", 0.01)
         monkeypatch.setattr(progress, "IN_LOGS", 0.05)
         monkeypatch.setattr("sys.stderr", stream)
-        with working("rendering a.png, frames") as told:
-            told(3, 7)
+        with show_progress("rendering a.png, frames") as report:
+            report(3, 7)
             time.sleep(seconds)
         return stream.getvalue()
 
@@ -48,5 +48,5 @@ def test_a_log_has_lines_of_what_takes_long(shown):
 
 def test_it_ends_with_an_error(monkeypatch):
     monkeypatch.setattr("sys.stderr", Terminal())
-    with pytest.raises(ZeroDivisionError), working("x"):
+    with pytest.raises(ZeroDivisionError), show_progress("x"):
         raise ZeroDivisionError

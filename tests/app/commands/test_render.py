@@ -283,10 +283,13 @@ BAD = {
     "EXR": (["FILE", "-o", "x.exr"], "--output: a file of colours must end in one of .png, .jpg"),
     "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of one channel must end in one of .tif"),
     "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
-    "clim of a file": (["FILE", "--transfer", "t.json", "--clim", "0", "1"], "--clim is for presets"),
-    "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--parallel goes with --direction"),
+    "clim of a file": (
+        ["FILE", "--transfer", "t.json", "--clim", "0", "1"],
+        "--transfer and --clim exclude",
+    ),
+    "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--camera and --parallel exclude each other"),
     "no file": (["nowhere.raw"], "error: there is no file"),
-    "cmap": (["nowhere.raw", "--cmap", "moon"], "cmap must be"),
+    "cmap": (["FILE", "--cmap", "moon"], "cmap must be"),
     "background": (
         ["nowhere.raw", "--background", "200", "0", "nan"],
         "--background must be three numbers from 0 to 1 (linear RGB); got 200 0 nan.",
@@ -303,7 +306,7 @@ BAD = {
     ),
     "no isovalue": (["FILE", "--compositing", "isosurface"], "--compositing isosurface needs the value"),
     "isovalue": (["FILE", "--isovalue", "9"], "--isovalue goes with --compositing isosurface; got --comp"),
-    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "--tolerance finds a step; leave out --step"),
+    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "--step and --tolerance exclude each other"),
 }
 
 

@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float
 from .._util.vec3 import apart
 from ..compositing.blending import Compositing
 from ..compositing.isosurface import Isosurface
-from ..compositing.modes import Mode
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import Rendering
@@ -26,19 +25,16 @@ RAYS, POINTS = 4096, 128
 """Maximum number of rays, and number of points per ray, at which a volume is sampled."""
 
 
-def why_unseen(
+def why_empty(
     volume: Volume,
     transfer: Transfer,
     camera: Camera,
     march: March,
     rendering: Rendering,
-    compositing: Compositing[Any] | Mode = "over",
+    compositing: Compositing[Any],
 ) -> str | None:
-    """Why an image of this scene shows nothing, and what to change; None if it shows something.
-
-    An image shows nothing if no pixel's opacity reaches 1/510, half a level of an 8-bit image. Values are
-    sampled along some 4096 rays, at 128 points each.
-    """
+    """Why an image of this scene shows nothing, and what to change; None where a pixel's opacity reaches
+    1/510."""
     opacity = float(np.asarray(rendering.rgba)[..., 3].max())
     if opacity >= LEAST:
         return None
@@ -48,10 +44,7 @@ def why_unseen(
         extends = f"the volume, which extends from ({low}) to ({high})"
         if _values_along(volume, camera, Affine(volume))[0].any():
             return f"no ray of the camera meets what the clip leaves of {extends}. Change its box or planes."
-        return (
-            f"no ray of the camera meets {extends}. Point the camera at its center, as Camera.looking_at "
-            "does."
-        )
+        return f"no ray of the camera meets {extends}. Point it at the center, as Camera.looking_at does."
     if opacity > 0:
         return (
             f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, which raises the "
@@ -61,34 +54,30 @@ def why_unseen(
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
     if isinstance(compositing, Isosurface):
         return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
-    shown = _shown(transfer)
-    if shown is None:
+    if not isinstance(transfer, TransferFunction):
         return (
             f"{where}, and the transfer function shows none of them, or only under another label or gradient."
         )
-    if not shown:
+    ranges = " or ".join(_visible_ranges(transfer))
+    if not ranges:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
-    ranges = " or ".join(_range_text(*ends) for ends in shown)
     advice = f" A clim from {low:g} to {high:g} would show something." if low < high else ""
     return f"{where}, and the transfer function shows values {ranges}.{advice}"
 
 
-def _range_text(low: float, high: float) -> str:
-    if high == np.inf:
-        return f"from {low:g} on" if low > -np.inf else "of any kind"
-    return f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}"
-
-
-def _shown(transfer: Transfer) -> list[tuple[float, float]] | None:
-    """Ranges of values that are not transparent; None if visibility depends on more than the value."""
-    if not isinstance(transfer, TransferFunction):
-        return None
-    values = np.asarray(transfer.values)
+def _visible_ranges(transfer: TransferFunction) -> list[str]:
+    """Ranges of values that are not transparent. The opacity of a point extends to its neighbours, that of
+    the first and the last to infinity."""
     positive = np.concatenate([[False], np.asarray(transfer.extinction) > 0, [False]])
-    ends = np.flatnonzero(positive[1:] != positive[:-1])
-    # the opacity of a control point extends to its neighbours, that of the first and last to infinity
-    reach = np.concatenate([[-np.inf], values, [np.inf]])
-    return [(float(reach[a]), float(reach[b + 1])) for a, b in ends.reshape(-1, 2)]
+    values = np.concatenate([[-np.inf], np.asarray(transfer.values), [np.inf]])
+    found = []
+    for first, last in np.flatnonzero(positive[1:] != positive[:-1]).reshape(-1, 2):
+        low, high = values[first], values[last + 1]
+        if high == np.inf:
+            found.append(f"from {low:g} on" if low > -np.inf else "of any kind")
+        else:
+            found.append(f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}")
+    return found
 
 
 def _values_along(
@@ -99,17 +88,16 @@ def _values_along(
     zero = jnp.zeros((), jnp.int32)
 
     @jax.jit
-    def entered(origin: Float[Array, "n 3"], direction: Float[Array, "n 3"]) -> Ray:
-        return jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)))(origin, direction)
+    @jax.vmap
+    def entered(origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Ray:
+        return enter(space, apart(origin), apart(direction), (zero, zero))
 
     @jax.jit
-    def values(rays: Ray) -> Float[Array, "n points"]:
-        def one(ray: Ray) -> Float[Array, " points"]:
-            depths = ray.length * jnp.linspace(0, 1, POINTS)
-            found = jax.vmap(lambda depth: volume.value(ray.path(depth)))(depths)
-            return jnp.where(ray.in_gap(depths), jnp.nan, found)
-
-        return jax.vmap(one)(rays)
+    @jax.vmap
+    def values(ray: Ray) -> Float[Array, " points"]:
+        depths = ray.length * jnp.linspace(0, 1, POINTS)
+        found = jax.vmap(lambda depth: volume.value(ray.path(depth)))(depths)
+        return jnp.where(ray.in_gap(depths), jnp.nan, found)
 
     rays = entered(*(part.reshape(-1, 3) for part in camera.rays()))
     hit = rays.length > 0

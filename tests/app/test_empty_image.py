@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxvol.compositing.compositing import Over
 
 import jaxvol as jv
-from jaxvol.app import unseen
+from jaxvol.app import empty_image
 
 
 VOLUME = jv.Volume(np.zeros((2, 2, 2), np.float32))
@@ -30,10 +31,10 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_the_values_that_are_shown_are_compared_with_those_there_are(case, monkeypatch):
     found = np.ones(1, bool), np.asarray([[20.0, 90.0]])
-    monkeypatch.setattr(unseen, "_values_along", lambda *_: found)
+    monkeypatch.setattr(empty_image, "_values_along", lambda *_: found)
     transfer, expected = CASES[case]
     empty = jv.Rendering(jnp.zeros((1, 4)), jnp.zeros(1, bool))
-    said = unseen.why_unseen(VOLUME, transfer, jv.Camera.looking_at(VOLUME), jv.March(0.1), empty)
+    said = empty_image.why_empty(VOLUME, transfer, jv.Camera.looking_at(VOLUME), jv.March(0.1), empty, Over())
     assert said is not None
     assert said.startswith("the volume's values along the rays run from 20 to 90, and the transfer function")
     assert expected in said

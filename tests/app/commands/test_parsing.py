@@ -4,12 +4,12 @@ import re
 
 import pytest
 
-from jaxvol.app.cli import _parser, main
-from jaxvol.app.commands.settings import parsed
+from jaxvol.app.cli import main, parser_of_all
+from jaxvol.app.commands.parsing import parsed
 
 
 def options(*words):
-    return parsed(_parser, [str(word) for word in words])
+    return parsed(parser_of_all(), [str(word) for word in words])[1]
 
 
 @pytest.fixture
@@ -59,6 +59,10 @@ def test_the_command_line_stands_above_the_file(config):
     assert (found.tolerance, found.step) == (0.1, None)
     assert list(found.size) == [9, 9]
     assert found.clip_plane == [[0, 0, 0, 1, 0, 0]]
+
+
+def test_small_negative_numbers_are_no_flags():
+    assert options("render", "a.raw", "--direction", "-1e-5", "-.5", "-1").direction == [-1e-5, -0.5, -1]
 
 
 def test_what_a_command_needs_may_stand_in_the_file(config):
@@ -148,7 +152,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path, capsys):
 def test_memory_is_a_number_of_bytes(capsys):
     for text, count in (("1000", 1000), ("256M", 2**28), ("2g", 2**31), ("0.5K", 512)):
         assert options("plan", "a.raw", "--memory", text).memory == count
-    for text in ("much", "", "-1", "0", "nan", "inf", "1e999", "5T"):
+    for text in ("much", "", "-1", "0", "nan", "inf", "1e999", "9" * 400, "5T"):
         with pytest.raises(SystemExit) as stop:
             options("plan", "a.raw", f"--memory={text}")
         assert stop.value.code == 2
