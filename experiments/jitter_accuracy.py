@@ -12,7 +12,6 @@ plain jitter can be nearer to the truth in the mean, or farther; it is noisier i
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,11 +20,18 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
-from . import common, marches, timing
-from .common import plt
+from . import charts, marches, timing
+from .harness import experiment, show
 
 
-METHODS = (marches.PLAIN, marches.JITTER, marches.EMPTY, marches.ALIGNED, marches.BOTH)
+METHODS = {
+    marches.PLAIN: "k-",
+    marches.JITTER: "C3--",
+    marches.EMPTY: "C0-",
+    marches.ALIGNED: "C2:",
+    marches.BOTH: "C1-.",
+}
+"""With their styles in the chart."""
 STEPS = (4.3, 2.3, 1.3, 0.7)
 """In voxels. Not whole or half ones: in the orthographic view the samples of all rays would then lie alike on
 nodes, or between them, which has an error of its own that jitter would seem to lower."""
@@ -131,13 +137,12 @@ def compared(result: dict[str, list[dict[str, Any]]]) -> str:
     return f"RMSE off the cut face / ray casting: {over(marches.JITTER)}, {over(marches.EMPTY)}."
 
 
-def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    figure, axes = plt.subplots(
-        len(result), len(PANELS), figsize=(12, 2.9 * len(result)), squeeze=False, layout="constrained"
-    )
-    for line, (scene, rows) in zip(axes, result.items(), strict=True):
+def draw(result: dict[str, Any], path: Path) -> None:
+    scenes = {name: rows for name, rows in result.items() if name != "note"}
+    figure, axes = charts.panels(len(scenes), len(PANELS), 12, 2.9 * len(scenes))
+    for line, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for panel, (key, label) in zip(line, PANELS.items(), strict=True):
-            for name, style in zip(METHODS, ("k-", "C3--", "C0-", "C2:", "C1-."), strict=True):
+            for name, style in METHODS.items():
                 mine = [row for row in rows if row["march"] == name]
                 found = [row["time"]["median"] if key == "time" else row[key] for row in mine]
                 panel.plot([row["step"] for row in mine], found, style, marker=".", label=name)
@@ -149,39 +154,30 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
             panel.tick_params(labelsize=7, which="both")
             panel.xaxis.set_major_formatter("{x:g}")
         line[0].set_ylabel(scene, fontsize=9)
-    figure.suptitle(f"{NOTE} {compared(result)}", fontsize=9)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    common.save(figure, path)
+    figure.suptitle(result["note"], fontsize=9)
+    charts.legend_below(figure, axes[0, 0], 5)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "jitter_accuracy",
     "What do jitter and alignment do to wood grain, noise on cut faces, the whole error and the time?",
     __doc__,
+    draw,
     repetitions=5,
     size=192,
     resolution=128,
+    steps=STEPS,
+    quick={"size": 96, "resolution": 64, "repetitions": 1, "steps": (2.3, 1.9)},
 )
-def main(chosen: Namespace) -> common.Answer:
-    steps = STEPS
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.repetitions, steps = 96, 64, 1, (2.3, 1.9)
-
-    result = {
-        name: measure(make(chosen.resolution, chosen.size), steps, chosen.repetitions, chosen.seed)
-        for name, make in SCENES.items()
-    }
-    for name, rows in result.items():
-        print(name)
-        for row in rows:
-            print(
-                f"  step {row['step']:4} {row['march']:30} wood grain {row['wood grain']:9.2e}"
-                f"  boundary noise {row['boundary noise']:8.2e}"
-                f"  RMSE {row['rmse']:.5f}, off the face {row['rmse off the face']:.5f}"
-                f"  time {row['seconds'] * 1e3:7.1f} ms, {row['time']['median']:.3f} x ray casting"
-            )
-    print(NOTE, compared(result))
-    return {"note": f"{NOTE} {compared(result)}", **result}, partial(draw, result)
+def main(chosen: Namespace) -> dict[str, Any]:
+    result = {}
+    for name, make in SCENES.items():
+        scene = make(chosen.resolution, chosen.size)
+        result[name] = measure(scene, chosen.steps, chosen.repetitions, chosen.seed)
+        for row in result[name]:
+            show(row, name)
+    return {"note": f"{NOTE} {compared(result)}", **result}
 
 
 if __name__ == "__main__":

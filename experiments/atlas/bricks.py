@@ -72,11 +72,6 @@ def ordered(depth: float, size: int) -> dict[str, float]:
     return {method: error(by_bricks(depth, size, method), truth) for method in METHODS}
 
 
-def ordered_picture(depth: float, size: int) -> np.ndarray:
-    rgba = np.asarray(by_bricks(depth, size, "naive").rgba, np.float64)
-    return np.clip(rgba[..., :3], 0, 1)
-
-
 ORDER = Entry(
     name="wrong order",
     question="From which optical depth on does it show that each brick of a scan is shown at once?",
@@ -91,7 +86,7 @@ ORDER = Entry(
     does="A ray that leaves a brick and comes back passes another one between. Shown at once (naive), both "
     "parts of it in the first brick are blended at once, and what lies between them after or before both. "
     '"overlap" and "reload" keep the order of the samples, and their error is that of rounding.',
-    picture=ordered_picture,
+    picture=lambda depth, size: np.asarray(by_bricks(depth, size, "naive").rgba)[..., :3],
     shows="a scan that is red near the probe (below) and blue far from it, each brick shown at once",
     size=SIZE,
 )
@@ -186,10 +181,6 @@ def overlapped(part: float, size: int) -> dict[str, float]:
     return {"largest": float(off.max()), "share of pixels off by > 1/255": float(np.mean(off > LEVEL))}
 
 
-def overlapped_picture(part: float, size: int) -> np.ndarray:
-    return np.clip(overlapped_image(part, size), 0, 1)
-
-
 OVERLAP = Entry(
     name="overlap under k",
     question="By how much may bricks of a scan overlap less than the paper's K* before their image is wrong?",
@@ -205,7 +196,7 @@ OVERLAP = Entry(
     "the wrong order: what it meets where it comes back stands before what it meets in the dip. K* is how "
     "far rays between the sides of a brick can dip, so that it suffices. The images of render_bricks do not "
     "rest on it: how far each brick is read is found from the rays.",
-    picture=overlapped_picture,
+    picture=overlapped_image,
     shows="two bricks of a fan, blended one after the other; a wall in its middle hides red stripes that lie "
     "in the farther one",
     pictured=(1.0, 0.5),

@@ -37,10 +37,6 @@ def behind_cuts(depth: float, size: int) -> dict[str, float]:
     }
 
 
-def behind_cuts_picture(depth: float, size: int) -> np.ndarray:
-    return signed(hollowed(depth, size, cut=False) - EXACT, 0.1)
-
-
 BEHIND = Entry(
     name="jitter behind cuts",
     question="From which step on does jitter show as noise on the far side of what is cut out?",
@@ -55,7 +51,7 @@ BEHIND = Entry(
     does="Rays are shifted in the gap, so that the face behind it lies where the next sample happens to be, "
     "and material there is as thick as its whole cells. AlphaCorrection cuts them at the face, and the error "
     "is that of rounding. Cut faces that a ray meets first are smooth without it.",
-    picture=behind_cuts_picture,
+    picture=lambda depth, size: signed(hollowed(depth, size, cut=False) - EXACT, 0.1),
     shows="error of the opacity without AlphaCorrection, ± 0.1 from blue to red",
     size=32,
 )

@@ -29,7 +29,7 @@ class Entry(NamedTuple):
     - `metric`: what these numbers are. `judged`: the name of the one that finds the edge.
     - `limit`: up to which that number counts as good; NaN never does.
     - `outcome`, `does`: what jaxvol does, in a word and in a sentence.
-    - `picture`: linear RGB image at a value, in [0, 1]; `shows`: what it shows.
+    - `picture`: linear RGB image at a value, in [0, 1], where an image is measured; `shows`: what it shows.
     - `pictured`: the two values; by default the last one within the limit and the last one of all.
     - `said`: the name of the number by which jaxvol says that it fails (1) or not (0).
     - `scales`: of both axes of the chart, as in Matplotlib.
@@ -47,8 +47,8 @@ class Entry(NamedTuple):
     limit: float
     outcome: Outcome
     does: str
-    picture: Callable[[float, int], np.ndarray]
-    shows: str
+    picture: Callable[[float, int], np.ndarray] | None = None
+    shows: str = ""
     pictured: tuple[float, float] | None = None
     said: str | None = None
     scales: tuple[str, str] = ("log", "log")

@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, signed, uniform
+from .entry import Entry, uniform
 from .sampling import halves
 
 
@@ -52,21 +52,6 @@ def face(contrast: float, size: int) -> dict[str, float]:
     return {name: abs(slope - exact) / exact for name, slope in zip(names, found, strict=True)}
 
 
-def face_picture(contrast: float, size: int) -> np.ndarray:
-    """Relative error of the derivative of each pixel by the angle of all rays."""
-    line = np.linspace(-0.5, 0.5, size, dtype=np.float32)
-    x, y = np.meshgrid(line - 0.5, line)
-    origins = jnp.asarray(np.stack([x, y, np.full_like(x, -2.0)], axis=-1))
-
-    def image(angle: Array) -> Array:
-        return _opacities(origins, angle, jnp.asarray(contrast), cut=True, adjoint="forward")
-
-    slope = jax.jit(lambda angle: jax.jvp(image, (angle,), (jnp.ones_like(angle),))[1])(jnp.asarray(ANGLE))
-    depth = FRONT * (NEAR + contrast * FAR) / np.cos(ANGLE)
-    exact = depth * np.tan(ANGLE) * np.exp(-depth)
-    return signed(np.asarray(slope) / exact - 1, 1.0)
-
-
 FACES = Entry(
     name="gradients at label faces",
     question="How much may extinction jump at the face of a label before the gradient of the rays is wrong?",
@@ -80,8 +65,6 @@ FACES = Entry(
     outcome="documented",
     does="Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the "
     "exit. Finite differences of the same image, whose cells are cut at the face, are right.",
-    picture=face_picture,
-    shows="relative error of the derivative by the angle, ± 1 from blue to red",
     scales=("linear", "log"),
 )
 

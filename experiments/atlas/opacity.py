@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, cube, finite, grey, signed, uniform
+from .entry import Entry, cube, finite, signed, uniform
 
 
 LEVEL = 1 / 255
@@ -49,14 +49,6 @@ def opaque(depth: float, size: int) -> dict[str, float]:
     }
 
 
-def ball_picture(extinction: float, size: int) -> np.ndarray:
-    """A ball of this extinction, left rule, steps of 1/32."""
-    transfer = jv.TransferFunction([0.1, 0.5], [(0.9, 0.6, 0.3), (0.3, 0.6, 0.9)], [0.0, extinction])
-    volume = _sphere()
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.7)
-    return colors(volume, transfer, camera, jv.March(1 / 32, ALIGNED))
-
-
 @cache
 def _sphere() -> jv.Volume:
     return jv.phantom("sphere", 32)
@@ -76,8 +68,6 @@ OPAQUE = Entry(
     does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 "
     "cannot tell from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not "
     "move.",
-    picture=lambda depth, size: ball_picture(depth, size),
-    shows="a ball of this extinction per unit length, radius 1/2",
     scales=("linear", "log"),
 )
 
@@ -118,9 +108,6 @@ UNBOUNDED = Entry(
     outcome="bounded",
     does="Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to "
     "voxels, camera and extinction are finite up to the largest float32.",
-    picture=ball_picture,
-    shows="a ball of this extinction: beyond one opaque cell, its colour no longer changes",
-    pictured=(1.0, 1e38),
 )
 
 
@@ -152,20 +139,6 @@ def grazing(length: float, size: int) -> dict[str, float]:
     }
 
 
-def grazing_picture(length: float, size: int) -> np.ndarray:
-    """Opacity, relative to its largest, of a window this wide at an edge of the cube."""
-    line = (np.arange(size, dtype=np.float64) + 0.5) / size
-    x = (0.5 - line * length / np.sqrt(2)).astype(np.float32)
-    z = np.linspace(-0.5, 0.5, size, dtype=np.float32)
-    origins = np.stack(np.broadcast_arrays(x[None, :], np.float32(-1.5), z[:, None]), axis=-1)
-    directions = np.broadcast_to(np.array([1, 1, 0], np.float32), origins.shape)
-    march = jv.March(0.25, ALIGNED)
-    rgba = jv.render_rays(
-        cube(), uniform(1.0), origins, directions, march, outputs="rgba", adjoint="forward"
-    ).rgba
-    return grey(np.asarray(rgba[..., 3]) / -np.expm1(-length))
-
-
 GRAZING = Entry(
     name="grazing exits",
     question="How short may the part of a ray inside the volume be?",
@@ -180,10 +153,6 @@ GRAZING = Entry(
     does="The width of the cut cell is a difference of two distances, so its error is that of rounding "
     "them, however short it is: some 1e-7 of the volume's size. The relative error of a nearly "
     "transparent pixel grows, that of the gradient does not.",
-    picture=grazing_picture,
-    shows="opacity of a window of this width at an edge of the cube, relative to its largest: exact, it is "
-    "an even ramp",
-    pictured=(1e-2, 2e-6),
 )
 
 
@@ -215,20 +184,6 @@ def at_end(part: float, size: int) -> dict[str, float]:
     }
 
 
-def at_end_picture(part: float, size: int) -> np.ndarray:
-    """The derivative of each pixel by the spacing, over its largest, of an orthographic view."""
-    volume = jv.Volume(np.ones((9, 9, 9), np.float32), [0.25, 0.25, 0.25 * (1 + part / 8)], [-1.0] * 3)
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=1.2)
-
-    def image(spacing: Array) -> Array:
-        scaled = jv.Volume(volume.data, volume.spacing.at[2].set(spacing), volume.origin)
-        march = jv.March(0.25, ALIGNED)
-        return jv.render(scaled, uniform(1.0), camera, march, outputs="rgba", adjoint="forward").rgba[..., 3]
-
-    slope = jax.jvp(image, (volume.spacing[2],), (jnp.ones(()),))[1]
-    return grey(np.asarray(slope) / (8 * np.exp(-2)))
-
-
 AT_END = Entry(
     name="exits at the end of a cell",
     question="Does the gradient by what moves the exit hold as the last cell gets narrower?",
@@ -243,10 +198,6 @@ AT_END = Entry(
     does="The gradient is exact for any e, and where the exit lies exactly at the end of a cell: then the "
     "last cell is not cut, but its width is the exit's to change. This happens in orthographic views along "
     "an axis with steps of one voxel.",
-    picture=at_end_picture,
-    shows="derivative of each pixel by the spacing, seen along z: it should be the same everywhere on the "
-    "cube",
-    pictured=(0.5, 0.0),
     scales=("symlog", "log"),
 )
 
@@ -297,10 +248,6 @@ def termination(left: float, size: int) -> dict[str, float]:
     return found
 
 
-def termination_picture(left: float, size: int) -> np.ndarray:
-    return signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05)
-
-
 TERMINATION = Entry(
     name="early termination in gradients",
     question="How much transmittance may be left out before the gradient is wrong?",
@@ -315,7 +262,7 @@ TERMINATION = Entry(
     does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T "
     "log(1/T) of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or "
     "none.",
-    picture=termination_picture,
+    picture=lambda left, size: signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05),
     shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
     pictured=(1e-4, 0.1),
     size=32,

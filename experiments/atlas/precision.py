@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, cube, grey, signed, uniform
+from .entry import Entry, colors, cube, uniform
 
 
 # -- voxels of 16-bit floats ------------------------------------------------------------------------------
@@ -96,25 +96,6 @@ def long(samples: float, size: int) -> dict[str, float]:
     }
 
 
-def long_picture(samples: float, size: int) -> np.ndarray:
-    """Error of the opacity of the cube."""
-    return signed(_cube_image(samples, size, None) + np.expm1(-2 * EXTINCTION), 1e-6)
-
-
-MOST = 64
-
-
-def exhausted_picture(samples: float, size: int) -> np.ndarray:
-    return grey(_cube_image(samples, size, MOST))
-
-
-def _cube_image(samples: float, size: int, most: int | None) -> np.ndarray:
-    """Opacity of the cube by rays that need so many samples."""
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.9)
-    march = jv.March(2 / samples, (jv.AlphaCorrection(),), max_samples=most)
-    return colors(cube(), uniform(EXTINCTION), camera, march)[..., 0]
-
-
 LONG = Entry(
     name="rays of very many samples",
     question="How many samples may a ray take before float32 shows?",
@@ -129,9 +110,6 @@ LONG = Entry(
     does="Depths are counted in steps, not summed, so the ten-thousandth sample is as exact as the first. "
     "Opacity is accumulated in float32; its rounding errors grow more slowly than the number of "
     "samples.",
-    picture=long_picture,
-    shows="error of the opacity of a cube, ± 1e-6 from blue to red",
-    pictured=(30.0, 1e3),
 )
 
 EXHAUSTED = Entry(
@@ -146,9 +124,6 @@ EXHAUSTED = Entry(
     limit=1 / 255,
     outcome="detected and said",
     does="What lies behind the last sample is missing, and Rendering.exhausted marks the ray.",
-    picture=exhausted_picture,
-    shows="a translucent cube, with max_samples=64",
-    pictured=(50.0, 150.0),
     said="exhausted",
 )
 

@@ -61,10 +61,6 @@ def haze(share: float, size: int) -> dict[str, float]:
     }
 
 
-def haze_picture(share: float, size: int) -> np.ndarray:
-    return signed(hazy(share, size, "EmptySpaceJitter") - hazy(share, size, "converged"), 0.05)
-
-
 HAZE = Entry(
     name="wood grain without empty samples",
     question="How many rays may begin in visible material before EmptySpaceJitter leaves wood grain?",
@@ -78,7 +74,9 @@ HAZE = Entry(
     outcome="documented",
     does="A ray that meets no transparent sample is not shifted: the wood grain that is left is the share "
     "of such rays. Jitter breaks it there, too.",
-    picture=haze_picture,
+    picture=lambda share, size: signed(
+        hazy(share, size, "EmptySpaceJitter") - hazy(share, size, "converged"), 0.05
+    ),
     shows="error of EmptySpaceJitter, ± 0.05 from blue to red",
     scales=("linear", "log"),
     size=96,
@@ -120,10 +118,6 @@ def cut_faces(step: float, size: int) -> dict[str, float]:
     }
 
 
-def cut_face_picture(step: float, size: int) -> np.ndarray:
-    return cut_face(step, size, JITTERS["Jitter"])[0]
-
-
 CUT = Entry(
     name="jitter on cut faces",
     question="From which step on does Jitter show as noise where the box cuts material?",
@@ -137,7 +131,7 @@ CUT = Entry(
     outcome="documented",
     does="Jitter leaves out the first ξ d of the material. With front_residual the noise is smaller; under "
     "EmptySpaceJitter, rays on the face are not shifted before they leave the material, and it stays smooth.",
-    picture=cut_face_picture,
+    picture=lambda step, size: cut_face(step, size, JITTERS["Jitter"])[0],
     shows="the block under Jitter; its left half is the cut face",
     size=64,
 )
@@ -177,10 +171,6 @@ def label_faces(depth: float, size: int) -> dict[str, float]:
     }
 
 
-def label_face_picture(depth: float, size: int) -> np.ndarray:
-    return signed(label_face(depth, size, cut=False) - FAR, 0.2)
-
-
 LABELS = Entry(
     name="jitter at label faces",
     question="From which step on does jitter show as noise at the faces of a segmentation?",
@@ -194,7 +184,7 @@ LABELS = Entry(
     outcome="documented",
     does="Without labels=True a structure is as thick as its whole cells, which jitter moves. With it, "
     "cells are cut at the face, and the error is that of rounding.",
-    picture=label_face_picture,
+    picture=lambda depth, size: signed(label_face(depth, size, cut=False) - FAR, 0.2),
     shows="error of the opacity without labels=True, ± 0.2 from blue to red",
     size=32,
 )
@@ -232,10 +222,6 @@ def sheets(ratio: float, size: int) -> dict[str, float]:
     }
 
 
-def sheet_picture(ratio: float, size: int) -> np.ndarray:
-    return grey(sheet(ratio, size, jitter=True))
-
-
 SHEETS = Entry(
     name="sheets thinner than a step",
     question="How thin may an opaque sheet be before rays pass through it?",
@@ -250,7 +236,7 @@ SHEETS = Entry(
     does="A sheet thinner than a step is met by as many rays as it is thick, in steps: as bands without "
     "jitter, as noise with it. No quadrature sees what lies between two samples alike; a shorter step "
     "does.",
-    picture=sheet_picture,
+    picture=lambda ratio, size: grey(sheet(ratio, size, jitter=True)),
     shows="opacity of the sheet under Jitter",
     scales=("log", "linear"),
     size=64,
@@ -284,10 +270,6 @@ def offsets(left: float, size: int) -> dict[str, float]:
     return {name: float(np.abs(offset_error(left, size, each)).max()) for name, each in BLUE.items()}
 
 
-def offset_picture(left: float, size: int) -> np.ndarray:
-    return signed(offset_error(left, size, BLUE["Jitter"]), 0.05)
-
-
 OFFSETS = Entry(
     name="jitter offsets near 1",
     question="Does the first cell survive an offset that rounds to a whole step?",
@@ -302,7 +284,7 @@ OFFSETS = Entry(
     does="Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells "
     "behind it always cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ "
     "d.",
-    picture=offset_picture,
+    picture=lambda left, size: signed(offset_error(left, size, BLUE["Jitter"]), 0.05),
     shows="error of the opacity under Jitter without front residual, ± 0.05 from blue to red",
     pictured=(1.0, 2.0**-24),
     scales=("log", "log"),

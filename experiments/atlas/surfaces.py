@@ -43,10 +43,6 @@ def surfaces(ratio: float, size: int) -> dict[str, float]:
     }
 
 
-def surface_picture(ratio: float, size: int) -> np.ndarray:
-    return grey(surface(ratio, size, jitter=True))
-
-
 SHEETS = Entry(
     name="isosurfaces of thin sheets",
     question="How thin may a sheet be before rays pass through both of its faces unseen?",
@@ -61,7 +57,7 @@ SHEETS = Entry(
     does="A cell that begins before the sheet and ends behind it has both ends below the value: rays miss a "
     "sheet by as much as it is thinner than a step, in bands without jitter, as noise with it. A shorter "
     "step sees it.",
-    picture=surface_picture,
+    picture=lambda ratio, size: grey(surface(ratio, size, jitter=True)),
     shows="pixels that meet the sheet, under EmptySpaceJitter",
     scales=("log", "linear"),
     size=64,
