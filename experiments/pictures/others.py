@@ -83,7 +83,7 @@ POINTS = [
 """A transfer function in which fluid is transparent, and all but bone translucent."""
 ZOOM, CENTRE = 2.2, (0.29, 0.44)
 BESIDE = (-220.0, -200.0, 40.0)
-"""Of the camera, beside the head, mm: rays pass the curved faces at small angles, and the fetus in between."""
+"""Of the camera, beside the head, mm: rays pass curved faces at small angles, and the fetus in between."""
 ORDERS: dict[str, Any] = {"wrong order: no overlap": each_at_once, "right order: overlap": "overlap"}
 
 
