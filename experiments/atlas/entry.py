@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 import jaxvol as jv
 
@@ -98,6 +99,42 @@ def colors(*parts: Any, **how: Any) -> np.ndarray:
     """Colour over black of an image, by the adjoint that compiles fastest."""
     rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
     return np.asarray(rendering.rgba[..., :3], np.float64)
+
+
+def opacities(*parts: Any, **how: Any) -> np.ndarray:
+    """Opacity of each pixel."""
+    rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
+    return np.asarray(rendering.rgba[..., 3], np.float64)
+
+
+def ray_opacities(volume: jv.Volume, transfer: Any, rays: Any, march: jv.March, **how: Any) -> Array:
+    """Opacity of rays, (origins, directions)."""
+    return jv.render_rays(volume, transfer, *rays, march, outputs="rgba", **how).rgba[..., 3]
+
+
+def value_and_slope(function: Callable[[Array], Array]) -> Callable[[Any], tuple[np.float64, np.float64]]:
+    """A function of one number, and its derivative, compiled."""
+    both = jax.jit(jax.value_and_grad(function))
+
+    def of(number: Any) -> tuple[np.float64, np.float64]:
+        value, slope = both(jnp.asarray(number, jnp.float32))
+        return np.float64(value), np.float64(slope)
+
+    return of
+
+
+def rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def along_z(size: int, scale: float = 0.5) -> jv.Camera:
+    """An orthographic camera that looks along z at the middle of [-1, 1]³."""
+    return jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
+
+
+def of_field(field: jv.Field) -> jv.Volume:
+    """The values of a field on [-1, 1]³."""
+    return jv.Volume(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3, field=field)
 
 
 def uniform(extinction: Any, color: White = (1.0, 1.0, 1.0)) -> jv.TransferFunction:

@@ -1,6 +1,7 @@
 """Where does accumulating opacity fail? Opaque rays, great extinction, short cells, early termination."""
 
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,49 +10,34 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, cube, finite, signed, uniform
+from .entry import Entry, along_z, cube, finite, ray_opacities, signed, uniform, value_and_slope
 
 
-LEVEL = 1 / 255
 ALIGNED = (jv.AlphaCorrection(),)
+
+
+def one_ray(volume: jv.Volume, extinction: Any, step: float, origin: Any, direction: Any) -> Array:
+    """Opacity of a ray."""
+    rays = jnp.stack([jnp.asarray(each, jnp.float32) for each in origin])[None], jnp.array([direction])
+    return ray_opacities(volume, uniform(extinction), rays, jv.March(step, ALIGNED))[0]
 
 
 # -- opaque cells -----------------------------------------------------------------------------------------
 
-
-def along_z(offset: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """One ray along z through a cube, as arrays of one ray."""
-    return np.array([[offset, 0.2, -3.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32)
-
-
-@jax.jit
-def _opacity(extinction: Array) -> tuple[Array, Array]:
-    """Opacity of a cube of side 2 in four steps, and its derivative by the extinction."""
-
-    def opacity(extinction: Array) -> Array:
-        origins, directions = along_z()
-        march = jv.March(0.5, ALIGNED)
-        return jv.render_rays(cube(), uniform(extinction), origins, directions, march, outputs="rgba").rgba[
-            0, 3
-        ]
-
-    return jax.value_and_grad(opacity)(extinction)
+ORIGIN, AHEAD = (0.1, 0.2, -3.0), (0.0, 0.0, 1.0)
+through = value_and_slope(lambda extinction: one_ray(cube(), extinction, 0.5, ORIGIN, AHEAD))
+"""A cube of side 2, in four steps, by its extinction."""
 
 
 def opaque(depth: float, size: int) -> dict[str, float]:
     """`depth`: optical depth of the cube."""
-    extinction = np.float32(depth / 2)
-    value, slope = (np.float64(number) for number in _opacity(jnp.asarray(extinction)))
-    exact = 2 * np.exp(-2 * np.float64(extinction))
+    extinction = np.float64(np.float32(depth / 2))
+    value, slope = through(extinction)
+    exact = 2 * np.exp(-2 * extinction)
     return {
         "gradient, relative": float(abs(slope - exact) / exact),
-        "opacity": float(abs(value + np.expm1(-2 * np.float64(extinction)))),
+        "opacity": float(abs(value + np.expm1(-2 * extinction))),
     }
-
-
-@cache
-def _sphere() -> jv.Volume:
-    return jv.phantom("sphere", 32)
 
 
 OPAQUE = Entry(
@@ -73,12 +59,12 @@ OPAQUE = Entry(
 
 
 def unbounded(extinction: float, size: int) -> dict[str, float]:
-    volume, camera = _sphere(), jv.Camera((0, 0, -3), (0, 0, 0), size=(8, 8), parallel_scale=0.7)
-    image, gradient = _image_and_gradient(volume, camera, jnp.asarray(extinction, jnp.float32))
-    value, slope = _opacity(jnp.asarray(extinction, jnp.float32))
+    camera = along_z(8, 0.7)
+    found = _image_and_gradient(jv.phantom("sphere", 32), camera, jnp.asarray(extinction, jnp.float32))
+    value, slope = through(extinction)
     exact = -np.expm1(-2 * np.float64(np.float32(extinction)))
     return {
-        "not finite": 0.0 if finite((image, gradient, value, slope)) else np.nan,
+        "not finite": 0.0 if finite((found, value, slope)) else np.nan,
         "opacity of a cube": float(abs(value - exact)),
     }
 
@@ -113,25 +99,15 @@ UNBOUNDED = Entry(
 
 # -- grazing exits ----------------------------------------------------------------------------------------
 
-
-@jax.jit
-def _grazing(x: Array) -> tuple[Array, Array]:
-    """Opacity, and its derivative by x, of a ray that cuts an edge of the cube."""
-
-    def opacity(x: Array) -> Array:
-        origin = jnp.stack([x, jnp.full_like(x, -1.5), jnp.full_like(x, 0.1)])[None]
-        direction = jnp.array([[1.0, 1.0, 0.0]])
-        march = jv.March(0.25, ALIGNED)
-        return jv.render_rays(cube(), uniform(1.0), origin, direction, march, outputs="rgba").rgba[0, 3]
-
-    return jax.value_and_grad(opacity)(x)
+past_edge = value_and_slope(lambda x: one_ray(cube(), 1.0, 0.25, (x, -1.5, 0.1), (1.0, 1.0, 0.0)))
+"""A ray that cuts an edge of the cube, by its place x."""
 
 
 def grazing(length: float, size: int) -> dict[str, float]:
     """`length`: of the ray within the cube, at its edge x = 1, y = -1."""
-    x = np.float32(0.5 - length / np.sqrt(2))
-    exact = (0.5 - np.float64(x)) * np.sqrt(2)
-    value, slope = (np.float64(number) for number in _grazing(jnp.asarray(x)))
+    x = np.float64(np.float32(0.5 - length / np.sqrt(2)))
+    value, slope = past_edge(x)
+    exact = (0.5 - x) * np.sqrt(2)
     return {
         "gradient, relative": float(abs(slope + np.sqrt(2) * np.exp(-exact)) / (np.sqrt(2) * np.exp(-exact))),
         "opacity, relative": float(abs(value + np.expm1(-exact)) / max(-np.expm1(-exact), 1e-30)),
@@ -159,25 +135,19 @@ GRAZING = Entry(
 # -- exits at the end of a cell ---------------------------------------------------------------------------
 
 
-@jax.jit
-def _at_end(spacing: Array) -> tuple[Array, Array]:
-    """Opacity, and its derivative by the spacing along the ray, of a cube of 8 spacings in steps of 1/4."""
-
-    def opacity(spacing: Array) -> Array:
-        along = jnp.stack([jnp.full_like(spacing, 0.25), jnp.full_like(spacing, 0.25), spacing])
-        volume = jv.Volume(np.ones((9, 9, 9), np.float32), along, [-1.0] * 3)
-        origins, directions = along_z()
-        march = jv.March(0.25, ALIGNED)
-        return jv.render_rays(volume, uniform(1.0), origins, directions, march, outputs="rgba").rgba[0, 3]
-
-    return jax.value_and_grad(opacity)(spacing)
+@value_and_slope
+def spaced(spacing: Array) -> Array:
+    """Opacity of a cube of 8 spacings in steps of 1/4, by the spacing along the ray."""
+    along = jnp.stack([jnp.full_like(spacing, 0.25), jnp.full_like(spacing, 0.25), spacing])
+    volume = jv.Volume(np.ones((9, 9, 9), np.float32), along, [-1.0] * 3)
+    return one_ray(volume, 1.0, 0.25, ORIGIN, AHEAD)
 
 
 def at_end(part: float, size: int) -> dict[str, float]:
     """`part`: of a step that the last cell is wide; 0 where the exit lies exactly at the end of a cell."""
-    spacing = np.float32(0.25 * (1 + part / 8))
-    exact = np.exp(-8 * np.float64(spacing))
-    value, slope = (np.float64(number) for number in _at_end(jnp.asarray(spacing)))
+    spacing = np.float64(np.float32(0.25 * (1 + part / 8)))
+    value, slope = spaced(spacing)
+    exact = np.exp(-8 * spacing)
     return {
         "gradient, relative": float(abs(slope - 8 * exact) / (8 * exact)),
         "opacity": float(abs(value - (1 - exact))),
@@ -200,7 +170,6 @@ AT_END = Entry(
     "an axis with steps of one voxel.",
     scales=("symlog", "log"),
 )
-
 
 # -- early termination ------------------------------------------------------------------------------------
 

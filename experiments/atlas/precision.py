@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, cube, uniform
+from .entry import Entry, colors, cube, rms, uniform
 
 
 # -- voxels of 16-bit floats ------------------------------------------------------------------------------
@@ -42,10 +42,10 @@ def stored(offset: float, size: int, dtype: Any) -> np.ndarray:
 
 def halves(offset: float, size: int) -> dict[str, float]:
     truth = stored(0, size, jnp.float32)
-    found = {"float32": float(np.sqrt(np.mean((stored(offset, size, jnp.float32) - truth) ** 2)))}
+    found = {"float32": rms(stored(offset, size, jnp.float32) - truth)}
     for name, dtype in TYPES.items():
         try:
-            found[name] = float(np.sqrt(np.mean((stored(offset, size, dtype) - truth) ** 2)))
+            found[name] = rms(stored(offset, size, dtype) - truth)
         except ValueError:  # values that the type does not hold
             found[name] = np.nan
     return found
