@@ -28,7 +28,7 @@ from matplotlib.colors import LogNorm
 import jaxvol as jv
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
 
 
 STEP = 0.11
@@ -219,7 +219,9 @@ def main(chosen: Namespace) -> dict[str, Any]:
         rule: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
         for rule, rows in found.items()
     }
-    show({f"{rule}, {name}": ", ".join(leaves) for rule, of in wrong.items() for name, leaves in of.items()})
+    for rule, of in wrong.items():
+        for name, leaves in of.items():
+            print(f"{rule}, {name}: {', '.join(leaves) or 'none'}")
     return {
         "image": [chosen.size] * 2,
         "widths": list(widths),
