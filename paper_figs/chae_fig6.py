@@ -7,7 +7,7 @@ channel.
 
 from argparse import Namespace
 
-from experiments.pictures.others import WHOLE, chae_fig6
+from experiments.pictures.chae import WHOLE, chae_fig6
 
 from .common import pictures
 

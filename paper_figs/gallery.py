@@ -8,7 +8,7 @@ take one or two materials for the same values. Both have the same lights, and an
 shown as they are.
 """
 
-from experiments.pictures.light import gallery
+from experiments.pictures.lee import gallery
 
 from .common import pictures
 

@@ -10,7 +10,7 @@ from argparse import Namespace
 
 from experiments import charts
 from experiments.harness import QUICK, command
-from experiments.pictures.others import order_of_bricks
+from experiments.pictures.kim import order_of_bricks
 
 from .common import OUTPUT
 

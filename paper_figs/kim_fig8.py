@@ -8,7 +8,7 @@ fetus stands before the tissue that covers it. Middle: with overlap (`"overlap"`
 Below, what is framed.
 """
 
-from experiments.pictures.others import kim_fig8
+from experiments.pictures.kim import kim_fig8
 
 from .common import pictures
 

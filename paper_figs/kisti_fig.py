@@ -3,7 +3,7 @@ first one low values are translucent and high ones opaque, under the second all 
 defaults are phantoms; `--data` draws the volumes of `experiments/kisti.py`.
 """
 
-from experiments.pictures.others import kisti_fig
+from experiments.pictures.kisti import kisti_fig
 
 from .common import pictures
 

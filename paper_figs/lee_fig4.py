@@ -5,7 +5,7 @@ the head, where nothing hides them, so the ear shines; if they are also tested f
 The text under each image is the mean brightness of the ear's pixels.
 """
 
-from experiments.pictures.light import lee_fig4
+from experiments.pictures.lee import lee_fig4
 
 from .common import pictures
 

@@ -8,7 +8,7 @@ templates of more packets are blended. Photons are also tested at 2, 4 and 8 tim
 without that fingers do not shade each other.
 """
 
-from experiments.pictures.light import lee_fig5
+from experiments.pictures.lee import lee_fig5
 
 from .common import pictures
 

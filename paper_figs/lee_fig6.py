@@ -7,7 +7,7 @@ sample uses. In the right column occlusion is soft, and four templates of more p
 are the same.
 """
 
-from experiments.pictures.light import lee_fig6
+from experiments.pictures.lee import lee_fig6
 
 from .common import pictures
 

@@ -3,7 +3,7 @@
 For each step, a scene in which only that step matters: as it is above, and with one thing changed below.
 """
 
-from experiments.pictures.steps import lee_fig_steps
+from experiments.pictures.lee_steps import lee_fig_steps
 
 from .common import pictures
 

@@ -1,73 +1,18 @@
-"""Pictures of Chae and Shin (Fig. 6), the KISTI report (Fig. V-1), and Kim, Kwon and Shin (Figs. 6 and 8)."""
+"""Kim, Kwon and Shin 2008: the order of bricks (Fig. 6), and a scan whose bricks are blended in a wrong one
+(Fig. 8)."""
 
 import math
 from argparse import Namespace
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.lighting import Phong
-from jaxvol.metrics import rmse
 
-from .. import kisti, minimum_distance
 from ..bricks import phantom
 from ..bricks_paper import grid, probe
-from ..harness import frame
 from ..naive_bricks import each_at_once
 from . import BLACK, Panels, panel
-
-
-# -- cells of a minimum-distance grid ---------------------------------------------------------------------
-
-CELLS = (8, 16, 32, 64)
-WHOLE = 2  # size of the image over that of the part that is shown
-MIDDLE = 0.38, 0.52
-GREEN = (0.0, 0.7, 0.05)
-
-
-def chae_fig6(chosen: Namespace) -> Panels:
-    """A part of the image without leaping, and under growing cells. Below, wrong pixels are green."""
-    side, size = chosen.size, round(chosen.size * WHOLE)
-    make = minimum_distance.airway if chosen.data else minimum_distance.colon
-    scene = make(chosen.data, size, **({} if chosen.data else {"resolution": chosen.resolution}))
-    left, top = (round(middle * size - side / 2) for middle in MIDDLE)
-    part = slice(top, top + side), slice(left, left + side)
-    reference = frame(scene, minimum_distance.march(scene, None))
-    whole = np.asarray(reference.image(BLACK))
-    small = scene._replace(camera=replace(scene.camera, size=(side, side)))
-    square = left * side / size, top * side / size, side / WHOLE
-    upper = [panel(whole[part], "", "no leaping")]
-    overview = frame(small, minimum_distance.march(small, None)).image(BLACK)
-    lower = [panel(overview, "the whole image", "", square)]
-    for cell in CELLS:
-        rendering = frame(scene, minimum_distance.march(scene, minimum_distance.PUBLISHED, cell))
-        image, off = np.asarray(rendering.image(BLACK)), minimum_distance.wrong(rendering, reference)
-        upper.append(panel(image[part], "", f"R = {cell}"))
-        caption = f"wrong {off.mean():.3%}, {off[part].sum()} pixels here"
-        caption += f"\nRMSE from no leaping {rmse(image, whole):.1e}"
-        lower.append(panel(np.where(off[..., None], GREEN, image)[part], caption))
-    return [upper, lower]
-
-
-# -- two transfer functions -------------------------------------------------------------------------------
-
-
-def kisti_fig(chosen: Namespace) -> Panels:
-    """A head and an engine, shaded."""
-    rows: Panels = []
-    for name, make in (kisti.REAL if chosen.data else kisti.PHANTOMS).items():
-        scene, row = make(chosen.data, chosen.size, chosen.resolution), []
-        titles = ("low values translucent", "all visible values opaque")
-        for number, seen in enumerate((scene, kisti.opaque(scene))):
-            march = jv.March(scene.step / 2, (jv.AlphaCorrection(),), "midpoint")
-            image = jv.render(*seen[:3], march, lighting=Phong(), outputs="rgba").image(BLACK)
-            row.append(
-                panel(image, f"{name}, transfer function {number + 1}", "" if rows else titles[number])
-            )
-        rows.append(row)
-    return rows
 
 
 # -- bricks in the wrong order ----------------------------------------------------------------------------
