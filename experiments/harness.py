@@ -105,6 +105,9 @@ def experiment(
     - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
     """
 
+    if unknown := set(quick or ()) - set(options):
+        raise ValueError(f"quick of {name} must be some of its options; got {', '.join(sorted(unknown))}.")
+
     def made(measure: Callable[[Namespace], Any]) -> Main:
         @command(about, record.RESULTS, seed=0, quick=QUICK, **options)
         def main(chosen: Namespace) -> None:

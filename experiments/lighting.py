@@ -100,9 +100,7 @@ def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
 def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetitions: int, seed: int) -> Any:
     """Time and error of each lighting, one at a time, since a volume keeps the light of one baking only."""
     truth = frame(scene, ScattererTemplates(FLESH, LIGHTS, templates=many, blend=True), seed).rgba
-    beside = {UNLIT: None}
-    if PHONG in lightings:
-        [(_, beside[PHONG])] = lightings[PHONG]
+    beside = {UNLIT: None, PHONG: Phong()}
     found: dict[str, list[dict[str, Any]]] = {}
     for kind, each in lightings.items():
         found[kind] = []
@@ -113,8 +111,7 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetition
             )
             image = frame(scene, lighting, seed).rgba
             row = {"number": number, **harness.row(seconds[kind], seconds[UNLIT], rmse(image, truth))}
-            if PHONG in beside:
-                row["ratio to Phong"] = timing.ratio(seconds[kind], seconds[PHONG])
+            row["ratio to Phong"] = timing.ratio(seconds[kind], seconds[PHONG])
             if kind == BAKED:
                 row["seconds to bake"] = round(baking(scene, lighting, seed) - row["seconds"], 4)
             found[kind].append(row)
@@ -203,21 +200,17 @@ def draw(result: dict[str, Any], path: Path) -> None:
     cost.set(xscale="log", yscale="log", xlabel="RMSE against many templates blended")
     cost.set_ylabel("time / that of an unlit frame")
     cost.set_title("numbers: photons of a template, templates blended, or nodes baked", fontsize=9)
-    cost.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    cost.yaxis.set_major_formatter("{x:g}")
-    cost.yaxis.set_minor_formatter(NullFormatter())
-    cost.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
-    cost.xaxis.set_major_formatter("{x:g}")
-    cost.xaxis.set_minor_formatter(NullFormatter())
+    for axis, digits in ((cost.xaxis, (1, 3)), (cost.yaxis, (1, 2, 5))):
+        axis.set_major_locator(LogLocator(subs=digits))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     figure.legend(*cost.get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8)
 
     rows = result["deferring"]
     for key, label, style in (("rmse", "deferred", "C4o--"), ("rmse of no light", "no light", "ko-")):
         deferred.plot([row["extinction"] for row in rows], [row[key] for row in rows], style, label=label)
-    deferred.set(xscale="log", yscale="log", xlabel="extinction, times that of opaque skin")
-    deferred.set(ylabel="RMSE against light on all samples")
-    for axis in (deferred.xaxis, deferred.yaxis):
-        axis.set_major_formatter("{x:g}")
+    charts.logarithmic(deferred, x=10, y=10)
+    deferred.set(xlabel="extinction, times that of opaque skin", ylabel="RMSE against light on all samples")
     deferred.set_title("light once for each ray, from translucent to opaque skin", fontsize=9)
     deferred.legend(fontsize=8)
     charts.save(figure, path)
@@ -245,8 +238,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "blended": (2,),
         "baked": (16,),
         "many": 4,
-        "trials": 3,
-        "opacities": (0.3, 0.7),
         "thinned": (1.0, 0.1),
         "picture": (48, 24),
     },
