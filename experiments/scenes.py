@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 import jaxvol as jv
 
@@ -93,6 +92,8 @@ SCENES: dict[str, Callable[..., Scene]] = {
 
 def inside(scene: Scene, size: int) -> Scene:
     """The scene seen from its widest empty place, towards what is visible."""
+    from scipy.ndimage import distance_transform_edt  # not at the top: the first image of a process is timed
+
     volume, transfer = scene.volume, scene.transfer
     data, spacing = np.asarray(volume.data, np.float64), np.asarray(volume.spacing, np.float64)
     extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
