@@ -200,6 +200,11 @@ def image(scene: Scene, march: jv.March) -> jv.Rendering:
     return jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
 
 
+def entered(scene: Scene) -> np.ndarray:
+    """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
+    return np.asarray(frame(scene, jv.March(scene.step, max_samples=1)).rgba[..., 3] > 0)
+
+
 # -- measures ---------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ plain jitter can be nearer to the truth in the mean, or farther; it is noisier i
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +22,8 @@ import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
 from . import charts, marches, timing
-from .harness import experiment, show
+from .harness import entered, experiment, frame, show
+from .scenes import Scene, cropped
 
 
 METHODS = {
@@ -45,17 +47,16 @@ PANELS = {
 }
 
 
-class Scene(NamedTuple):
-    """`grain` measures the wood grain of an error at a step; `face` is where the box cuts material."""
+class Faced(NamedTuple):
+    """A scene whose step is a voxel. `grain` measures the wood grain of an error at a step; `face` is where
+    the box cuts material."""
 
-    volume: jv.Volume
-    transfer: jv.TransferFunction
-    camera: jv.Camera
+    scene: Scene
     grain: Callable[[np.ndarray, float], float]
     face: np.ndarray
 
 
-def cut_block(resolution: int, size: int) -> Scene:
+def cut_block(resolution: int, size: int) -> Faced:
     volume = jv.phantom("cut_block", resolution)
     points = [(0.05, (0.33, 0.33, 0.33), 0.0), (1.0, (0.9, 0.9, 0.9), 0.45)]
     transfer = jv.TransferFunction.from_points(points, unit_distance=0.05)
@@ -70,52 +71,49 @@ def cut_block(resolution: int, size: int) -> Scene:
         frequency = comb_frequency(step, (rightwards * SLOPE, 0.0), 2 * scale / size)
         return wood_grain_energy(error[:, plane[0]], frequency)
 
-    return Scene(volume, transfer, camera, grain, x < -0.1)
+    return Faced(Scene(volume, transfer, camera, float(volume.spacing[0])), grain, x < -0.1)
 
 
-def head(resolution: int, size: int) -> Scene:
-    whole = jv.phantom("head", resolution)
-    volume = jv.Volume(np.asarray(whole.data)[..., : int(0.62 * resolution)], whole.spacing, whole.origin)
-    transfer = jv.preset("head", unit_distance=0.01)
+def head(resolution: int, size: int) -> Faced:
+    volume = cropped(jv.phantom("head", resolution), (0, 0, 0), (1, 1, 0.62))
     camera = jv.Camera.looking_at(volume, (0.5, -1, 0.75), size=(size, size)).zoom(1.7, (0.52, 0.46))
-    first = jv.render(volume, transfer, camera, jv.March(volume.spacing[0], max_samples=1))
-    face = np.asarray(first.rgba[..., 3] > 0)
+    scene = Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
+    face = entered(scene)
     below = int(np.flatnonzero(face.any(axis=1))[-1]) + 2  # below the cut face there is only skin
-    return Scene(volume, transfer, camera, lambda error, step: wood_grain_energy(error[below:]), face)
+    return Faced(scene, lambda error, step: wood_grain_energy(error[below:]), face)
 
 
 SCENES = {"cut block, orthographic": cut_block, "head, perspective": head}
 
 
-def measure(scene: Scene, steps: Sequence[float], repetitions: int, seed: int) -> list[dict[str, Any]]:
+def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> list[dict[str, Any]]:
     """One row for each step and march."""
-    voxel = float(scene.volume.spacing[0])
-
-    def frame(march: jv.March) -> jv.Rendering:
-        return jv.render(scene.volume, scene.transfer, scene.camera, march)
+    scene, grain, face = of
+    voxel = scene.step
 
     def image(rendering: jv.Rendering) -> np.ndarray:
         return np.asarray(rendering.rgba[..., :3], np.float64)
 
-    truth = image(frame(marches.converged(min(steps) * voxel)))
+    truth = image(frame(scene, marches.converged(min(steps) * voxel)))
     rows = []
     for step in steps:
         under = {name: jv.March(step * voxel, marches.transforms(name, seed)) for name in METHODS}
-        seconds = timing.interleaved({n: lambda m=m: frame(m) for n, m in under.items()}, repetitions)
+        drawn = {name: partial(frame, scene, march) for name, march in under.items()}
+        seconds = timing.interleaved(drawn, repetitions)
         for name, march in under.items():
-            rendering = frame(march)
+            rendering = frame(scene, march)
             assert not np.any(rendering.exhausted)
             error = image(rendering) - truth
             rows.append(
                 {
                     "step": step,
                     "march": name,
-                    "wood grain": scene.grain(error, step * voxel),
-                    "boundary noise": boundary_noise(error, scene.face),
+                    "wood grain": grain(error, step * voxel),
+                    "boundary noise": boundary_noise(error, face),
                     "rmse": float(np.sqrt(np.mean(error**2))),
-                    "rmse off the face": float(np.sqrt(np.mean(error[~scene.face] ** 2))),
+                    "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
                     "samples": int(np.sum(rendering.samples)),
-                    "seconds": float(np.median(seconds[name])),
+                    "seconds": timing.median(seconds[name]),
                     "time": timing.ratio(seconds[name], seconds[marches.PLAIN]),
                 }
             )

@@ -90,6 +90,16 @@ SCENES: dict[str, Callable[..., Scene]] = {
 }
 
 
+def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) -> jv.Volume:
+    """The part of a volume between two corners, given as fractions of its sides."""
+    first, last = (
+        [int(part * n) for part, n in zip(corner, volume.shape, strict=True)] for corner in (low, high)
+    )
+    part = np.asarray(volume.data)[tuple(map(slice, first, last))]
+    origin = np.asarray(volume.origin) + np.array(first) * np.asarray(volume.spacing)
+    return jv.Volume(part, volume.spacing, origin)
+
+
 def inside(scene: Scene, size: int) -> Scene:
     """The scene seen from its widest empty place, towards what is visible."""
     from scipy.ndimage import distance_transform_edt  # not at the top: the first image of a process is timed

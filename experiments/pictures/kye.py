@@ -9,9 +9,9 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
 
-from ..harness import frame
+from ..harness import entered, frame
 from ..marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
-from ..scenes import SKIN, Scene
+from ..scenes import SKIN, Scene, cropped
 from . import BLACK, Panels, panel
 
 
@@ -49,16 +49,6 @@ class View(NamedTuple):
     def scenes(self) -> dict[str, Scene]:
         zoomed = self.scene.camera.zoom(self.factor, self.middle)
         return {"whole": self.scene, "zoomed": self.scene._replace(camera=zoomed)}
-
-
-def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) -> jv.Volume:
-    """The part of a volume between two corners, given as fractions of its sides."""
-    first, last = (
-        [int(part * n) for part, n in zip(corner, volume.shape, strict=True)] for corner in (low, high)
-    )
-    part = np.asarray(volume.data)[tuple(map(slice, first, last))]
-    origin = np.asarray(volume.origin) + np.array(first) * np.asarray(volume.spacing)
-    return jv.Volume(part, volume.spacing, origin)
 
 
 def camera(volume: jv.Volume, chosen: Namespace, direction: tuple, up: tuple = (0, 0, 1)) -> jv.Camera:
@@ -115,11 +105,6 @@ def vessels(chosen: Namespace) -> View:
     seen = camera(volume, chosen, (0.5, -1, 0.6)).zoom(1.5, (0.5, 0.52))
     transfer = jv.TransferFunction.from_points(CONTRAST, unit_distance=0.03)
     return View(Scene(volume, transfer, seen, 2 * float(volume.spacing[0])), 6, (0.5, 0.84))
-
-
-def entered(scene: Scene) -> np.ndarray:
-    """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
-    return np.asarray(frame(scene, jv.March(scene.step, max_samples=1)).rgba[..., 3] > 0)
 
 
 def left(scene: Scene) -> np.ndarray:
