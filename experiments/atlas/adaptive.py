@@ -54,7 +54,6 @@ TOLERANCE = Entry(
     metric="RMSE of the image / tolerance",
     judged="finest=1",
     limit=1.0,
-    outcome="documented",
     does="No cell is shorter than step / finest: below the error of an image of such cells the tolerance "
     "means nothing. A larger finest moves the edge.",
     picture=lambda tolerance, size: signed(
@@ -114,7 +113,6 @@ LIGHT = Entry(
     metric="RMSE of the image / tolerance",
     judged="lit",
     limit=1.0,
-    outcome="documented",
     does="Strides follow from values and transfer function alone, so that in a cube of one value all cells "
     "are as long as allowed, whatever the tolerance: without light that is exact, with light it is "
     "not. Rendering.error does not count it.",

@@ -15,7 +15,6 @@ from .entry import Entry
 SHAPE = 24, 32, 48
 BRICKS = 1, 1, 3
 STEP = 1.5
-LEVEL = 1 / 255
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 SIZE, ACROSS = 24, 90.0
 """Pixels along a side, and mm across the image."""
@@ -77,8 +76,6 @@ ORDER = Entry(
     measure=ordered,
     metric="largest error of a pixel",
     judged="naive",
-    limit=LEVEL,
-    outcome="documented",
     does="A ray that leaves a brick and comes back passes another one between. Shown at once (naive), both "
     "parts of it in the first brick are blended at once, and what lies between them after or before both. "
     '"overlap" and "reload" keep the order of the samples, and their error is that of rounding.',

@@ -19,6 +19,9 @@ Curves = dict[str, float]
 """Measured numbers at one value of the regime, by name."""
 
 
+LEVEL = 1 / 255
+
+
 class Entry(NamedTuple):
     """One way in which a method fails.
 
@@ -28,8 +31,8 @@ class Entry(NamedTuple):
     - `regime`: what is swept, with its unit. `values`: from harmless to harmful.
     - `measure`: from a value and the number of pixels along a side to the measured numbers.
     - `metric`: what these numbers are. `judged`: the name of the one that finds the edge.
-    - `limit`: up to which that number counts as good; NaN never does.
-    - `outcome`, `does`: what jaxvol does, in a word and in a sentence.
+    - `does`: what jaxvol does, in a sentence; `outcome`: in a word.
+    - `limit`: up to which that number counts as good, by default one level of 8 bits; NaN never does.
     - `picture`: linear RGB image at a value, in [0, 1], where an image is measured; `shows`: what it shows.
     - `pictured`: the two values; by default the last one within the limit and the last one of all.
     - `said`: the name of the number by which jaxvol says that it fails (1) or not (0).
@@ -45,9 +48,9 @@ class Entry(NamedTuple):
     measure: Callable[[float, int], Curves]
     metric: str
     judged: str
-    limit: float
-    outcome: Outcome
     does: str
+    outcome: Outcome = "documented"
+    limit: float = LEVEL
     picture: Callable[[float, int], np.ndarray] | None = None
     shows: str = ""
     pictured: tuple[float, float] | None = None

@@ -13,7 +13,6 @@ from jaxvol.metrics import boundary_noise
 from .entry import Entry, along_z, colors, cube, opacities, ray_opacities, rms, signed, uniform
 
 
-LEVEL = 1 / 255
 SEED = 0
 
 
@@ -55,8 +54,6 @@ CUT = Entry(
     measure=cut_faces,
     metric="noise on the face, standard deviation",
     judged="Jitter",
-    limit=LEVEL,
-    outcome="documented",
     does="Jitter leaves out the first ξ d of the material. With front_residual the noise is smaller; under "
     "EmptySpaceJitter, rays on the face are not shifted before they leave the material, and it stays smooth.",
     picture=lambda step, size: cut_face(step, size, "Jitter"),
@@ -104,8 +101,6 @@ LABELS = Entry(
     measure=label_faces,
     metric="RMSE of the opacity behind the face",
     judged="AlphaCorrection()",
-    limit=LEVEL,
-    outcome="documented",
     does="Without labels=True a structure is as thick as its whole cells, which jitter moves. With it, "
     "cells are cut at the face, and the error is that of rounding.",
     picture=lambda depth, size: signed(label_face(depth, size, cut=False), 0.2),
@@ -156,7 +151,6 @@ FACES = Entry(
     metric="relative error of the derivative by the angle of a ray",
     judged="AlphaCorrection(labels=True)",
     limit=0.1,
-    outcome="documented",
     does="Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the "
     "exit. Finite differences of the same image, whose cells are cut at the face, are right.",
     scales=("linear", "log"),
@@ -193,8 +187,6 @@ BEHIND = Entry(
     measure=behind_cuts,
     metric="noise of the opacity, standard deviation; with AlphaCorrection, its RMSE",
     judged="EmptySpaceJitter",
-    limit=LEVEL,
-    outcome="documented",
     does="Rays are shifted in the gap, so that the face behind it lies where the next sample happens to be, "
     "and material there is as thick as its whole cells. AlphaCorrection cuts them at the face, and the error "
     "is that of rounding. Cut faces that a ray meets first are smooth without it.",

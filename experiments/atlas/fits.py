@@ -108,7 +108,6 @@ STARTS = Entry(
     metric="RMSE of the fitted image",
     judged="RMSE after 30 steps",
     limit=0.001,
-    outcome="documented",
     does="A ray that is opaque from its first cell on shows nothing of what lies behind, and has no "
     "gradient by it: the fit ends in another minimum, or stalls. Start transparent, as jv.flat_grey "
     "does.",

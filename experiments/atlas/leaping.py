@@ -78,7 +78,6 @@ LOST = Entry(
     metric="share of the sheet's pixels that are wrong",
     judged="min_distance, R = 16",
     limit=0.001,
-    outcome="documented",
     does='Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R '
     'no larger than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which '
     "lose nothing.",
@@ -178,7 +177,6 @@ LEAPT = Entry(
     metric="relative error of the gradient",
     judged="SpaceLeaping",
     limit=0.05,
-    outcome="documented",
     does="What has any extinction above 0 is marched and has its gradient; what has none is leapt over and "
     "has none, although it would. A fit that should make invisible regions visible must start above "
     "0, or not leap.",

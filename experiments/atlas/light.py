@@ -41,7 +41,6 @@ ENERGY = Entry(
     metric="energy of a template that begins with 1",
     judged="printed, without flights",
     limit=1.0,
-    outcome="documented",
     does="Equations (1) to (3) of the paper, to the letter, pass on α I where (1 - α) I is left: without the "
     "factors of flight, energy grows as α / (1 - α). The default form, conserving, never exceeds 1.",
     scales=("linear", "log"),
@@ -73,7 +72,6 @@ LOPSIDED = Entry(
     metric="distance of the centre of light from the sample, mean free paths",
     judged="one template",
     limit=1.0,
-    outcome="documented",
     does="One packet goes one way, and so does all that comes of it. By default there are four, spread "
     "evenly, which still lean by 0.6 mean free paths at an opacity of 0.4; blending templates takes "
     "off most of that.",
@@ -140,7 +138,6 @@ LONG = Entry(
     metric="difference from path tracing (radiance: powers of 2)",
     judged="pixels, scaled alike",
     limit=0.25,
-    outcome="documented",
     does="The sum of all radiance stays near that of path tracing. But photons of a template lie outside a "
     "ball that is thin against the mean free path, on all sides alike, so that its lit side is no "
     "longer where it was.",
@@ -160,7 +157,6 @@ SHORT = Entry(
     metric="difference from path tracing (radiance: powers of 2)",
     judged="total radiance",
     limit=0.35,
-    outcome="documented",
     does="A sphere of white matter is too dark by a quarter to a third, once it is several mean free paths "
     "thick: the template of a sample near a curved face has more photons outside than on the flat one "
     "that set its scale.",

@@ -50,7 +50,6 @@ OPAQUE = Entry(
     metric="error",
     judged="gradient, relative",
     limit=0.1,
-    outcome="documented",
     does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 "
     "cannot tell from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not "
     "move.",
@@ -227,7 +226,6 @@ TERMINATION = Entry(
     metric="error (of gradients: relative)",
     judged="opaque: gradient",
     limit=0.05,
-    outcome="documented",
     does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T "
     "log(1/T) of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or "
     "none.",

@@ -60,8 +60,6 @@ HALVES = Entry(
     measure=halves,
     metric="RMSE of the image",
     judged="bfloat16",
-    limit=1 / 255,
-    outcome="documented",
     does="A voxel keeps its type: 8 significant bits in bfloat16, 11 in float16, so that values around "
     "1000 (CT in Hounsfield units + 1000) are rounded to multiples of 4 and of 0.5. float16 ends at "
     "65504, and Volume refuses what is infinite (crosses). Integers of 16 bits keep all of it.",
@@ -121,7 +119,6 @@ EXHAUSTED = Entry(
     measure=long,
     metric="error of the opacity",
     judged="float32",
-    limit=1 / 255,
     outcome="detected and said",
     does="What lies behind the last sample is missing, and Rendering.exhausted marks the ray.",
     said="exhausted",

@@ -78,7 +78,6 @@ GAPS = Entry(
     metric="share of the gap that is taken for material; share of rays",
     judged="share of the gap",
     limit=0.05,
-    outcome="documented",
     does="Gaps are found ray by ray, whatever the step of the march, by steps that cannot pass a face. A ray "
     "that is nowhere farther outside than some roundings of float32 counts as inside.",
     picture=gap_picture,

@@ -71,7 +71,6 @@ HAZE = Entry(
     metric="wood grain energy / that of ray casting",
     judged="EmptySpaceJitter",
     limit=0.1,
-    outcome="documented",
     does="A ray that meets no transparent sample is not shifted: the wood grain that is left is the share "
     "of such rays. Jitter breaks it there, too.",
     picture=lambda share, size: signed(haze_error(share, size, "EmptySpaceJitter"), 0.05),
@@ -134,7 +133,6 @@ SHEETS = Entry(
     metric="share of pixels that miss the sheet",
     judged="Jitter",
     limit=0.001,
-    outcome="documented",
     does="A sheet thinner than a step is met by as many rays as it is thick, in steps: as bands without "
     "jitter, as noise with it. No quadrature sees what lies between two samples alike; a shorter step "
     "does.",
@@ -154,7 +152,6 @@ SURFACES = Entry(
     metric="share of pixels that miss the sheet",
     judged="EmptySpaceJitter",
     limit=0.001,
-    outcome="documented",
     does="A cell that begins before the sheet and ends behind it has both ends below the value: rays miss a "
     "sheet by as much as it is thinner than a step, in bands without jitter, as noise with it. A shorter "
     "step sees it.",
