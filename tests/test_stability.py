@@ -45,7 +45,7 @@ def test_an_edge_is_the_first_value_beyond_the_limit():
 
 def test_record_and_page_hold_every_entry_with_the_edge_of_its_own_curve(tmp_path):
     some = dict(list(RECORDED.items())[:2])  # the documentation's build draws all
-    stability.draw({"entries": some}, record.RESULTS / "stability", tmp_path / "stability.png")
+    stability.draw({"entries": some}, tmp_path / "stability.png")
     text = (tmp_path / "stability.html").read_text(encoding="utf-8")
     assert list(RECORDED) == list(atlas.ENTRIES)
     assert text.count("data:image/webp") == 2 * sum(atlas.ENTRIES[name].picture is not None for name in some)
