@@ -9,9 +9,8 @@ interpolation, and for the cells of a ray that are taken at a time. The best spl
 from several sides: whether a ray comes back to a brick depends on where it comes from.
 
 Before each frame the file is dropped from the system's page cache, where the system can do that, so that
-frames read from the disk. Ranges of values are found before the first frame. A split into many bricks is
-timed once. `--only` measures some splits anew and keeps what the record says of the others, with the commit
-that they are of.
+frames read from the disk. A split into many bricks is timed once. `--only` measures some splits again and
+keeps what the record says of the others, with the commit that they are of.
 """
 
 import os
@@ -28,10 +27,11 @@ from matplotlib.ticker import NullFormatter
 import jaxvol as jv
 from jaxvol.bricks import VoxelSource, overlap_of, share, source_of
 
-from . import bricks_paper, common, record, timing
+from . import bricks_paper, charts, record, timing
 from .bricks_paper import BEST, TABLE, Split
-from .common import plt
+from .harness import experiment, recorded, show, some_of
 from .naive_bricks import each_at_once
+from .scan_conversion import BODY
 
 
 METHODS: dict[str, Any] = {"overlap": "overlap", "reload": "reload", "naive": each_at_once}
@@ -39,8 +39,6 @@ SCALE = 0.17
 """Of the probe, so that the fetus lies within the scan."""
 MANY = 100
 """From so many bricks on, a split is timed once, after a warm frame."""
-TISSUE = [(50, (0.1, 0.04, 0.03), 0.0), (90, (0.8, 0.5, 0.35), 0.1), (170, (1.0, 0.9, 0.8), 0.5)]
-"""A transfer function of the phantom: skin and bone in clear fluid."""
 
 EYES: dict[str, tuple[float, float, float]] = {
     "across": (0, -290, 40),
@@ -51,7 +49,7 @@ EYES: dict[str, tuple[float, float, float]] = {
 """Where the camera is, mm. Across and along the fan, rays pass the curved faces at small angles."""
 VIEW = "across"
 FROM = f"{','.join(map(str, BEST))} from"
-QUICK: list[Split] = [(2, 1, 2)]
+WHOLE = "whole"
 
 
 class Scan(NamedTuple):
@@ -92,7 +90,7 @@ def stored(folder: Path, resolution: int) -> Scan:
     volume, probe = phantom(resolution)
     path = folder / "fetus.npy"
     np.save(path, np.asarray(volume.data))
-    return Scan(path, source_of(path), probe, jv.TransferFunction.from_points(TISSUE))
+    return Scan(path, source_of(path), probe, jv.TransferFunction.from_points(BODY))
 
 
 def forget(path: Path) -> None:
@@ -116,9 +114,6 @@ def whole(scan: Scan, view: jv.Camera) -> jv.Rendering:
     return jv.render(volume, scan.transfer, view, scan.march, outputs="rgba")
 
 
-WHOLE = "whole"
-
-
 def compared(
     scan: Scan, view: jv.Camera, split: Split, repetitions: int, truth: np.ndarray
 ) -> dict[str, dict[str, Any]]:
@@ -133,12 +128,12 @@ def compared(
     programs[WHOLE] = lambda: whole(scan, view).rgba
     seconds = timing.interleaved(programs, repetitions)
     voxels = np.prod(scan.source.shape) * np.dtype(np.float32).itemsize
-    rows: dict[str, dict[str, Any]] = {WHOLE: {"seconds": median(seconds[WHOLE])}}
+    rows: dict[str, dict[str, Any]] = {WHOLE: {"seconds": timing.median(seconds[WHOLE])}}
     for method in METHODS:
         report = found[method].bricks
         assert report is not None
         rows[method] = {
-            "seconds": median(seconds[method]),
+            "seconds": timing.median(seconds[method]),
             "ratio to overlap": timing.ratio(seconds[method], seconds["overlap"]),
             "needed": report.needed,
             "loads": report.loads,
@@ -150,17 +145,13 @@ def compared(
     return rows
 
 
-def median(seconds: list[float]) -> float:
-    return round(float(np.median(seconds)), 5)
-
-
 def named(split: Split) -> str:
     return ",".join(map(str, split))
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """The paper's rates and ours, against overlap and against loads."""
-    figure, axes = plt.subplots(2, 2, figsize=(10, 7), layout="constrained")
+    figure, axes = charts.panels(2, 2, 10, 7)
     rows = result["splits"]
     styles = {"overlap": "C0o", "reload": "C1s", "naive": "C3x"}
     paper = {name: row["paper"] for name, row in rows.items() if "paper" in row}
@@ -199,26 +190,23 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[0, 1].set_title("the paper's rates; named: slow although below 3 %", fontsize=9)
     for panel in axes[1]:
         panel.set_title("measured here", fontsize=9)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "bricks",
     "What do bricks of an ultrasound scan cost, by how it is split, and does overlap save time?",
     __doc__,
+    draw,
     repetitions=5,
     size=64,
     resolution=320,
-    only=common.some_of([named(split) for split in TABLE], "SPLIT"),
+    only=some_of([named(split) for split in TABLE], "SPLIT"),
+    quick={"size": 16, "resolution": 48, "repetitions": 1, "only": ["2,1,2"]},
 )
-def main(chosen: Namespace) -> common.Answer:
-    splits = [split for split in TABLE if named(split) in chosen.only]
-    views = [view for view in EYES if view != VIEW and BEST in splits]
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.repetitions = 16, 48, 1
-        splits, views = QUICK, []
+def main(chosen: Namespace) -> dict[str, Any]:
+    splits = {name: split for split in TABLE if (name := named(split)) in chosen.only}
     rows: dict[str, Any] = {}
-    from_: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         scan = stored(Path(folder), chosen.resolution)
 
@@ -226,50 +214,33 @@ def main(chosen: Namespace) -> common.Answer:
             repetitions = chosen.repetitions if np.prod(split) < MANY else 1
             seen = camera(view, chosen.size)
             found = compared(scan, seen, split, repetitions, np.asarray(whole(scan, seen).rgba))
-            line = ", ".join(
-                f"{m} {found[m]['seconds']:.3f} s, {found[m]['loads']} loads, "
-                f"{found[m]['read, times the volume']:.2f} read"
-                for m in METHODS
-            )
-            print(f"{named(split):8} {view}: {line}", flush=True)
+            show(found, named(split), view)
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
-        for split in splits:
-            grid = bricks_paper.grid(scan.source.shape, split)
-            rows[named(split)] = {
-                **({"paper": TABLE[split]._asdict()} if split in TABLE else {}),
+        for name, split in splits.items():
+            overlap = overlap_of(scan.probe, bricks_paper.grid(scan.source.shape, split))
+            rows[name] = {
+                "paper": TABLE[split]._asdict(),
                 "formula": round(bricks_paper.overlap(split), 3),
-                "formula, of these voxels": round(
-                    100 * share(overlap_of(scan.probe, grid), scan.source.shape[2]), 3
-                ),
+                "formula, of these voxels": round(100 * share(overlap, scan.source.shape[2]), 3),
                 **measure(split, VIEW),
             }
-        for view in views:
-            from_[view] = measure(BEST, view)
-    about = {
-        "image": [chosen.size] * 2,
-        "voxels": list(scan.source.shape),
-        "step, mm": round(scan.step, 5),
+        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits.values()}
+        about = {
+            "image": [chosen.size] * 2,
+            "voxels": list(scan.source.shape),
+            "step, mm": round(scan.step, 5),
+        }
+    others = [name for name in map(named, TABLE) if name not in rows]
+    rows |= recorded("bricks", chosen, "splits", others, about)
+    if not views and not chosen.quick and (path := chosen.output / "bricks.json").is_file():
+        views = record.read(path)["result"][FROM]
+    return {
+        **about,
         "view": VIEW,
+        "splits": {name: rows[name] for name in map(named, TABLE) if name in rows},
+        FROM: views,
     }
-    kept, kept_from = recorded(chosen, about)
-    rows = {name: (rows | kept)[name] for name in (*map(named, TABLE), *rows) if name in rows | kept}
-    result = {**about, "splits": rows, FROM: from_ or kept_from}
-    return result, partial(draw, result)
-
-
-def recorded(chosen: Namespace, about: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What the record in the output says of the splits that are not chosen, with the commit and the command
-    that measured them, and of the views; nothing if quick, or of another image or scan."""
-    path = chosen.output / "bricks.json"
-    if chosen.quick or not path.is_file():
-        return {}, {}
-    found = record.read(path)
-    if any(found["result"][name] != value for name, value in about.items()):
-        return {}, {}
-    made = {"commit": found["commit"], "command": found["command"]}
-    splits = found["result"]["splits"].items()
-    return {n: {"measured": made, **row} for n, row in splits if n not in chosen.only}, found["result"][FROM]
 
 
 if __name__ == "__main__":

@@ -24,14 +24,11 @@ import tempfile
 import time
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from . import common, timing
-from .common import plt
+from . import charts, timing
+from .harness import data, experiment, geometric_mean, show, some_of
 from .scenes import PHANTOM, SCENES
 
 
@@ -131,7 +128,7 @@ def ratios(taken: dict[str, dict[str, list[float]]], base: str) -> dict[str, dic
     """By program and commit, its time and its ratio to the baseline's, where that has the program."""
     return {
         program: {
-            commit: {"seconds": round(float(np.median(seconds)), 5), **timing.ratio(seconds, of[base])}
+            commit: {"seconds": timing.median(seconds), **timing.ratio(seconds, of[base])}
             for commit, seconds in of.items()
         }
         for program, of in taken.items()
@@ -147,43 +144,42 @@ def means(found: dict[str, dict[str, dict[str, float]]]) -> dict[str, dict[str, 
             kind = kinds.setdefault(program.rpartition(": ")[2], {})
             kind.setdefault(commit, []).append(row["median"])
     return {
-        kind: {commit: common.geometric_mean(ratios) for commit, ratios in of.items()}
-        for kind, of in kinds.items()
+        kind: {commit: geometric_mean(ratios) for commit, ratios in of.items()} for kind, of in kinds.items()
     }
 
 
-def draw(found: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
-    figure, panel = plt.subplots(figsize=(7, 0.28 * len(found) + 1.2), layout="constrained")
+def draw(result: dict[str, Any], path: Path) -> None:
+    found = result["programs"]
+    figure, ((panel,),) = charts.panels(1, 1, 7, 0.28 * len(found) + 1.2)
     base, *others = next(iter(found.values()))
     for y, of in enumerate(found.values()):
         for number, commit in enumerate(others):
-            if commit not in of:
-                continue
-            row, place = of[commit], y + 0.15 * (number - (len(others) - 1) / 2)
-            panel.plot((row["low"], row["high"]), (place, place), color=f"C{number}", linewidth=2, alpha=0.5)
-            panel.plot(row["median"], place, "o", color=f"C{number}", label=commit if y == 0 else None)
+            if commit in of:
+                place = y + 0.15 * (number - (len(others) - 1) / 2)
+                charts.interval(panel, of[commit], place, f"C{number}", commit if y == 0 else None)
     panel.axvline(1, color="k", linewidth=0.8)
     panel.set_yticks(range(len(found)), list(found), fontsize=8)
     panel.invert_yaxis()
     panel.set_xlabel(f"time / that of {base}: median of paired ratios, 95 % interval", fontsize=9)
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "compare",
     "Is one commit slower than another?",
     __doc__,
+    draw,
     commits={"nargs": "+", "metavar": "COMMIT", "help": "the baseline first; WORKTREE: files as they are"},
     size=512,
     repetitions=11,
     kinds={"nargs": "+", "choices": KINDS, "default": list(KINDS[:3]), "help": "default: all but first"},
-    only=common.some_of(SCENES, "VOLUME"),
+    only=some_of(SCENES, "VOLUME"),
+    quick={"size": 32, "repetitions": 2},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, names = common.available(chosen, PHANTOM)
-    if chosen.quick:
-        chosen.size, chosen.repetitions = 32, 2
+def main(chosen: Namespace) -> dict[str, Any]:
+    folder = data()
+    names = [PHANTOM] if folder is None or chosen.quick else chosen.only
     with tempfile.TemporaryDirectory(prefix="compare-") as temporary:
         trees = {commit: checked_out(commit, Path(temporary)) for commit in chosen.commits}
         taken: dict[str, dict[str, list[float]]] = {}
@@ -200,16 +196,11 @@ def main(chosen: Namespace) -> common.Answer:
         if "first" in chosen.kinds:
             taken[f"{names[0]}: first"] = first_images(trees, folder, names[0], chosen.size)
     found = ratios(taken, chosen.commits[0])
-    for program, of in found.items():
-        for commit, row in of.items():
-            print(
-                f"{program:26} {commit:12} {row['seconds']:8.4f} s  {row['median']:.3f}"
-                f"  [{row['low']:.3f}, {row['high']:.3f}]"
-            )
-    for kind, of in (mean := means(found)).items():
-        print(f"{kind}: geometric means {of}")
-    result: dict[str, Any] = {"size": chosen.size, "repetitions": chosen.repetitions}
-    return {**result, "geometric means": mean, "programs": found}, partial(draw, found)
+    mean = means(found)
+    show(found)
+    show(mean, "geometric means")
+    sizes = {"size": chosen.size, "repetitions": chosen.repetitions}
+    return {**sizes, "geometric means": mean, "programs": found}
 
 
 if __name__ == "__main__":

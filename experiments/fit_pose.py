@@ -8,7 +8,6 @@ first, since a derivative describes only features that move by less than their o
 
 import time
 from argparse import Namespace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,8 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common, fit_transfer
-from .common import plt
+from . import charts, fit_transfer
+from .harness import experiment, show
 
 
 ANGLE, SHIFT = 10.0, 0.05
@@ -70,9 +69,9 @@ def reached(rows: list[dict[str, Any]]) -> float:
     return float(np.mean([all(row[key] < goal for key, goal in GOALS.items()) for row in rows]))
 
 
-def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
-    for (name, rows), color in zip(result.items(), ("C0", "C3"), strict=True):
+def draw(result: dict[str, Any], path: Path) -> None:
+    figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
+    for (name, rows), color in zip(result["starts"].items(), ("C0", "C3"), strict=True):
         label = f"{name}: {reached(rows):.0%} of starts lead back"
         for number, row in enumerate(rows):
             losses, label = row["losses"], label if number == 0 else None
@@ -80,43 +79,37 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
         degrees, shift = ([row[key] for row in rows] for key in GOALS)
         right.loglog(degrees, shift, "o", color=color, alpha=0.6)
     left.set(xlabel="step, those of all stages together", ylabel="mean squared difference of the images")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    charts.legend_below(figure, left, 2)
     right.plot(ANGLE, SHIFT, "k*", markersize=10)
     right.axvline(GOALS["degrees"], color="k", linestyle=":", linewidth=0.8)
     right.axhline(GOALS["shift"], color="k", linestyle=":", linewidth=0.8)
     right.set(xlabel="rotation left, degrees", ylabel="shift left / distance to focal point")
     right.set_title("after the last step; star: the start, dotted: what counts as led back", fontsize=8)
     left.set_title("a line for each of the starts", fontsize=8)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "fit_pose",
     "Is a camera's pose found from one image, from 10° and 5 % off?",
     __doc__,
+    draw,
     size=96,
     resolution=96,
     starts=10,
+    quick={"size": 32, "resolution": 24, "starts": 2},
 )
-def main(chosen: Namespace) -> common.Answer:
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.starts = 32, 24, 2
-
-    result = measure(chosen.size, chosen.resolution, chosen.starts, chosen.seed)
-    for name, rows in result.items():
-        worst = {key: max(row[key] for row in rows) for key in GOALS}
-        print(
-            f"{name:20} {reached(rows):.0%} of {len(rows)} starts lead back to {GOALS['degrees']}° and"
-            f" {GOALS['shift']:.1%}; worst {worst['degrees']:.4f}° and {worst['shift']:.3%},"
-            f" {np.mean([row['steps'] for row in rows]):.1f} steps"
-        )
-    return {
+def main(chosen: Namespace) -> dict[str, Any]:
+    starts = measure(chosen.size, chosen.resolution, chosen.starts, chosen.seed)
+    result = {
         "image": [chosen.size] * 2,
         "resolution": chosen.resolution,
         "goals": GOALS,
-        "reached": {name: reached(rows) for name, rows in result.items()},
-        "starts": result,
-    }, partial(draw, result)
+        "reached": {name: reached(rows) for name, rows in starts.items()},
+        "starts": starts,
+    }
+    show(result["reached"], "share of starts that lead back")
+    return result
 
 
 if __name__ == "__main__":

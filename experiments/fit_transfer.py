@@ -4,14 +4,11 @@ A hidden transfer function of eight points renders four reference images of a vo
 a fit recovers colours and extinction by Levenberg–Marquardt: once at the points of the truth, and once at 32
 evenly spaced points, as if nothing were known of the truth. The result is judged by the PSNR of held-out
 views.
-
-Scenes are the head phantom and, if JAXVOL_DATA names the folder of real volumes, the engine.
 """
 
 import time
 import warnings
 from argparse import Namespace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,8 +17,8 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import psnr
 
-from . import common
-from .common import plt
+from . import charts, harness
+from .harness import experiment, show
 
 
 GOAL = 40.0
@@ -120,11 +117,10 @@ UNDER: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 8}
 """Where the text of a line stands."""
 
 
-def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
-    figure, axes = plt.subplots(
-        len(result), 2, figsize=(9, 3 * len(result)), squeeze=False, layout="constrained"
-    )
-    for (left, right), (scene, rows) in zip(axes, result.items(), strict=True):
+def draw(result: dict[str, Any], path: Path) -> None:
+    scenes = result["scenes"]
+    figure, axes = charts.panels(len(scenes), 2, 9, 3 * len(scenes))
+    for (left, right), (scene, rows) in zip(axes, scenes.items(), strict=True):
         truth = rows["truth"]
         right.plot(truth["values"], truth["extinction"], "k-", linewidth=3, alpha=0.3, label="the truth")
         for name, style in ((KNOWN, "C0.-"), (EVEN, "C3.-")):
@@ -139,40 +135,25 @@ def draw(result: dict[str, dict[str, Any]], path: Path) -> None:
         left.set(xlabel="step of the fit", ylabel=f"{scene}\nPSNR of the views seen, dB")
         right.set(xlabel="value", ylabel="extinction, 1/length")
         right.legend(fontsize=8)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "fit_transfer",
     "Is a transfer function recovered from four views, and do other views agree?",
     __doc__,
+    draw,
     size=96,
     resolution=96,
+    quick={"size": 24, "resolution": 24},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, names = common.data(), list(SCENES)
-    if folder is None or chosen.quick:
-        names = names[:1]
-    if chosen.quick:
-        chosen.size, chosen.resolution = 24, 24
-
-    result = {}
-    for name in names:
-        result[name] = measure(SCENES[name](folder, chosen.resolution), chosen.size)
-        for points in (KNOWN, EVEN):
-            row = result[name][points]
-            print(
-                f"{name:14} {points:20} {row['steps']:3} steps  held out {min(row['psnr held out']):6.2f} dB"
-                f" (start {min(row['psnr at the start']):5.2f}, goal {GOAL:g})"
-                f"  {row['seconds with compilation']:.1f} s  {row['message']}",
-                flush=True,
-            )
-    return {
-        "image": [chosen.size] * 2,
-        "resolution": chosen.resolution,
-        "goal": GOAL,
-        "scenes": result,
-    }, partial(draw, result)
+def main(chosen: Namespace) -> dict[str, Any]:
+    folder, scenes = harness.data(), {}
+    for name, make in SCENES.items():
+        if make is head or (folder is not None and not chosen.quick):
+            scenes[name] = measure(make(folder, chosen.resolution), chosen.size)
+            show(scenes[name], name)
+    return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "goal": GOAL, "scenes": scenes}
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import common, marches
+from . import harness, marches, timing
 from .scenes import seen_head
 
 
@@ -52,7 +52,7 @@ def measure(size: int, resolution: int, left: float, repetitions: int) -> dict[s
     """Seconds from the start of a process until the import, the scene and the image are done."""
     volume = jv.phantom("head", resolution)
     scene = seen_head(volume, size)
-    truth = common.frame(scene, marches.converged(scene.step, common.FINER)).rgba
+    truth = harness.frame(scene, marches.converged(scene.step, harness.FINER)).rgba
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         voxels, image, cache = (Path(folder) / name for name in ("voxels.npy", "image.npy", "cache"))
@@ -76,7 +76,7 @@ def measure(size: int, resolution: int, left: float, repetitions: int) -> dict[s
         for name, more in (("nothing kept", {}), ("compiled before", warm)):
             times = [child(more) for _ in range(repetitions)]
             found[name] = {
-                **{part: round(float(np.median([t[part] for t in times])), 3) for part in times[0]},
+                **{part: timing.median([t[part] for t in times]) for part in times[0]},
                 "all": times,
                 "rmse": rmse(np.load(image), truth),
             }

@@ -15,7 +15,6 @@ the larger of the two, over several weightings of the image and directions of ea
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +27,8 @@ from matplotlib.colors import LogNorm
 
 import jaxvol as jv
 
-from . import common
-from .common import plt
+from . import charts
+from .harness import experiment
 
 
 STEP = 0.11
@@ -162,19 +161,13 @@ def _relative(integrals: Sequence[np.ndarray], changes: Sequence[np.ndarray]) ->
     return float(np.linalg.norm(integral - change) / largest)
 
 
-def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path) -> None:
+def draw(result: dict[str, Any], path: Path) -> None:
     """A heat map of marches by leaves, for each quadrature and width."""
-    names, leaves = list(next(iter(result.values()))), list(LEAVES)
-    figure, axes = plt.subplots(
-        len(result),
-        len(widths),
-        figsize=(4.2 * len(widths) + 1.6, (0.27 * len(names) + 1.2) * len(result)),
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-        layout="constrained",
-    )
-    for line, (quadrature, rows) in zip(axes, result.items(), strict=True):
+    found, widths = result["relative errors"], result["widths"]
+    names, leaves = list(next(iter(found.values()))), list(LEAVES)
+    width, height = 4.2 * len(widths) + 1.6, (0.27 * len(names) + 1.2) * len(found)
+    figure, axes = charts.panels(len(found), len(widths), width, height, sharex=True, sharey=True)
+    for line, (quadrature, rows) in zip(axes, found.items(), strict=True):
         for number, (panel, width) in enumerate(zip(line, widths, strict=True)):
             errors = np.array(
                 [[rows[name].get(leaf, [np.nan] * 3)[number] for leaf in leaves] for name in names]
@@ -193,39 +186,49 @@ def draw(result: dict[str, dict[str, Any]], widths: Sequence[float], path: Path)
         f"|sum - change| / the larger one.\n{NOTE}",
         fontsize=9,
     )
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
-    "gradient_errors", "Which gradients are wrong without AlphaCorrection, per transform?", __doc__, size=6
+@experiment(
+    "gradient_errors",
+    "Which gradients are wrong without AlphaCorrection, per transform?",
+    __doc__,
+    draw,
+    size=6,
+    names=tuple(marches()),
+    leaves=tuple(LEAVES),
+    quadratures=("left", "midpoint"),
+    widths=tuple(WIDTHS.items()),
+    quick={
+        "names": ("ray casting", f"ray casting{CUT}"),
+        "leaves": ("position", "colours"),
+        "quadratures": ("left",),
+        "widths": ((1e-5, 1), (1.0, 24)),
+    },
 )
-def main(chosen: Namespace) -> common.Answer:
-    names, leaves, widths = list(marches()), list(LEAVES), WIDTHS
-    quadratures = ["left", "midpoint"]
-    if chosen.quick:
-        names, leaves, quadratures = names[:2], ["position", "colours"], quadratures[:1]
-        widths = {1e-5: 1, 1.0: 24}
-
-    result: dict[str, dict[str, Any]] = {}
+def main(chosen: Namespace) -> dict[str, Any]:
+    found: dict[str, dict[str, Any]] = {}
+    widths = dict(chosen.widths)
     with jax.enable_x64(True):
-        for quadrature in quadratures:
-            result[quadrature] = {}
-            for name in names:
-                found = measure(name, quadrature, chosen.size, chosen.seed, leaves, widths)
-                result[quadrature][name] = found
-                summary = ", ".join(f"{leaf} {errors[-1]:.2g}" for leaf, errors in found.items())
-                print(f"{quadrature:8} {name:36} {summary}", flush=True)
+        for rule in chosen.quadratures:
+            found[rule] = {
+                name: measure(name, rule, chosen.size, chosen.seed, chosen.leaves, widths)
+                for name in chosen.names
+            }
     wrong = {
-        quadrature: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
-        for quadrature, rows in result.items()
+        rule: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
+        for rule, rows in found.items()
     }
+    for rule, of in wrong.items():
+        for name, leaves in of.items():
+            print(f"{rule}, {name}: {', '.join(leaves) or 'none'}")
     return {
         "image": [chosen.size] * 2,
         "widths": list(widths),
         "wrong from": WRONG,
         "wrong": wrong,
-        "relative errors": result,
-    }, partial(draw, result, list(widths))
+        "relative errors": found,
+    }
 
 
 if __name__ == "__main__":

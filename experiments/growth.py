@@ -8,7 +8,6 @@ ends early. Beside each time stands the image's RMSE against a converged one.
 
 from argparse import Namespace
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import common, timing
-from .common import plt
+from . import charts, harness, timing
+from .harness import experiment, show, some_of
 from .scenes import Scene, seen_head
 
 
@@ -59,23 +58,20 @@ def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions
         for size, scene in at.items()
         for method, transforms in METHODS.items()
     }
-    programs = {str(key): lambda of=of: common.image(*of) for key, of in marches.items()}
-    seconds = timing.interleaved(programs, repetitions)
-    finest = min(min(scene.step for scene in at.values()) / 2, SIDE / usual["samples"] / common.FINER)
+    drawn = {key: lambda of=of: harness.image(*of) for key, of in marches.items()}
+    seconds = timing.interleaved(drawn, repetitions)
+    finest = min(min(scene.step for scene in at.values()) / 2, SIDE / usual["samples"] / harness.FINER)
     # It may leap: if leaps skipped anything visible, the errors with and without leaping would differ.
     converged = jv.March(finest, (jv.SpaceLeaping(), jv.AlphaCorrection()), "midpoint")
     found: dict[str, Any] = {method: {} for method in METHODS}
     for size, scene in at.items():
-        truth = common.frame(scene, converged).rgba
+        truth = harness.frame(scene, converged).rgba
         for method in METHODS:
-            rendering = common.frame(*marches[size, method])
+            rendering = harness.frame(*marches[size, method])
             assert not np.any(rendering.exhausted)
-            mine, base = (seconds[str((size, name))] for name in (method, OFF))
-            row = common.row(mine, base, rmse(rendering.rgba, truth))
+            row = harness.row(seconds[size, method], seconds[size, OFF], rmse(rendering.rgba, truth))
             found[method][str(size)] = row | {"samples a ray": float(np.mean(rendering.samples))}
-    for method, rows in found.items():
-        found[method] = {"slope": slope(sizes, rows), "sizes": rows}
-    return found
+    return {method: {"slope": slope(sizes, rows), "sizes": rows} for method, rows in found.items()}
 
 
 def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
@@ -84,11 +80,9 @@ def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
     return round(float(np.polyfit(np.log(sizes[-3:]), np.log(times[-3:]), 1)[0]), 3)
 
 
-def draw(sweeps: dict[str, Any], path: Path) -> None:
-    size = (3.7 * len(sweeps), 3.6)
-    figure, (axes,) = plt.subplots(
-        1, len(sweeps), figsize=size, sharey=True, squeeze=False, layout="constrained"
-    )
+def draw(result: dict[str, Any], path: Path) -> None:
+    sweeps = result["sweeps"]
+    figure, (axes,) = charts.panels(1, len(sweeps), 3.7 * len(sweeps), 3.6, sharey=True)
     for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
         sizes = []
         for (method, found), style in zip(methods.items(), ("C7o-", "C0s-"), strict=True):
@@ -112,34 +106,25 @@ def draw(sweeps: dict[str, Any], path: Path) -> None:
     axes[0].set_ylabel("time of a frame, seconds", fontsize=9)
     figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes", fontsize=9)
     axes[0].yaxis.set_major_formatter("{x:g}")
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "growth",
     "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",
     __doc__,
+    draw,
     repetitions=5,
-    only=common.some_of(SWEEPS, "AXIS"),
+    only=some_of(SWEEPS, "AXIS"),
+    quick={"repetitions": 1},
 )
-def main(chosen: Namespace) -> common.Answer:
-    sweeps, usual = SWEEPS, USUAL
-    if chosen.quick:
-        chosen.repetitions, sweeps, usual = 1, TINY, {"pixels": 32, "voxels": 32, "samples": 32}
-
+def main(chosen: Namespace) -> dict[str, Any]:
+    sweeps, usual = (TINY, dict.fromkeys(USUAL, 32)) if chosen.quick else (SWEEPS, USUAL)
     found: dict[str, Any] = {}
     for along in chosen.only:
         found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
-        for method, sweep in found[along].items():
-            for size, row in sweep["sizes"].items():
-                print(
-                    f"{along:8} {size:>5}  {method:10} {row['seconds'] * 1e3:9.1f} ms"
-                    f"  {row['ratio']['median']:.3f} x no leaping  {row['samples a ray']:7.1f} samples a ray"
-                    f"  RMSE {row['rmse']:.5f}",
-                    flush=True,
-                )
-            print(f"{along:8} {method:10} grows as size^{sweep['slope']:.2f}", flush=True)
-    return {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found}, partial(draw, found)
+        show(found[along], along)
+    return {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found}
 
 
 if __name__ == "__main__":

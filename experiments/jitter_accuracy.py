@@ -21,11 +21,19 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
-from . import common, marches, timing
-from .common import plt
+from . import charts, marches, timing
+from .harness import entered, experiment, frame, show
+from .scenes import Scene, cropped
 
 
-METHODS = (marches.PLAIN, marches.JITTER, marches.EMPTY, marches.ALIGNED, marches.BOTH)
+METHODS = {
+    marches.PLAIN: "k-",
+    marches.JITTER: "C3--",
+    marches.EMPTY: "C0-",
+    marches.ALIGNED: "C2:",
+    marches.BOTH: "C1-.",
+}
+"""With their styles in the chart."""
 STEPS = (4.3, 2.3, 1.3, 0.7)
 """In voxels. Not whole or half ones: in the orthographic view the samples of all rays would then lie alike on
 nodes, or between them, which has an error of its own that jitter would seem to lower."""
@@ -39,17 +47,16 @@ PANELS = {
 }
 
 
-class Scene(NamedTuple):
-    """`grain` measures the wood grain of an error at a step; `face` is where the box cuts material."""
+class Faced(NamedTuple):
+    """A scene whose step is a voxel. `grain` measures the wood grain of an error at a step; `face` is where
+    the box cuts material."""
 
-    volume: jv.Volume
-    transfer: jv.TransferFunction
-    camera: jv.Camera
+    scene: Scene
     grain: Callable[[np.ndarray, float], float]
     face: np.ndarray
 
 
-def cut_block(resolution: int, size: int) -> Scene:
+def cut_block(resolution: int, size: int) -> Faced:
     volume = jv.phantom("cut_block", resolution)
     points = [(0.05, (0.33, 0.33, 0.33), 0.0), (1.0, (0.9, 0.9, 0.9), 0.45)]
     transfer = jv.TransferFunction.from_points(points, unit_distance=0.05)
@@ -64,52 +71,49 @@ def cut_block(resolution: int, size: int) -> Scene:
         frequency = comb_frequency(step, (rightwards * SLOPE, 0.0), 2 * scale / size)
         return wood_grain_energy(error[:, plane[0]], frequency)
 
-    return Scene(volume, transfer, camera, grain, x < -0.1)
+    return Faced(Scene(volume, transfer, camera, float(volume.spacing[0])), grain, x < -0.1)
 
 
-def head(resolution: int, size: int) -> Scene:
-    whole = jv.phantom("head", resolution)
-    volume = jv.Volume(np.asarray(whole.data)[..., : int(0.62 * resolution)], whole.spacing, whole.origin)
-    transfer = jv.preset("head", unit_distance=0.01)
+def head(resolution: int, size: int) -> Faced:
+    volume = cropped(jv.phantom("head", resolution), (0, 0, 0), (1, 1, 0.62))
     camera = jv.Camera.looking_at(volume, (0.5, -1, 0.75), size=(size, size)).zoom(1.7, (0.52, 0.46))
-    first = jv.render(volume, transfer, camera, jv.March(volume.spacing[0], max_samples=1))
-    face = np.asarray(first.rgba[..., 3] > 0)
+    scene = Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
+    face = entered(scene)
     below = int(np.flatnonzero(face.any(axis=1))[-1]) + 2  # below the cut face there is only skin
-    return Scene(volume, transfer, camera, lambda error, step: wood_grain_energy(error[below:]), face)
+    return Faced(scene, lambda error, step: wood_grain_energy(error[below:]), face)
 
 
 SCENES = {"cut block, orthographic": cut_block, "head, perspective": head}
 
 
-def measure(scene: Scene, steps: Sequence[float], repetitions: int, seed: int) -> list[dict[str, Any]]:
+def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> list[dict[str, Any]]:
     """One row for each step and march."""
-    voxel = float(scene.volume.spacing[0])
-
-    def frame(march: jv.March) -> jv.Rendering:
-        return jv.render(scene.volume, scene.transfer, scene.camera, march)
+    scene, grain, face = of
+    voxel = scene.step
 
     def image(rendering: jv.Rendering) -> np.ndarray:
         return np.asarray(rendering.rgba[..., :3], np.float64)
 
-    truth = image(frame(marches.converged(min(steps) * voxel)))
+    truth = image(frame(scene, marches.converged(min(steps) * voxel)))
     rows = []
     for step in steps:
         under = {name: jv.March(step * voxel, marches.transforms(name, seed)) for name in METHODS}
-        seconds = timing.interleaved({n: lambda m=m: frame(m) for n, m in under.items()}, repetitions)
+        drawn = {name: partial(frame, scene, march) for name, march in under.items()}
+        seconds = timing.interleaved(drawn, repetitions)
         for name, march in under.items():
-            rendering = frame(march)
+            rendering = frame(scene, march)
             assert not np.any(rendering.exhausted)
             error = image(rendering) - truth
             rows.append(
                 {
                     "step": step,
                     "march": name,
-                    "wood grain": scene.grain(error, step * voxel),
-                    "boundary noise": boundary_noise(error, scene.face),
+                    "wood grain": grain(error, step * voxel),
+                    "boundary noise": boundary_noise(error, face),
                     "rmse": float(np.sqrt(np.mean(error**2))),
-                    "rmse off the face": float(np.sqrt(np.mean(error[~scene.face] ** 2))),
+                    "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
                     "samples": int(np.sum(rendering.samples)),
-                    "seconds": float(np.median(seconds[name])),
+                    "seconds": timing.median(seconds[name]),
                     "time": timing.ratio(seconds[name], seconds[marches.PLAIN]),
                 }
             )
@@ -131,13 +135,12 @@ def compared(result: dict[str, list[dict[str, Any]]]) -> str:
     return f"RMSE off the cut face / ray casting: {over(marches.JITTER)}, {over(marches.EMPTY)}."
 
 
-def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    figure, axes = plt.subplots(
-        len(result), len(PANELS), figsize=(12, 2.9 * len(result)), squeeze=False, layout="constrained"
-    )
-    for line, (scene, rows) in zip(axes, result.items(), strict=True):
+def draw(result: dict[str, Any], path: Path) -> None:
+    scenes = {name: rows for name, rows in result.items() if name != "note"}
+    figure, axes = charts.panels(len(scenes), len(PANELS), 12, 2.9 * len(scenes))
+    for line, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for panel, (key, label) in zip(line, PANELS.items(), strict=True):
-            for name, style in zip(METHODS, ("k-", "C3--", "C0-", "C2:", "C1-."), strict=True):
+            for name, style in METHODS.items():
                 mine = [row for row in rows if row["march"] == name]
                 found = [row["time"]["median"] if key == "time" else row[key] for row in mine]
                 panel.plot([row["step"] for row in mine], found, style, marker=".", label=name)
@@ -149,39 +152,30 @@ def draw(result: dict[str, list[dict[str, Any]]], path: Path) -> None:
             panel.tick_params(labelsize=7, which="both")
             panel.xaxis.set_major_formatter("{x:g}")
         line[0].set_ylabel(scene, fontsize=9)
-    figure.suptitle(f"{NOTE} {compared(result)}", fontsize=9)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    common.save(figure, path)
+    figure.suptitle(result["note"], fontsize=9)
+    charts.legend_below(figure, axes[0, 0], 5)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "jitter_accuracy",
     "What do jitter and alignment do to wood grain, noise on cut faces, the whole error and the time?",
     __doc__,
+    draw,
     repetitions=5,
     size=192,
     resolution=128,
+    steps=STEPS,
+    quick={"size": 96, "resolution": 64, "repetitions": 1, "steps": (2.3, 1.9)},
 )
-def main(chosen: Namespace) -> common.Answer:
-    steps = STEPS
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.repetitions, steps = 96, 64, 1, (2.3, 1.9)
-
-    result = {
-        name: measure(make(chosen.resolution, chosen.size), steps, chosen.repetitions, chosen.seed)
-        for name, make in SCENES.items()
-    }
-    for name, rows in result.items():
-        print(name)
-        for row in rows:
-            print(
-                f"  step {row['step']:4} {row['march']:30} wood grain {row['wood grain']:9.2e}"
-                f"  boundary noise {row['boundary noise']:8.2e}"
-                f"  RMSE {row['rmse']:.5f}, off the face {row['rmse off the face']:.5f}"
-                f"  time {row['seconds'] * 1e3:7.1f} ms, {row['time']['median']:.3f} x ray casting"
-            )
-    print(NOTE, compared(result))
-    return {"note": f"{NOTE} {compared(result)}", **result}, partial(draw, result)
+def main(chosen: Namespace) -> dict[str, Any]:
+    result = {}
+    for name, make in SCENES.items():
+        scene = make(chosen.resolution, chosen.size)
+        result[name] = measure(scene, chosen.steps, chosen.repetitions, chosen.seed)
+        for row in result[name]:
+            show(row, name)
+    return {"note": f"{NOTE} {compared(result)}", **result}
 
 
 if __name__ == "__main__":

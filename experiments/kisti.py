@@ -15,8 +15,8 @@ The report tests early termination every 16 slices, since a test costs it more t
 Here rays that have ended are looked for between two segments of samples; so segments of 1, 4, 8 and 16
 samples are measured, each with the test and without.
 
-Steps are one voxel long. Rays end at 1 % of transmittance. Volumes are read from the folder that JAXVOL_DATA
-names; without one, the phantoms of a head and an engine stand in.
+Steps are one voxel long. Rays end at 1 % of transmittance. Without the folder JAXVOL_DATA of real volumes,
+the phantoms of a head and an engine stand in.
 """
 
 from argparse import Namespace
@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 import jaxvol as jv
 from jaxvol.engine.image import render_scene
@@ -35,8 +34,8 @@ from jaxvol.lighting import Lighting, Phong
 from jaxvol.metrics import rmse
 from jaxvol.ray import Scene as EngineScene
 
-from . import common, marches, timing
-from .common import plt
+from . import charts, harness, marches, timing
+from .harness import experiment, geometric_mean, show
 from .scenes import PHANTOM, SCENES, Scene
 
 
@@ -61,19 +60,23 @@ REPORT = {  # speed-ups at 256², 512²
 }
 
 
-def cthead(folder: Path, size: int) -> Scene:
+def cthead(folder: Path, size: int, resolution: int) -> Scene:
     volume = jv.load(folder / "cthead_256x256x113_uint16le.raw.gz", spacing=(1, 1, 2))
     camera = jv.Camera.looking_at(volume, (-0.5, -1, -0.3), (0, 0, -1), size=(size, size)).zoom(1.4)
     return Scene(volume, jv.preset("ct_skin_bone", clim=(0, 4000)), camera, 1.0)
 
 
-def engine_phantom(folder: Path | None, size: int, resolution: int = 192) -> Scene:
+def engine(folder: Path, size: int, resolution: int) -> Scene:
+    return SCENES["engine"](folder, size)
+
+
+def engine_phantom(folder: Path | None, size: int, resolution: int) -> Scene:
     volume = jv.phantom("engine", resolution)
     camera = jv.Camera.looking_at(volume, (0.5, -1, 0.6), size=(size, size)).zoom(1.4)
     return Scene(volume, jv.preset("engine", unit_distance=0.01), camera, float(volume.spacing[0]))
 
 
-REAL: dict[str, Callable[..., Scene]] = {"head": cthead, "engine": SCENES["engine"]}
+REAL: dict[str, Callable[..., Scene]] = {"head": cthead, "engine": engine}
 PHANTOMS: dict[str, Callable[..., Scene]] = {"head": SCENES[PHANTOM], "engine": engine_phantom}
 
 
@@ -106,7 +109,7 @@ SHADED: dict[str, tuple[tuple[jv.Transform, ...], Lighting]] = {
 def measure(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
     """Time, speed-up over neither method, and error of a scene's frame under every method."""
     under = {name: jv.March(scene.step, transforms) for name, transforms in METHODS.items()}
-    return with_gains(common.compare(scene, under, repetitions))
+    return with_gains(harness.compare(scene, under, repetitions))
 
 
 def measure_shaded(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
@@ -118,11 +121,9 @@ def measure_shaded(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
         return jv.render(*scene[:3], march, lighting=lighting, outputs="rgba").rgba
 
     seconds = timing.interleaved({name: partial(frame, name) for name in SHADED}, repetitions)
-    finer = marches.converged(scene.step, common.FINER)
+    finer = marches.converged(scene.step, harness.FINER)
     truth = jv.render(*scene[:3], finer, lighting=Phong(), outputs="rgba").rgba
-    return with_gains(
-        {n: common.row(seconds[n], seconds[NEITHER], float(rmse(frame(n), truth))) for n in SHADED}
-    )
+    return with_gains({n: harness.row(seconds[n], seconds[NEITHER], rmse(frame(n), truth)) for n in SHADED})
 
 
 def with_gains(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -142,21 +143,13 @@ def tested_every(scene: Scene, samples: int, repetitions: int) -> dict[str, Any]
         return render_scene(parts, "rgba", "replay", Tiling(cells=samples)).rgba
 
     seconds = timing.interleaved({name: partial(frame, name) for name in (NEITHER, ERT)}, repetitions)
-    medians = {name: round(float(np.median(all_)), 5) for name, all_ in seconds.items()}
+    medians = {name: timing.median(all_) for name, all_ in seconds.items()}
     return {"seconds": medians, "speed-up": timing.ratio(seconds[NEITHER], seconds[ERT])}
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Measured speed-ups as bars, the report's as crosses: without shading above, with it below."""
-    figure, axes = plt.subplots(
-        2,
-        len(result["sizes"]),
-        figsize=(11, 6.4),
-        sharex=True,
-        sharey="row",
-        squeeze=False,
-        layout="constrained",
-    )
+    figure, axes = charts.panels(2, len(result["sizes"]), 11, 6.4, sharex=True, sharey="row")
     bars = {ERT: "C3", SKIPPED: "C9", ESS: "C0", BOTH_SKIPPED: "C8", BOTH: "C2"}
     reported = {SKIPPED: ESS, BOTH_SKIPPED: BOTH}
     for row, (key, what) in zip(axes, (("scenes", "unshaded"), ("shaded", "shaded")), strict=True):
@@ -188,73 +181,57 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "thin bars: 95 % intervals",
         fontsize=9,
     )
-    figure.legend(*axes[1][0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
-    common.save(figure, path)
+    charts.legend_below(figure, axes[1, 0], 6)
+    charts.save(figure, path)
 
 
-def show(name: str, rows: dict[str, dict[str, Any]]) -> None:
-    for method, row in rows.items():
-        gain = row["speed-up"]
-        print(
-            f"{name}  {method:26} {row['seconds'] * 1e3:7.1f} ms"
-            f"  speed-up {gain['median']:5.2f} [{gain['low']:.2f}, {gain['high']:.2f}]"
-            f"  RMSE {row['rmse']:.5f}",
-            flush=True,
-        )
-
-
-@common.experiment(
+@experiment(
     "kisti",
     "What do early ray termination and empty-space skipping save, apart and together?",
     __doc__,
+    draw,
     repetitions=9,
+    resolution=192,
+    sizes=SIZES,
+    every=EVERY,
+    quick={"sizes": (32,), "every": (1, 8), "repetitions": 2, "resolution": 32},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, sizes, counts, more = common.data(), SIZES, EVERY, {}
+def main(chosen: Namespace) -> dict[str, Any]:
+    folder = harness.data()
     makers = PHANTOMS if folder is None or chosen.quick else REAL
-    if chosen.quick:
-        sizes, counts, chosen.repetitions, more = (32,), (1, 8), 2, {"resolution": 32}
-
     scenes: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
     shaded: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
     every: dict[str, dict[str, Any]] = {}
     for name, make in makers.items():
-        for size in sizes:
-            scene = make(folder, size, **more)
-            for tf, look in (("tf 1", scene), ("tf 2", opaque(scene))):
+        for size in chosen.sizes:
+            scene = make(folder, size, chosen.resolution)
+            for tf, seen in (("tf 1", scene), ("tf 2", opaque(scene))):
                 case = f"{name}, {tf}"
-                scenes[case][str(size)] = measure(look, chosen.repetitions)
-                shaded[case][str(size)] = measure_shaded(look, chosen.repetitions)
-                show(f"{case}, {size} x {size}, unshaded", scenes[case][str(size)])
-                show(f"{case}, {size} x {size}, shaded  ", shaded[case][str(size)])
-                if size == sizes[-1]:
-                    every[case] = {str(n): tested_every(look, n, chosen.repetitions) for n in counts}
-                    gains = ", ".join(
-                        f"{n}: {row['speed-up']['median']:.2f}" for n, row in every[case].items()
-                    )
-                    print(f"{case}: ERT looked at every so many samples, speed-up: {gains}", flush=True)
+                scenes[case][str(size)] = measure(seen, chosen.repetitions)
+                shaded[case][str(size)] = measure_shaded(seen, chosen.repetitions)
+                show(scenes[case][str(size)], case, size, "unshaded")
+                show(shaded[case][str(size)], case, size, "shaded")
+                if size == chosen.sizes[-1]:
+                    every[case] = {str(n): tested_every(seen, n, chosen.repetitions) for n in chosen.every}
+                    show(every[case], case, "ended rays are looked for every so many samples")
     gains = [rows[BOTH]["speed-up"]["median"] for of_size in scenes.values() for rows in of_size.values()]
-    mean = common.geometric_mean(gains)
-    print(f"both over neither: least {min(gains):.2f}, geometric mean {mean:.2f}; the goal is {GOAL}")
     over = {
         f"{case}, {size}": round(rows[BOTH]["speed-up"]["median"] / REPORT[case][BOTH][at], 3)
         for case, of_size in shaded.items()
         for at, (size, rows) in enumerate(of_size.items())
     }
-    print("both, shaded, over the report's: " + ", ".join(f"{c}: {ratio:.2f}" for c, ratio in over.items()))
-    result = {
+    return {
         "volumes": "phantoms" if makers is PHANTOMS else "cthead and engine",
-        "sizes": sizes,
+        "sizes": chosen.sizes,
         "repetitions": chosen.repetitions,
         "opacity left": LEFT,
         "goal": GOAL,
-        "both, geometric mean": mean,
+        "both, geometric mean": geometric_mean(gains),
         "scenes": scenes,
         "shaded": shaded,
         "both, shaded, over the report's": over,
         "ended rays are looked for every so many samples": every,
     }
-    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ mean free path leave it undetermined.
 
 from argparse import Namespace
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,8 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from . import common
-from .common import plt
+from . import charts
+from .harness import experiment, show
 
 
 GOAL = 0.01
@@ -150,12 +149,7 @@ def one_ball(
         row: dict[str, Any] = {"thickness": thickness}
         for name, (views, tied) in cases.items():
             residual = jv.ImageResidual(scene, views, background=(0, 0, 0))
-            found = jv.fit(
-                residual,
-                start(1 / 3, tied),
-                constraints=constraints,
-                max_steps=STEPS,
-            )
+            found = jv.fit(residual, start(1 / 3, tied), constraints=constraints, max_steps=STEPS)
             assert found.uncertainty is not None
             errors = found.uncertainty.standard_errors
             row[name] = {
@@ -167,23 +161,16 @@ def one_ball(
                 "message": found.message,
             }
         rows.append(row)
-        print(
-            thickness,
-            {name: (round(row[name]["ratio"], 4), row[name]["undetermined"]) for name in cases},
-            flush=True,
-        )
+        show(row)
     return rows
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
+    figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
     losses = result["three materials"]["losses"]
     left.semilogy(range(1, len(losses) + 1), losses, "o-")
-    left.set(
-        xlabel="step of the fit",
-        ylabel="mean squared difference of the images",
-        title="λ of three materials, from starts 3 times off",
-    )
+    left.set(xlabel="step of the fit", ylabel="mean squared difference of the images")
+    left.set_title("λ of three materials, from starts 3 times off")
     rows = result["one ball"]
     names = {
         "templates": "from images by templates",
@@ -192,51 +179,40 @@ def draw(result: dict[str, Any], path: Path) -> None:
     }
     for (name, label), mark in zip(names.items(), ("ko", "C0s", "C3^"), strict=True):
         known = [row for row in rows if not row[name]["undetermined"] and np.isfinite(row[name]["ratio"])]
-        right.loglog(
-            [r["thickness"] for r in known], [r[name]["ratio"] for r in known], mark + "-", label=label
-        )
+        at, ratios = [row["thickness"] for row in known], [row[name]["ratio"] for row in known]
+        right.loglog(at, ratios, mark + "-", label=label)
     lost = [row["thickness"] for row in rows if row["templates"]["undetermined"]]
     if lost:
-        right.plot(
-            lost,
-            np.ones(len(lost)),
-            "kx",
-            markersize=9,
-            label="from images by templates: said to be undetermined",
-        )
+        label = "from images by templates: said to be undetermined"
+        right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label=label)
     right.axhline(1, color="k", linewidth=0.8)
     right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
     right.set_title("λ of one ball, from two views")
-    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-    common.save(figure, path)
+    charts.legend_below(figure, right, 2)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "mean_free_path",
     "Are mean free paths found back from images, of templates and path-traced?",
     __doc__,
+    draw,
     size=32,
     resolution=32,
     paths=256,
+    thicknesses=THICKNESSES,
+    quick={"size": 10, "resolution": 12, "paths": 2, "thicknesses": (2.0,)},
 )
-def main(chosen: Namespace) -> common.Answer:
-    thicknesses = THICKNESSES
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.paths = 10, 12, 2
-        thicknesses = (2.0,)
-
-    result = {
-        "image": [chosen.size] * 2,
-        "resolution": chosen.resolution,
+def main(chosen: Namespace) -> dict[str, Any]:
+    size, resolution = chosen.size, chosen.resolution
+    return {
+        "image": [size] * 2,
+        "resolution": resolution,
         "paths": chosen.paths,
         "goal": GOAL,
-        "three materials": three_materials(chosen.size, chosen.resolution),
-        "one ball": one_ball(chosen.size, chosen.resolution, chosen.paths, thicknesses, chosen.seed),
+        "three materials": three_materials(size, resolution),
+        "one ball": one_ball(size, resolution, chosen.paths, chosen.thicknesses, chosen.seed),
     }
-    worst = max(abs(ratio - 1) for ratio in result["three materials"]["found"])
-    steps = len(result["three materials"]["losses"])
-    print(f"three materials: within {worst:.2%} (goal {GOAL:.0%}), {steps} steps")
-    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,10 @@ The published starts are not a bound, so each time comes with the share of pixel
 without leaping by more than 1/255 in any channel, and with the RMSE against a converged image. The paper
 reports 53 % less time at R = 8 and distortion at R = 32. The goal is 2.1 times the speed of the distance map,
 that of voxels, at R = 8.
-
-The airway is read from the folder that JAXVOL_DATA names; without one, only the colon phantom is measured.
 """
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +22,8 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common, timing
-from .common import plt
+from . import charts, harness, timing
+from .harness import chosen_scenes, experiment, frame, show, some_of
 from .scenes import Scene
 from .voxel_distances import VoxelLeaping, distances
 
@@ -92,10 +89,10 @@ def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, d
     grid = distances(scene.volume, scene.transfer)
     under[VOXELS] = leaping(scene, VoxelLeaping(grid))
     under |= {named(OF_VOXELS, cell): leaping(scene, VoxelLeaping(grid, PUBLISHED, cell)) for cell in cells}
-    rows = common.compare(scene, under, repetitions)
-    reference = common.frame(scene, under[NONE])
+    rows = harness.compare(scene, under, repetitions)
+    reference = frame(scene, under[NONE])
     for name, row in rows.items():
-        row["wrong"] = float(np.mean(wrong(common.frame(scene, under[name]), reference)))
+        row["wrong"] = float(np.mean(wrong(frame(scene, under[name]), reference)))
         base = VOXELS if name.startswith(OF_VOXELS) else MAP
         row["speed-up"] = timing.ratio(rows[base]["all seconds"], row["all seconds"])
     return rows
@@ -104,8 +101,7 @@ def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, d
 def draw(result: dict[str, Any], path: Path) -> None:
     """Time, wrong pixels and RMSE against R; the methods without cells are lines."""
     scenes, cells = result["scenes"], result["cells"]
-    size = (11.5, 2.8 * len(scenes) + 0.4)
-    figure, axes = plt.subplots(len(scenes), 3, figsize=size, squeeze=False, layout="constrained")
+    figure, axes = charts.panels(len(scenes), 3, 11.5, 2.8 * len(scenes) + 0.4)
     for (times, wrongs, errors), (scene, rows) in zip(axes, scenes.items(), strict=True):
         for method, style in ((PUBLISHED, "C3o-"), (PROVEN, "C0s-"), (OF_VOXELS, "C1^-")):
             mine = [rows[named(method, cell)] for cell in cells]
@@ -129,44 +125,35 @@ def draw(result: dict[str, Any], path: Path) -> None:
         if not any(rows[named(method, cell)]["wrong"] for method in (PUBLISHED, OF_VOXELS) for cell in cells):
             wrongs.set_ylim(0, 1)
             wrongs.text(0.5, 0.5, "none, at any R", ha="center", fontsize=9, transform=wrongs.transAxes)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    common.save(figure, path)
+    charts.legend_below(figure, axes[0, 0], 5)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "minimum_distance",
     "What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil?",
     __doc__,
+    draw,
     repetitions=15,
     size=512,
-    only=common.some_of(SCENES, "SCENE"),
+    resolution=256,
+    only=some_of(SCENES, "SCENE"),
+    cells=CELLS,
+    quick={"size": 64, "repetitions": 2, "cells": (8, 32), "resolution": 48},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, names = common.available(chosen, PHANTOM)
-    cells, more = CELLS, {}
-    if chosen.quick:
-        chosen.size, chosen.repetitions, cells, more = 64, 2, (8, 32), {"resolution": 48}
-
+def main(chosen: Namespace) -> dict[str, Any]:
     scenes: dict[str, dict[str, Any]] = {}
-    for name in names:
-        scenes[name] = measure(SCENES[name](folder, chosen.size, **more), cells, chosen.repetitions)
-        for method, row in scenes[name].items():
-            gain = row["speed-up"]
-            print(
-                f"{name:14} {method:28} {row['seconds'] * 1e3:7.1f} ms  {gain['median']:5.2f} x as fast as"
-                f" its distance map [{gain['low']:.2f}, {gain['high']:.2f}]  wrong {row['wrong']:8.4%}"
-                f"  RMSE {row['rmse']:.5f}",
-                flush=True,
-            )
-    result = {
+    for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
+        scenes[name] = measure(scene, chosen.cells, chosen.repetitions)
+        show(scenes[name], name)
+    return {
         "image": [chosen.size, chosen.size],
         "repetitions": chosen.repetitions,
         "opacity left": LEFT,
         "goal at R = 8": GOAL,
-        "cells": cells,
+        "cells": chosen.cells,
         "scenes": scenes,
     }
-    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ alone, and the candidate of the least held-out loss.
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,8 +19,8 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common
-from .common import plt
+from . import charts
+from .harness import experiment, show
 
 
 STEPS = 40
@@ -165,7 +164,7 @@ def summary(trials: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
 def draw(result: dict[str, Any], path: Path) -> None:
     """Held-out losses of all candidates, relative to the truth's, and how often each rule chose the truth."""
     problems = result["problems"]
-    figure, axes = plt.subplots(len(problems), 3, figsize=(11, 3.2 * len(problems)), layout="constrained")
+    figure, axes = charts.panels(len(problems), 3, 11, 3.2 * len(problems))
     for (left, middle, right), (name, problem) in zip(axes, problems.items(), strict=True):
         numbers = [row["numbers"] for row in next(iter(problem["trials"].values()))[0]["candidates"]]
         for axis, (noise, trials) in zip((left, middle), problem["trials"].items(), strict=True):
@@ -194,26 +193,26 @@ def draw(result: dict[str, Any], path: Path) -> None:
         right.set_xticklabels(["choose", "BIC", "least held-out loss"], fontsize=8)
         right.set_ylim(0, 1.25 * right.get_ylim()[1])
         right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "model_choice",
     "Is the true number of materials, and of control points, chosen by held-out views?",
     __doc__,
+    draw,
     size=10,
     resolution=10,
     trials={"type": int, "default": 10, "help": "truths of each kind"},
+    points=POINTS,
+    quick={"size": 8, "resolution": 8, "trials": 1, "points": POINTS[:2]},
 )
-def main(chosen: Namespace) -> common.Answer:
-    points = POINTS
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.trials, points = 8, 8, 1, POINTS[:2]
-    problems = {}
+def main(chosen: Namespace) -> dict[str, Any]:
+    problems: dict[str, Any] = {}
     seeds = range(chosen.seed, chosen.seed + chosen.trials)
     for name, problem in (
         ("mean free paths", materials(chosen.resolution)),
-        ("control points", control_points(chosen.resolution, points)),
+        ("control points", control_points(chosen.resolution, chosen.points)),
     ):
         trials = {
             f"{noise:g}": [trial(problem, chosen.size, seed, noise) for seed in seeds]
@@ -221,9 +220,8 @@ def main(chosen: Namespace) -> common.Answer:
         }
         counts = {noise: summary(of_noise) for noise, of_noise in trials.items()}
         problems[name] = {"labels": problem.labels, "summary": counts, "trials": trials}
-        for noise, rules in counts.items():
-            print(f"{name}, noise {noise}, {chosen.trials} trials: {rules} (goal {GOAL} of 10)", flush=True)
-    result = {
+        show(counts, name, "noise")
+    return {
         "image": [chosen.size] * 2,
         "resolution": chosen.resolution,
         "training views": SEEN,
@@ -231,7 +229,6 @@ def main(chosen: Namespace) -> common.Answer:
         "goal": f"the truth in {GOAL} of 10 trials with noise, and never more without",
         "problems": problems,
     }
-    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -16,14 +16,11 @@ import subprocess
 import sys
 import tempfile
 from argparse import Namespace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from . import common
-from .common import plt
+from . import charts, timing
+from .harness import experiment, show
 from .large_volume import write_raw, zarr_of_raw
 
 
@@ -69,7 +66,7 @@ def image(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[str,
 
 
 def seconds(row: dict[str, Any]) -> float:
-    return float(np.median(row["seconds"]))
+    return timing.median(row["seconds"])
 
 
 def peak(row: dict[str, Any]) -> float:
@@ -96,14 +93,16 @@ def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]
                 "ratio": round(seconds(of_kind[name]) / seconds(whole), 3),
                 "scaled": round(scaled, 4),
                 "ratio, scaled": round(seconds(of_kind[name]) / scaled, 3),
-                "difference": float(np.max(np.abs(np.subtract(of_kind[name]["mean"], whole["mean"])))),
+                "difference": max(
+                    abs(a - b) for a, b in zip(of_kind[name]["mean"], whole["mean"], strict=True)
+                ),
             }
     return found
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Time and memory against the size."""
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    figure, (axes,) = charts.panels(1, 3, 12, 3.6)
     sizes, at = result["sizes"], [int(size) for size in result["resident"]]
     for kind, color in zip(FORMATS, ("C0", "C1"), strict=True):
         rows = [result["bricks"][kind][str(size)] for size in sizes]
@@ -117,60 +116,47 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[2].plot(at, [peak(row) for row in result["resident"].values()], "ks--")
     axes[2].set_title(f"peak memory, MiB; dotted: allowed for {result['memory']} MiB", fontsize=9)
     for panel in axes:
-        panel.set_xscale("log", base=2)
-        panel.set_yscale("log", base=2)
+        charts.logarithmic(panel, x=2, y=2)
         panel.set_xlabel("voxels, MiB", fontsize=8)
-        panel.xaxis.set_major_formatter("{x:g}")
-        panel.yaxis.set_major_formatter("{x:g}")
     axes[0].legend(fontsize=8)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "out_of_core",
     "How much memory and time does an image take of a volume that does not fit into the memory given?",
     __doc__,
+    draw,
     pixels={"type": int, "default": 512, "help": "pixels along a side"},
     sizes={"nargs": "+", "type": int, "default": SIZES, "help": "MiB of voxels"},
     volumes={"type": Path, "metavar": "FOLDER", "help": "keep the volumes here (default: delete them)"},
+    memory={"type": int, "default": MEMORY, "help": "MiB, the budget"},
+    resident=RESIDENT,
+    quick={"pixels": 32, "sizes": [2], "memory": 4, "resident": (2, 2)},
 )
-def main(chosen: Namespace) -> common.Answer:
-    sizes, memory, resident = list(chosen.sizes), MEMORY, RESIDENT
-    if chosen.quick:
-        chosen.pixels, sizes, memory, resident = 32, [2], 4, (2, 2)
-    result: dict[str, Any] = {"pixels": chosen.pixels, "sizes": sizes, "memory": memory}
-    bricks: dict[str, dict[str, Any]] = {kind: {} for kind in FORMATS}
-    constant, whole = {}, {}
+def main(chosen: Namespace) -> dict[str, Any]:
+    result: dict[str, Any] = {"pixels": chosen.pixels, "sizes": chosen.sizes, "memory": chosen.memory}
+    result |= {"constant": {}, "bricks": {kind: {} for kind in FORMATS}, "resident": {}}
     with tempfile.TemporaryDirectory() as temporary:
         folder = chosen.volumes or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
+
+        def measured(voxels: int, kind: str, memory: int | None) -> dict[str, Any]:
+            found = image(volume(folder, voxels, kind, chosen.seed), voxels, chosen.pixels, memory)
+            show(found, f"{voxels}³", kind, "in memory" if memory is None else f"{memory} MiB")
+            return found
+
         for kind in FORMATS:
-            small = image(volume(folder, SMALL, kind, chosen.seed), SMALL, chosen.pixels, 8)
-            constant[kind] = small
-            said(f"constant, {kind}", small)
-        for size in sizes:
-            voxels = side(size)
+            result["constant"][kind] = measured(SMALL, kind, 8)
+        for size in chosen.sizes:
             for kind in FORMATS:
-                path = volume(folder, voxels, kind, chosen.seed)
-                bricks[kind][str(size)] = image(path, voxels, chosen.pixels, memory)
-                said(f"{size} MiB, {kind}", bricks[kind][str(size)])
-            if size in resident:
-                raw = volume(folder, voxels, "raw", chosen.seed)
-                whole[str(size)] = image(raw, voxels, chosen.pixels, None)
-                said(f"{size} MiB, in memory", whole[str(size)])
-    result |= {"constant": constant, "bricks": bricks, "resident": whole}
-    result["compared"] = compared(result, str(resident[1]), str(resident[0]))
-    print(json.dumps(result["compared"], indent=1))
-    return result, partial(draw, result)
-
-
-def said(what: str, found: dict[str, Any]) -> None:
-    for name in SCENES:
-        row = found[name]
-        print(
-            f"{what:28} {name:12} {row['seconds']} s, first {row['first seconds']} s, {row['peak']} MiB",
-            flush=True,
-        )
+                result["bricks"][kind][str(size)] = measured(side(size), kind, chosen.memory)
+            if size in chosen.resident:
+                result["resident"][str(size)] = measured(side(size), "raw", None)
+    fitting, large = map(str, chosen.resident)
+    result["compared"] = compared(result, large, fitting)
+    show(result["compared"])
+    return result
 
 
 if __name__ == "__main__":

@@ -7,13 +7,9 @@ one. The goal is a ratio of at most 1.02 for both proposed methods, in the geome
 
 The same again as in the paper: where all four marches leap over empty space and end rays early. Frames are
 then shorter, and the goal is 1.05.
-
-Real volumes are read from the folder that JAXVOL_DATA names; without one, only the phantom is measured.
 """
 
 from argparse import Namespace
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,14 +18,14 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common, marches
-from .common import plt
+from . import charts, marches
+from .harness import chosen_scenes, compare, experiment, frame, geometric_mean, show, some_of
 from .scenes import PHANTOM, SCENES, Scene
 
 
-METHODS = (marches.PLAIN, marches.JITTER, marches.EMPTY, marches.BOTH)
+METHODS = {marches.PLAIN: "k", marches.JITTER: "C3", marches.EMPTY: "C0", marches.BOTH: "C1"}
+"""With their colours in the chart."""
 SIZES = 512, 1024
-ENDED = 1 / 255
 
 
 class Condition(NamedTuple):
@@ -41,7 +37,7 @@ class Condition(NamedTuple):
 
 CONDITIONS = {
     "all samples": Condition((), 1.02),
-    "as in the paper": Condition((jv.SpaceLeaping(), jv.EarlyTermination(ENDED)), 1.05),
+    "as in the paper": Condition((jv.SpaceLeaping(), jv.EarlyTermination(1 / 255)), 1.05),
 }
 SHOWN = {"as in the paper": "leaps and early ends, as in the paper"}
 """How a condition is called in the chart, where not as in the record."""
@@ -54,32 +50,24 @@ def measure(scene: Scene, repetitions: int, seed: int, condition: Condition) -> 
         name: jv.March(scene.step, (*marches.transforms(name, seed), *condition.transforms))
         for name in METHODS
     }
-    rows = common.compare(scene, under, repetitions)
+    rows = compare(scene, under, repetitions)
     for name, march in under.items():
-        rows[name]["aligned"] = float(np.mean(common.frame(scene, march).aligned))
+        rows[name]["aligned"] = float(np.mean(frame(scene, march).aligned))
     return rows
 
 
-def draw(conditions: dict[str, Any], sizes: Sequence[int], path: Path) -> None:
+def draw(result: dict[str, Any], path: Path) -> None:
+    conditions, sizes = result["conditions"], result["sizes"]
     volumes = len(next(iter(conditions.values()))["volumes"])
+    width, height = 5 * len(sizes) + 2, (0.55 * volumes + 0.7) * len(conditions) + 0.9
+    figure, axes = charts.panels(len(conditions), len(sizes), width, height, sharex=True, sharey=True)
     panels = [(condition, size) for condition in conditions for size in sizes]
-    figure, axes = plt.subplots(
-        len(conditions),
-        len(sizes),
-        figsize=(5 * len(sizes) + 2, (0.55 * volumes + 0.7) * len(conditions) + 0.9),
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-        layout="constrained",
-    )
     for panel, (condition, pixels) in zip(axes.flat, panels, strict=True):
         measured, goal = conditions[condition]["volumes"], conditions[condition]["goal"]
         for number, rows in enumerate(of_size[str(pixels)] for of_size in measured.values()):
-            for shift, (name, color) in enumerate(zip(METHODS[1:], ("C3", "C0", "C1"), strict=True)):
-                ratio, y = rows[name]["ratio"], number + 0.22 * (shift - 1)
-                panel.plot((ratio["low"], ratio["high"]), (y, y), color=color, linewidth=2, alpha=0.5)
+            for shift, (name, color) in enumerate(list(METHODS.items())[1:]):
                 label = name if number == 0 and panel is axes[0, 0] else None
-                panel.plot(ratio["median"], y, "o", color=color, label=label)
+                charts.interval(panel, rows[name]["ratio"], number + 0.22 * (shift - 1), color, label)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(goal, color="k", linewidth=0.8, linestyle=":")
         panel.set_title(
@@ -91,46 +79,35 @@ def draw(conditions: dict[str, Any], sizes: Sequence[int], path: Path) -> None:
         "time of a frame / that of ray casting: median of paired ratios, 95 % interval", fontsize=9
     )
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "overhead",
     "What do empty-space jitter and alignment add to the time of a whole frame?",
     __doc__,
+    draw,
     repetitions=15,
     sizes={"nargs": "+", "type": int, "default": SIZES, "help": "pixels along a side; the paper's are 1024"},
-    only=common.some_of(SCENES, "VOLUME"),
+    resolution=192,
+    only=some_of(SCENES, "VOLUME"),
+    quick={"sizes": (32,), "repetitions": 2, "resolution": 32},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, names = common.available(chosen, PHANTOM)
-    more = {}
-    if chosen.quick:
-        chosen.sizes, chosen.repetitions, more = (32,), 2, {"resolution": 32}
-
+def main(chosen: Namespace) -> dict[str, Any]:
     conditions: dict[str, Any] = {}
     for said, condition in CONDITIONS.items():
-        volumes: dict[str, dict[str, Any]] = {name: {} for name in names}
+        volumes: dict[str, dict[str, Any]] = {}
         means: dict[str, float] = {}
         for size in chosen.sizes:
-            for name, of_size in volumes.items():
-                scene = SCENES[name](folder, size, **more)
-                of_size[str(size)] = measure(scene, chosen.repetitions, chosen.seed, condition)
-                for march, row in of_size[str(size)].items():
-                    ratio = row["ratio"]
-                    print(
-                        f"{said}: {name:16} {size:4}  {march:30} {row['seconds']:7.3f} s"
-                        f"  {ratio['median']:.3f} x ray casting [{ratio['low']:.3f}, {ratio['high']:.3f}]"
-                        f"  RMSE {row['rmse']:.5f}",
-                        flush=True,
-                    )
-            means[str(size)] = common.geometric_mean(
+            for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, size):
+                rows = measure(scene, chosen.repetitions, chosen.seed, condition)
+                volumes.setdefault(name, {})[str(size)] = rows
+                show(rows, said, name, size)
+            means[str(size)] = geometric_mean(
                 of_size[str(size)][marches.BOTH]["ratio"]["median"] for of_size in volumes.values()
             )
-        print(f"{said}: both proposed methods, geometric means: {means}; the goal is {condition.goal}")
         conditions[said] = {"goal": condition.goal, "both, geometric means": means, "volumes": volumes}
-    result = {"sizes": chosen.sizes, "repetitions": chosen.repetitions, "conditions": conditions}
-    return result, partial(draw, conditions, chosen.sizes)
+    return {"sizes": chosen.sizes, "repetitions": chosen.repetitions, "conditions": conditions}
 
 
 if __name__ == "__main__":

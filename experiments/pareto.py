@@ -4,40 +4,36 @@ Each scene of `pareto_scenes` is rendered under each setting of `pareto_points`:
 adaptive sampling, jitter, alignment, leaping, termination, tables, types of voxels, and the light of lit
 scenes, beside VTK and Dr.Jit. Settings are timed in turn with the scene's base; a point's time is its median
 ratio to the base, times the base's median time over the whole scene. Errors are those of linear RGB over
-white against a converged image, whose own error is estimated (`pareto_reference`).
+white against a converged image, whose own error is estimated (`pareto_measure`).
 
-What is finished is kept in the folder `pareto/` of the output, and is not measured again by the same command
-unless commit, sources or options differ; Ctrl-C loses one method of one scene. `--scene` measures some
-scenes anew and keeps what the record says of the others, with the commit that they are of. `--point` renders
-one point of one scene again, times it and saves its picture beside its error. The record is `pareto.json`,
-the chart `pareto.png`, the page `pareto.html` (see `pareto_page`).
+Ctrl-C stops at the scenes that are finished. `--scene` measures some scenes again and keeps what the record
+says of the others, with the commit that they are of. `--point` renders one point of one scene again, times it
+and saves its picture beside its error. The record is `pareto.json`, the chart `pareto.png`, the page
+`pareto.html` (see `pareto_page`), the pictures that it shows are in the folder `pareto/`.
 
 Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
 distance to our image, up to 3 / 255, is that and not an error.
 
-Peers that are not installed are left out, and the record says why. Real volumes are read from the folder that
-JAXVOL_DATA names; scenes whose volume is not there are left out, too.
+Peers that are not installed are left out, and the record says why. Scenes whose volume is not in the folder
+JAXVOL_DATA are left out, too.
 """
 
-import json
 import shlex
 from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 import jaxvol as jv
 
-from . import common, pareto_chart, pareto_measure, pareto_page, pareto_points, record
-from .accuracy import DRJIT, VTK
-from .pareto_front import behind, front
-from .pareto_measure import Sizes, Store, slug
-from .pareto_points import Setting
-from .pareto_reference import TEMPLATES
+from . import harness, pareto_measure, pareto_page, pareto_points, programs, record
+from .harness import experiment, recorded, show, some_of
+from .pareto_measure import Sizes, slug
 from .pareto_scenes import ROWS
+from .programs import DRJIT, THREADS, VTK
 from .scenes import PHANTOM
-from .speed import THREADS, peers
 
 
 PEERS = (VTK, DRJIT)
@@ -45,33 +41,59 @@ QUICK = (PHANTOM, f"{PHANTOM}, lit")
 """The scenes of `--quick`."""
 SAME = 0.01
 """Errors that differ by less count as equal."""
-FEW = 2
-"""Settings of each family under `--quick`."""
+
+Point: TypeAlias = tuple[float, float]
+"""Error and time; less is better in both."""
 
 
-def there(file: str | None) -> bool:
-    """Whether a scene's volume is there."""
-    folder = common.data()
-    return file is None or (folder is not None and (folder / file).is_file())
+def front(points: Sequence[Point]) -> list[int]:
+    """Numbers of the points of which none other is better in one and as good in both, by growing error. Of
+    points that are equal in both, all are kept.
+
+    **Raises:** `ValueError` for points that are not pairs of numbers, and for NaN.
+    """
+    at = np.asarray(points, float).reshape(-1, 2) if len(points) == 0 else np.asarray(points, float)
+    if at.ndim != 2 or at.shape[1] != 2 or np.isnan(at).any():
+        raise ValueError(f"points must be pairs of numbers, (error, time), without NaN; got {points!r}.")
+    found: list[int] = []
+    for i in np.lexsort((at[:, 1], at[:, 0])):
+        if not found or at[i, 1] < at[found[-1], 1] or (at[i] == at[found[-1]]).all():
+            found.append(int(i))
+    return found
 
 
-def few(settings: dict[str, Setting]) -> dict[str, Setting]:
-    """The first settings of each family."""
-    families: dict[str, list[str]] = {}
-    for name, setting in settings.items():
-        families.setdefault(setting.family, []).append(name)
-    return {n: settings[n] for names in families.values() for n in names[:FEW]}
+def behind(
+    ours: Sequence[Point], theirs: Mapping[str, Point], same: float = 0.0
+) -> dict[str, dict[str, float | None]]:
+    """The points of other programs that no point of ours is as good as, in error and in time.
+
+    `same`: errors that differ by this part count as equal, since programs that take the same samples differ
+    by rounding.
+
+    For each, by what factor we miss it: `time`: that of our fastest point at its error, over its own;
+    `error`: that of our best point in its time, over its own. None where we have no such point.
+    """
+    found: dict[str, dict[str, float | None]] = {}
+    for name, (error, seconds) in theirs.items():
+        enough = error * (1 + same)
+        if any(e <= enough and s <= seconds for e, s in ours):
+            continue
+        fastest = min((s for e, s in ours if e <= enough), default=None)
+        best = min((e for e, s in ours if s <= seconds), default=None)
+        found[name] = {
+            "time": None if fastest is None else fastest / seconds,
+            "error": None if best is None else best / error if error else None,
+        }
+    return found
 
 
-def concluded(name: str, kept: dict[str, Any], options: list[str]) -> dict[str, Any]:
+def concluded(name: str, found: dict[str, Any], options: list[str]) -> dict[str, Any]:
     """A scene's entry in the record: times by the base, fronts, commands, and what peers do better."""
-    row = ROWS[name]
-    base = float(np.median([s for each in kept["base"].values() for s in each]))
-    points = {}
-    for point, found in kept["points"].items():
+    row, points = ROWS[name], {}
+    base = float(np.median(found["base seconds"]))
+    for point, measured in found["points"].items():
         line = ["python", "-m", "experiments.pareto", "--scene", name, "--point", point, *options]
-        left = {k: v for k, v in found.items() if k != "all seconds"}
-        points[point] = {**left, "time": base * found["ratio"]["median"], "command": shlex.join(line)}
+        points[point] = {**measured, "time": base * measured["ratio"]["median"], "command": shlex.join(line)}
     pairs = {n: (p["rmse"], p["time"]) for n, p in points.items()}
     ours = {n: pair for n, pair in pairs.items() if points[n]["family"] not in PEERS}
     theirs = {n: pair for n, pair in pairs.items() if n not in ours}
@@ -82,8 +104,8 @@ def concluded(name: str, kept: dict[str, Any], options: list[str]) -> dict[str, 
         "lit": row.lit,
         "toroidal": row.toroidal,
         "volume": row.file or "phantom",
-        "pixels": kept["pixels"],
-        "reference": kept["reference"],
+        "pixels": found["pixels"],
+        "reference": found["reference"],
         "base": pareto_points.base_of(row),
         "base seconds": round(base, 5),
         "front of jaxvol": [list(ours)[i] for i in front(list(ours.values()))],
@@ -92,40 +114,23 @@ def concluded(name: str, kept: dict[str, Any], options: list[str]) -> dict[str, 
         "jaxvol's front is left of and below all points of VTK and Dr.Jit": not ahead if theirs else None,
         "their points that it is not": ahead,
         "points": points,
-        **({"gradients": kept["gradients"]} if "gradients" in kept else {}),
+        **({"gradients": found["gradients"]} if "gradients" in found else {}),
     }
 
 
 def summary(scenes: dict[str, Any]) -> dict[str, Any]:
     """What the record says in short, of scenes with peers."""
     compared = {n: s for n, s in scenes.items() if any(p["family"] in PEERS for p in s["points"].values())}
+    ahead = {n: s["their points that it is not"] for n, s in compared.items()}
     return {
         "points": sum(len(s["points"]) for s in scenes.values()),
         "scenes with peers": len(compared),
         "scenes in which jaxvol's front is left of and below all points of VTK and Dr.Jit": [
-            n for n, s in compared.items() if not s["their points that it is not"]
+            n for n, points in ahead.items() if not points
         ],
-        "points that it is not left of and below, by scene": {
-            n: s["their points that it is not"]
-            for n, s in compared.items()
-            if s["their points that it is not"]
-        },
+        "points that it is not left of and below, by scene": {n: p for n, p in ahead.items() if p},
         "largest error of a reference": max(s["reference"]["rmse"] for s in scenes.values()),
     }
-
-
-def recorded(chosen: Namespace) -> dict[str, Any]:
-    """What the record at the output says of the scenes that are not chosen, with the commit and the command
-    that measured them; nothing if its sizes are others."""
-    path = chosen.output / "pareto.json"
-    if chosen.quick or not path.is_file():
-        return {}
-    found = record.read(path)
-    result, made = found["result"], {"commit": found["commit"], "command": found["command"]}
-    sizes = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
-    if any(result[name] != size for name, size in sizes.items()) or found["seed"] != chosen.seed:
-        return {}
-    return {n: {"measured": made, **scene} for n, scene in result["scenes"].items() if n not in chosen.scene}
 
 
 def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, str]) -> dict[str, Any]:
@@ -137,83 +142,82 @@ def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, 
             f"--point must be one of the settings of {name!r}, {', '.join(settings)}; got {point!r}."
         )
     case, base = pareto_measure.case_of(row, sizes), pareto_points.base_of(row)
-    store = Store(output / slug(name), pareto_measure.key_of(name, sizes, present))
-    truth = pareto_measure.truth_of(case, row, sizes, store)
-    program, against = settings[point].make(case), settings[base].make(case)
-    rows, _ = pareto_measure.timed({point: program}, base, against, truth, sizes.repetitions)
+    truth = pareto_measure.converged(case, row, sizes.templates)
+    made = {"": settings[base].make(case), point: settings[point].make(case)}
+    rows = programs.measured(made, truth, sizes.repetitions)
+    output.mkdir(parents=True, exist_ok=True)
     file = output / f"{slug(name)}, {slug(point)}.png"
-    jv.save_png(file, pareto_measure.beside(program, truth))
+    jv.save_png(file, pareto_measure.beside(made[point], truth))
     return {**rows[point], "picture, and its error times " + str(pareto_measure.AMPLIFIED): str(file)}
 
 
-@common.experiment(
+def draw(result: dict[str, Any], path: Path) -> None:
+    """The chart, and the page beside it, with the pictures that the experiment left there."""
+    pareto_page.chart(result, path)
+    file = path.with_suffix(".json")
+    file = file if file.is_file() else record.RESULTS / "pareto.json"
+    pareto_page.write(file, file.parent / "pareto", path.with_suffix(".html"))
+
+
+@experiment(
     "pareto",
     "What does accuracy cost, for every setting of every method, and where are the Pareto fronts?",
     __doc__,
+    draw,
     repetitions=5,
     size=256,
     resolution=192,
-    scene=common.some_of(ROWS, "SCENE"),
-    point={
-        "metavar": "SETTING",
-        "default": None,
-        "help": "render, time and save this point of one scene again",
-    },
+    templates={"type": int, "default": pareto_measure.TEMPLATES, "help": "of a lit scene's reference"},
+    scene=some_of(ROWS, "SCENE"),
+    point={"metavar": "SETTING", "help": "render, time and save this point of one scene again"},
+    quick={"size": 32, "repetitions": 2, "resolution": 32, "templates": 4},
 )
-def main(chosen: Namespace) -> common.Answer | None:
-    templates, names = TEMPLATES, [name for name in chosen.scene if there(ROWS[name].file)]
+def main(chosen: Namespace) -> dict[str, Any] | None:
     given = any(word.split("=")[0] == "--scene" for word in chosen.argv)
-    for name in chosen.scene:
-        if name not in names:
-            print(f"{name}: left out, {ROWS[name].file} is not in the folder JAXVOL_DATA")
-    if chosen.quick:
-        chosen.size, chosen.repetitions, chosen.resolution, templates = 32, 2, 32, 4
-        names = names if given else list(QUICK)
+    names = [name for name in chosen.scene if there(ROWS[name].file)]
+    if chosen.quick and not given:
+        names = list(QUICK)
     if chosen.point is not None and (len(names) != 1 or not given):
         raise ValueError(f"--point is of one scene: give one --scene that is there; got {', '.join(names)}.")
-    sizes = Sizes(chosen.size, chosen.resolution, chosen.repetitions, templates, chosen.seed)
-    folder, present = chosen.output / "pareto", peers()
-    print(present, flush=True)
-    if chosen.point is not None:
-        print(json.dumps(again(names[0], chosen.point, folder, sizes, present), indent=1))
-        return None
     if not names:
         raise ValueError("--scene must name a scene whose volume is there; got none.")
+    sizes = Sizes(chosen.size, chosen.resolution, chosen.repetitions, chosen.templates)
+    folder, present = chosen.output / "pareto", programs.peers()
+    if chosen.point is not None:
+        show(again(names[0], chosen.point, folder, sizes, present), names[0], chosen.point)
+        return None
 
-    scenes: dict[str, Any] = {}
-    for number, name in enumerate(names, 1):
-        say = lambda text, n=number: print(f"[{n}/{len(names)}] {text}", flush=True)  # noqa: E731
-        kept = pareto_measure.scene(
-            name, folder / slug(name), sizes, present, few if chosen.quick else dict, say
-        )
-        command = shlex.join(["python", "-m", "experiments.pareto", *chosen.argv])
-        measured = {"commit": record.commit(), "command": command}
-        scenes[name] = {"measured": measured, **concluded(name, kept, repeated(chosen))}
-    scenes |= recorded(chosen)
-    scenes = {name: scenes[name] for name in ROWS if name in scenes}
-    result = {
-        "repetitions": chosen.repetitions,
-        "voxels along an axis of phantoms": chosen.resolution,
-        "threads": THREADS,
-        "peers": present,
-        "summary": summary(scenes),
-        "scenes": scenes,
+    options = [f"--{n}={getattr(chosen, n)}" for n in ("size", "resolution", "repetitions", "seed")]
+    made = {
+        "commit": record.commit(),
+        "command": shlex.join(["python", "-m", *harness.ran("pareto", chosen)]),
     }
-    print(json.dumps(result["summary"], indent=1))
+    scenes: dict[str, Any] = {}
+    try:
+        for name in names:
+            few = pareto_points.few if chosen.quick else dict
+            found = pareto_measure.scene(
+                name, folder / slug(name), sizes, few(pareto_points.of(ROWS[name], present))
+            )
+            scenes[name] = {
+                "measured": made,
+                **concluded(name, found, ["--quick"] if chosen.quick else options),
+            }
+    except KeyboardInterrupt:
+        print(f"interrupted after {len(scenes)} scenes")
+        if not scenes:
+            return None
+    same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
+    scenes |= recorded("pareto", chosen, "scenes", [name for name in ROWS if name not in scenes], same)
+    scenes = {name: scenes[name] for name in ROWS if name in scenes}
+    show(summary(scenes))
+    return {**same, "threads": THREADS, "peers": present, "summary": summary(scenes), "scenes": scenes}
 
-    def charts(path: Path) -> None:
-        pareto_chart.draw(result, path)
-        page = pareto_page.write(path.with_suffix(".json"), folder, path.with_suffix(".html"))
-        print(f"{page}: {page.stat().st_size / 1e6:.1f} MB")
 
-    return result, charts
-
-
-def repeated(chosen: Namespace) -> list[str]:
-    """The options with which a point is made again: those of the run."""
-    if chosen.quick:
-        return ["--quick"]
-    return [f"--{n}={getattr(chosen, n)}" for n in ("size", "resolution", "repetitions", "seed")]
+def there(file: str | None) -> bool:
+    """Whether a scene's volume is there."""
+    folder = harness.data()
+    return file is None or (folder is not None and (folder / file).is_file())
 
 
 if __name__ == "__main__":

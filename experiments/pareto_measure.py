@@ -1,34 +1,52 @@
-"""Time, error and picture of every setting in one scene, kept on disk as they are measured.
+"""Time, error and picture of every setting in one scene, against its converged image.
 
-Each scene has a folder: `scene.json` with what is finished, `reference.npy`, and a picture for each point.
-What is there is not measured again if commit, sources, sizes, seed and peers are the same.
+The converged image, the reference, is ours at a fraction of the step, by the midpoint rule (under a thin
+peak pre-integrated), cells cut at the exit, rays not ended early; of a lit scene every sample is lit, by
+many templates. Its own error is estimated twice: by the difference to the image of twice the step, and, at
+some pixels, to `render_ray_reference` in float64 by the midpoint rule, at half the step (under a thin peak
+at an eighth). In lit scenes both take one template only, and a third estimate follows from the difference to
+half as many templates from another seed.
+
+Gradients are those of the mean square of all premultiplied pixels, by `adjoint="replay"`, to the colours and
+to the extinction of all control points. Extinctions of 0, whose gradient leaping leaves out by design, do not
+count.
 """
 
-import hashlib
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from PIL import Image as Pillow
 
 import jaxvol as jv
+from jaxvol.lighting import Lighting
 from jaxvol.metrics import psnr, rmse, ssim, wood_grain_energy
+from jaxvol.xla.compiling import OPTIONS
 
-from . import common, pareto_gradients, pareto_points, pareto_reference, record, timing
-from .pareto_points import Setting
-from .pareto_programs import Program
-from .pareto_scenes import ROWS, Case, Row
+from . import harness, pareto_points, programs, timing
+from .pareto_points import BASE, GRADIENTS, Setting
+from .pareto_scenes import ROWS, Row
+from .programs import Case, Image, Program, Quadrature, lighting_of, program
 
 
 AMPLIFIED = 10
 """How many times as bright as it is an error is shown."""
 SIDE = 112
 """Pixels along a side of the small pictures."""
+TEMPLATES = 256
+"""Two images of 32 templates each differ by 0.07 on the lit head, as much as they differ from those of some
+settings."""
+PIXELS = 256
+"""Compared with float64."""
+SEEDS = 1001, 2002
+"""Of the reference's templates: not those of the settings."""
+FINER = 8
+"""Steps in a voxel of the converged gradient."""
 
 
 class Sizes(NamedTuple):
@@ -38,39 +56,6 @@ class Sizes(NamedTuple):
     resolution: int
     repetitions: int
     templates: int
-    seed: int = 0
-
-
-class Store:
-    """What is finished of a scene. Nothing is written, or removed, before `save`."""
-
-    def __init__(self, folder: Path, key: dict[str, Any]):
-        self.folder, self.path = folder, folder / "scene.json"
-        kept = json.loads(self.path.read_text(encoding="utf-8")) if self.path.is_file() else {}
-        fresh: dict[str, Any] = {"key": key, "points": {}, "base": {}}
-        self.kept = kept if kept.get("key") == key else fresh
-
-    def save(self) -> None:
-        """Write all, or, if interrupted, leave what was there."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        new = self.path.with_suffix(".new")
-        new.write_text(json.dumps(self.kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        new.replace(self.path)
-
-
-def state() -> str:
-    """Identifies the code: a digest of its sources. (Whether the checkout is clean does not: results lie in
-    it.)"""
-    found, root = hashlib.sha256(), Path(__file__).parent.parent
-    for file in sorted([*(root / "jaxvol").rglob("*.py"), *(root / "experiments").glob("*.py")]):
-        found.update(file.read_bytes())
-    return found.hexdigest()[:16]
-
-
-def key_of(name: str, sizes: Sizes, there: dict[str, str]) -> dict[str, Any]:
-    """What a scene's results depend on."""
-    commit = (record.commit() or "").rstrip("+")
-    return {"scene": name, "commit": commit, "sources": state(), **sizes._asdict(), "peers": there}
 
 
 def slug(name: str) -> str:
@@ -79,105 +64,184 @@ def slug(name: str) -> str:
 
 
 def case_of(row: Row, sizes: Sizes) -> Case:
-    return row.make(common.data(), max(32, int(sizes.pixels * row.part)), sizes.resolution)
+    return row.make(harness.data(), max(32, int(sizes.pixels * row.part)), sizes.resolution)
 
 
-def scene(
-    name: str,
-    folder: Path,
-    sizes: Sizes,
-    there: dict[str, str],
-    chosen: Callable[[dict[str, Setting]], dict[str, Setting]] = lambda settings: settings,
-    say: Callable[[str], None] = print,
-) -> dict[str, Any]:
-    """All results of a scene; measured are those that its folder lacks. `chosen`: of its settings."""
-    row, store = ROWS[name], Store(folder, key_of(name, sizes, there))
-    settings, base = chosen(pareto_points.of(row, there)), pareto_points.base_of(row)
-    kept, missing = store.kept, {n: s for n, s in settings.items() if n not in store.kept["points"]}
-    wanted = row.gradients and "gradients" not in kept
-    if not missing and not wanted and "reference" in kept:
-        say(f"{name}: kept, {len(kept['points'])} points")
-        return kept
-    case = case_of(row, sizes)
-    truth = reference(case, row, sizes, store)
-    kept["pixels"] = case.scene.camera.size[0]
-    say(f"{name}: reference errs by {kept['reference']['rmse']:.1e}")
+def scene(name: str, folder: Path, sizes: Sizes, settings: dict[str, Setting]) -> dict[str, Any]:
+    """All results of a scene; its pictures are written into the folder."""
+    row = ROWS[name]
+    case, base = case_of(row, sizes), pareto_points.base_of(row)
+    truth = converged(case, row, sizes.templates)
+    found: dict[str, Any] = {
+        "pixels": case.scene.camera.size[0],
+        "reference": own_error(case, row, truth, sizes.templates),
+        "points": {},
+        "base seconds": [],
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    small(truth).save(folder / "reference.webp", quality=80, method=6)
     against = settings[base].make(case)
-    for family in dict.fromkeys(setting.family for setting in missing.values()):
-        programs = {n: s.make(case) for n, s in missing.items() if s.family == family}
-        rows, base_seconds = timed(programs, base, against, truth, sizes.repetitions)
-        for point, found in rows.items():
-            kept["points"][point] = {"family": family, **found}
-            picture(programs[point], truth).save(folder / f"{slug(point)}.webp", quality=72, method=6)
-        kept["base"].setdefault(family, []).extend(base_seconds)
-        store.save()
-        say(f"{name}: {family}, {len(rows)} points, {len(kept['points'])} of {len(settings)}")
-    if wanted:
-        kept["gradients"] = pareto_gradients.measure(case, settings, sizes.repetitions)
-        store.save()
-        say(f"{name}: gradients at {len(kept['gradients']['points'])} points")
+    for family in dict.fromkeys(setting.family for setting in settings.values()):
+        made = {n: against if n == base else s.make(case) for n, s in settings.items() if s.family == family}
+        rows = programs.measured({base: against, **made}, truth, sizes.repetitions)
+        found["base seconds"] += rows[base]["all seconds"]
+        for point, each in made.items():
+            del rows[point]["all seconds"]
+            found["points"][point] = {"family": family, **rows[point], **quality(each, truth)}
+            small(beside(each, truth)).save(folder / f"{slug(point)}.webp", quality=72, method=6)
+        harness.show({n: found["points"][n] for n in made}, name)
+    if row.gradients:
+        found["gradients"] = gradients(case, settings, sizes.repetitions)
     jax.clear_caches()  # a process cannot hold the programs of all scenes
-    return kept
+    return found
 
 
-def truth_of(case: Case, row: Row, sizes: Sizes, store: Store) -> np.ndarray:
-    """The converged image, from the store if it is there."""
-    if "reference" in store.kept:
-        return np.load(store.folder / "reference.npy")
-    return pareto_reference.converged(case, row, sizes.templates)
-
-
-def reference(case: Case, row: Row, sizes: Sizes, store: Store) -> np.ndarray:
-    """The converged image, kept with its own error."""
-    truth = truth_of(case, row, sizes, store)
-    if "reference" in store.kept:
-        return truth
-    own = pareto_reference.own_error(case, row, truth, sizes.templates)
-    store.save()  # makes the folder, and marks what it holds as stale
-    np.save(store.folder / "reference.npy", truth)
-    small(truth).save(store.folder / "reference.webp", quality=80, method=6)
-    store.kept["reference"] = own
-    store.save()
-    return truth
-
-
-def timed(
-    programs: dict[str, Program], base: str, against: Program, truth: np.ndarray, repetitions: int
-) -> tuple[dict[str, dict[str, Any]], list[float]]:
-    """Time and error of each program, timed in turn with the base; and the base's times."""
-    seconds = timing.interleaved(
-        {base: against.draw, **{n: p.draw for n, p in programs.items() if n != base}}, repetitions
-    )
-    rows = {}
-    for name, each in programs.items():
-        image, seen = each.image(), each.seen(truth)
-        row = common.row(seconds[name], seconds[base], rmse(image, seen))
-        rows[name] = {**row, **quality(image, seen)}
-    return rows, [round(s, 5) for s in seconds[base]]
-
-
-def quality(image: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """What `common.row` does not have of an image's error."""
+def quality(each: Program, truth: Image) -> dict[str, float]:
+    """What `harness.row` does not have of an image's error."""
+    image, seen = each.image(), each.seen(truth)
     return {
-        "psnr": round(psnr(image, truth), 3),
-        "ssim": round(ssim(image, truth), 6),
-        "wood grain": wood_grain_energy(image - truth),
+        "psnr": round(psnr(image, seen), 3),
+        "ssim": round(ssim(image, seen), 6),
+        "wood grain": wood_grain_energy(image - seen),
     }
 
 
-def beside(each: Program, truth: np.ndarray) -> Float[np.ndarray, "height width 3"]:
+def beside(each: Program, truth: Image) -> Image:
     """The image, and beside it its error, amplified."""
     image = each.image()
     error = np.abs(image - each.seen(truth)) * AMPLIFIED
     return np.concatenate([image, np.clip(error, 0, 1)], axis=1)
 
 
-def picture(each: Program, truth: np.ndarray) -> Pillow.Image:
-    return small(beside(each, truth))
-
-
-def small(linear: np.ndarray) -> Pillow.Image:
+def small(linear: Image) -> Pillow.Image:
     """Linear RGB as a small picture."""
     shown = Pillow.fromarray(np.rint(np.asarray(jv.to_srgb(linear)) * 255).astype(np.uint8))
     height, width = linear.shape[:2]
     return shown.resize((round(SIDE * width / height), SIDE), Pillow.Resampling.LANCZOS)
+
+
+# -- the converged image ----------------------------------------------------------------------------------
+
+
+def fine(case: Case, finer: float, quadrature: Quadrature = "midpoint") -> jv.March:
+    transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping()
+    return jv.March(case.scene.step / finer, transforms, quadrature)
+
+
+def converged(case: Case, row: Row, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
+    """The reference, over white. `row`: how fine it is; `count`: of templates."""
+    how = {"templates": count, "blend": True, "seed": seed} if row.noisy else {}
+    lighting = None if case.lighting is None else lighting_of(case, **how)
+    return program(case, fine(case, row.finer, row.quadrature), lighting).image()
+
+
+def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
+    """What is estimated of the reference's own error: `rmse` in total, and its parts."""
+    few: Lighting | None = None if case.lighting is None or row.noisy else lighting_of(case)
+    image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
+    if row.noisy:
+        # grown once: in float64, random numbers are others
+        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).simulated(blend=False)
+        few = lighting_of(case, given=grown)
+        image = program(case, fine(case, row.finer, row.quadrature), few).image()
+    coarse = program(case, fine(case, row.finer / 2, row.quadrature), few).image()
+    pixels = visible_pixels(image)
+    exact = in_float64(case, fine(case, exactly), few, pixels)
+    off = image[pixels[:, 1], pixels[:, 0]] - exact
+    found: dict[str, Any] = {
+        "steps in a voxel": row.finer,
+        "quadrature": row.quadrature,
+        "difference to twice the step": rmse(image, coarse),
+        "pixels in float64": len(pixels),
+        "steps in a voxel, float64": exactly,
+        "difference to float64": float(np.sqrt(np.mean(off**2))),
+        "largest difference to float64": float(np.abs(off).max()),
+    }
+    if row.noisy:
+        found["templates"] = count
+        counts = zip((count, count // 2), SEEDS, strict=True)
+        one, other = (converged(case, row._replace(finer=1), n, seed) for n, seed in counts)
+        # of images with the variances v and 2 v
+        found["error by the number of templates"] = rmse(one, other) / np.sqrt(3)
+    errors = found["difference to float64"], found.get("error by the number of templates", 0)
+    return {"rmse": float(np.hypot(*errors)), **found}
+
+
+def visible_pixels(image: Image) -> np.ndarray:
+    """(column, row) of some pixels that show something, drawn at random; of any if none does."""
+    rows, columns = np.nonzero(np.any(image != 1, axis=-1))
+    if len(rows) == 0:
+        rows, columns = (index.ravel() for index in np.indices(image.shape[:2]))
+    drawn = np.random.default_rng(0).permutation(len(rows))[:PIXELS]
+    return np.column_stack([columns[drawn], rows[drawn]])
+
+
+def in_float64(case: Case, march: jv.March, lighting: Lighting | None, pixels: np.ndarray) -> np.ndarray:
+    """What `render_ray_reference` sees in float64 through these pixels, over white."""
+    with jax.enable_x64(True):
+        volume, transfer, camera, march, lighting = jax.tree.map(
+            doubled, (case.scene.volume, case.scene.transfer, case.scene.camera, march, lighting)
+        )
+
+        # voxels keep their type
+        volume = eqx.tree_at(lambda v: v.data, volume, case.scene.volume.data)
+
+        def one(pixel: jax.Array) -> jax.Array:
+            origin, direction = (jnp.stack(part) for part in camera.ray(pixel[0], pixel[1]))
+            how = {"pixel": (pixel[0], pixel[1]), "lighting": lighting, "compositing": case.compositing}
+            return jv.render_ray_reference(volume, transfer, origin, direction, march, **how).image()
+
+        return np.asarray(jax.vmap(one)(jnp.asarray(pixels, jnp.int32)))
+
+
+def doubled(leaf: Any) -> Any:
+    """A leaf in float64, if it is of floats."""
+    if eqx.is_inexact_array(leaf):
+        return jnp.asarray(np.asarray(leaf, np.float64))
+    return leaf
+
+
+# -- gradients --------------------------------------------------------------------------------------------
+
+
+def gradients(case: Case, settings: dict[str, Setting], repetitions: int) -> dict[str, Any]:
+    """By setting, where one is compared: relative errors, seconds, and their ratio to the base's image."""
+    transfer = case.scene.transfer
+    truth, coarser = (
+        gradient(program(case, fine(case, finer)).of_transfer, transfer)()[1] for finer in (FINER, FINER / 2)
+    )
+    rows, drawn = {}, {"image": settings[BASE].make(case).draw}
+    for name in (name for name in GRADIENTS if name in settings):
+        drawn[name] = gradient(settings[name].make(case).of_transfer, transfer)
+        rows[name] = relative(drawn[name]()[1], truth, transfer)
+    seconds = timing.interleaved(drawn, repetitions)
+    for name, row in rows.items():
+        row["seconds"] = timing.median(seconds[name])
+        row["over the base's image"] = timing.ratio(seconds[name], seconds["image"])
+    own = relative(coarser, truth, transfer)
+    return {"steps in a voxel": FINER, "reference to twice its step": own, "points": rows}
+
+
+def gradient(
+    rgba: Callable[[jv.TransferFunction], jax.Array] | None, transfer: jv.TransferFunction
+) -> Callable[[], Any]:
+    """A program of the image's loss and its gradient, to the colours and to the extinction."""
+    assert rgba is not None
+
+    def loss(leaf: Any) -> jax.Array:
+        return jnp.mean(rgba(eqx.tree_at(lambda t: (t.colors, t.extinction), transfer, leaf)) ** 2)
+
+    # compiled as one program, like the image
+    both = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
+    return lambda: both((transfer.colors, transfer.extinction))
+
+
+def relative(found: Any, truth: Any, transfer: jv.TransferFunction) -> dict[str, Any]:
+    """|g - g*| / |g*|, of colours and of extinctions."""
+    visible = np.asarray(transfer.extinction) > 0
+
+    def of(g: jax.Array, exact: jax.Array) -> float:
+        g, exact = (np.asarray(each, np.float64)[visible] for each in (g, exact))
+        return float(np.linalg.norm(g - exact) / np.linalg.norm(exact))
+
+    return {"colours": of(found[0], truth[0]), "extinction": of(found[1], truth[1])}

@@ -8,25 +8,36 @@ shaded by its gradient, and an isosurface where it is hit. A scene in bricks is 
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+import numpy as np
+
 import jaxvol as jv
+from jaxvol.bricks.split import COPIES
 from jaxvol.lighting import Lighting
 
-from .accuracy import DRJIT, FINEST_OF, LONGEST, QUADRATURES, VTK
-from .pareto_programs import (
+from . import peer_vtk
+from .pareto_scenes import Row
+from .programs import (
+    DRJIT,
+    FINEST_OF,
+    LEFT,
+    QUADRATURES,
+    VTK,
+    Case,
     Program,
+    adaptive,
     by_drjit,
     by_vtk,
     deferred,
-    in_bricks,
+    is_here,
     lighting_of,
     ours,
-    stored,
-    tabulated,
 )
-from .pareto_scenes import Case, Row, copied
 
 
 STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -91,6 +102,61 @@ def unlit_peer(row: Row) -> bool:
     return peer(row) and not row.shaded
 
 
+def copied(volume: jv.Volume) -> jv.Volume:
+    """The same volume in arrays of its own: what is computed once for each array of voxels, such as baked
+    light, is then kept apart."""
+    return jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)
+
+
+@cache
+def _folder() -> TemporaryDirectory:
+    """Where volumes lie that are read brick by brick, until the program ends."""
+    return TemporaryDirectory()
+
+
+def in_bricks(part: float, step: float, case: Case) -> Program:
+    """The base by `render_bricks` from a file, within `part` of what the whole volume takes in memory with
+    the copies that are made of it. Ranges of values are found once, before."""
+    volume, transfer, camera, voxel = case.scene
+    transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
+    march = jv.March(step * voxel, transforms, "midpoint")
+    memory = int(part * COPIES * volume.data.nbytes)
+    path = Path(_folder().name) / f"{len(list(Path(_folder().name).glob('*.npy')))}.npy"
+    np.save(path, np.asarray(volume.data))
+    source = jv.bricks.source_of(path, spacing=volume.spacing, origin=volume.origin)
+
+    def render() -> jv.Rendering:
+        return jv.render_bricks(source, transfer, camera, march, memory=memory, outputs="rgba")
+
+    def image() -> np.ndarray:
+        rendering = render()
+        assert not np.any(rendering.exhausted)
+        return np.asarray(rendering.image())
+
+    return Program(lambda: render().rgba, image)
+
+
+def tabulated(points: int, case: Case) -> Case:
+    """The transfer function as a table of equidistant entries."""
+    values = jnp.linspace(case.scene.transfer.values[0], case.scene.transfer.values[-1], points)
+    return case._replace(scene=case.scene._replace(transfer=peer_vtk.tabulated(case.scene.transfer, values)))
+
+
+def stored(kind: str, case: Case) -> Case:
+    """The voxels in another type. What does not fit is scaled to the type's range and rounded, and the
+    transfer function with it."""
+    volume, transfer = case.scene.volume, case.scene.transfer
+    data = np.asarray(volume.data)
+    if np.issubdtype(kind, np.integer) and not np.can_cast(data.dtype, kind):
+        low, high = float(data.min()), float(data.max())
+        scale = np.iinfo(kind).max / (high - low)
+        data = np.rint((data.astype(np.float64) - low) * scale)
+        values = (np.asarray(transfer.values) - low) * scale
+        transfer = jv.TransferFunction(values, transfer.colors, transfer.extinction)
+    volume = jv.Volume(data.astype(kind), volume.spacing, volume.origin)
+    return case._replace(scene=case.scene._replace(volume=volume, transfer=transfer))
+
+
 JITTERS: dict[str, tuple[jv.Transform, ...]] = {
     "jittered": (jv.Jitter(0),),
     "jittered, blue": (jv.Jitter(0, "blue"),),
@@ -108,12 +174,7 @@ UNLIT: dict[str, Setting] = {
         for q in QUADRATURES
         for step in STEPS
     },
-    **{
-        f"adaptive, tolerance {t:g}": Setting(
-            "adaptive", ours(jv.AdaptiveSampling(t, LONGEST * finest), step=1 / finest)
-        )
-        for t, finest in FINEST_OF.items()
-    },
+    **{f"adaptive, tolerance {t:g}": Setting("adaptive", adaptive(t)) for t in FINEST_OF},
     **{
         name: setting
         for how, jitter in JITTERS.items()
@@ -239,7 +300,7 @@ GRADIENTS = (
 def of(row: Row, there: dict[str, str]) -> dict[str, Setting]:
     """The settings of a scene, its base first; `there`: version of each peer, or why it is missing."""
     found = {name: setting for name, setting in SETTINGS.items() if setting.where(row)}
-    present = {n: s for n, s in found.items() if not there.get(s.family, "").startswith("not here")}
+    present = {n: s for n, s in found.items() if is_here(there, s.family)}
     base = base_of(row)
     return {base: present[base], **present}
 
@@ -251,3 +312,11 @@ def base_of(row: Row) -> str:
     if row.bricks:
         return WHOLE_BASE
     return SHADED_BASE if row.shaded else LIT_BASE if row.lit else BASE
+
+
+def few(settings: dict[str, Setting], count: int = 2) -> dict[str, Setting]:
+    """The first settings of each family."""
+    families: dict[str, list[str]] = {}
+    for name, setting in settings.items():
+        families.setdefault(setting.family, []).append(name)
+    return {n: settings[n] for names in families.values() for n in names[:count]}

@@ -9,31 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import jax.numpy as jnp
-import numpy as np
-
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, DirectionalLight, Lighting, Phong, ScattererTemplates
-from jaxvol.march.march import Quadrature
+from jaxvol.lighting import ConstantLight, DirectionalLight, Phong, ScattererTemplates
 
-from . import peer_vtk, scenes
-from .accuracy import peaked
-from .adaptive_error import inside
+from . import peer_vtk, scan_conversion, scenes
 from .lighting import FLESH, LIGHTS
-from .scenes import PHANTOM, SCENES, Scene
-
-
-class Case(NamedTuple):
-    """A scene, the transforms without which it cannot be rendered, its light, and its compositing mode.
-
-    `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options
-    `Phong`; None where the scene is unlit.
-    """
-
-    scene: Scene
-    placed: tuple[jv.Transform, ...] = ()
-    lighting: Callable[..., Lighting] | None = None
-    compositing: Any = "over"
+from .programs import Case, Quadrature
+from .scenes import PHANTOM, SCENES, Scene, inside, peaked
 
 
 class Row(NamedTuple):
@@ -113,28 +95,10 @@ def bronchi(folder: Path | None, size: int, resolution: int) -> Case:
     return Case(inside(scene._replace(transfer=jv.preset("ct_airway")), size))
 
 
-def fetus(folder: Path | None, size: int, resolution: int) -> Case:
-    shape = resolution // 3, resolution // 2, resolution
-    volume, probe = jv.toroidal_phantom("fetus", shape)
-    transfer = jv.TransferFunction.from_points(
-        [(50, (0.1, 0.04, 0.03), 0.0), (90, (0.8, 0.5, 0.35), 0.1), (170, (1.0, 0.9, 0.8), 0.5)]
-    )
-    camera = jv.Camera((60, -150, -110), (0, 0, 95), (1, 0, 0), 30.0, size=(size, size))
-    return Case(Scene(volume, transfer, camera, 2 * 100 / (resolution - 1)), (probe,))
-
-
-def shells(folder: Path | None, size: int, resolution: int) -> Case:
-    """A real convex scan of reverberation; its file has the beam's samples first. The angle of elevation is
-    taken as the whole one."""
-    assert folder is not None
-    data = np.asarray(jv.load(folder / SHELLS).data)
-    volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
-    azimuth, elevation, span = np.deg2rad(38.55), np.deg2rad(54.45) / 2, 69.58
-    beta, sigma = ((np.pi / 2 - half, np.pi / 2 + half) for half in (elevation, azimuth))
-    probe = jv.ToroidalMap(22.70 - 52.70, 52.70, beta, sigma, (0, span))
-    camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
-    transfer = jv.colormap("gray", (60, 200), (0.0, 0.5))
-    return Case(Scene(volume, transfer, camera, 2 * span / (data.shape[0] - 1)), (probe,))
+def scan(name: str, folder: Path | None, size: int, resolution: int) -> Case:
+    """Ultrasound as acquired."""
+    scene = scan_conversion.SCENES[name](folder, size, resolution)
+    return Case(Scene(scene.volume, scene.transfer, scene.camera, 2 * scene.sample), (scene.probe,))
 
 
 def lit_head(folder: Path | None, size: int, resolution: int) -> Case:
@@ -165,16 +129,17 @@ def surface(folder: Path | None, size: int, resolution: int) -> Case:
     return shaded("engine", folder, size, resolution)._replace(compositing=jv.Isosurface(100))
 
 
-ENGINE, BONSAI, AIRWAY, ANEURISM, SHELLS = (
+ENGINE, BONSAI, AIRWAY, ANEURISM = (
     "engine_256x256x128_uint8.raw.gz",
     "bonsai_256x256x256_uint8.raw.gz",
     "lidc0314_airway_256x192x200_int16le.raw.gz",
     "aneurism_256x256x256_uint8.raw.gz",
-    "us_aplio_convex_239x128x91_uint8.raw.gz",
 )
 
 PEAK: Any = {"finer": 32, "quadrature": "preintegrated"}
 """By the midpoint rule, such an image would err by 0.003 to 0.005."""
+
+TOROIDAL: Any = {"peers": UNBENT, "toroidal": True, "finer": 8, "part": 0.25}
 
 ROWS: dict[str, Row] = {
     PHANTOM: Row(head, gradients=True),
@@ -188,8 +153,8 @@ ROWS: dict[str, Row] = {
     "lidc0314_airway": Row(partial(real, "lidc0314_airway"), AIRWAY),
     "lidc0314_airway, inside": Row(bronchi, AIRWAY, view="inside", look="opaque"),
     "aneurism": Row(partial(real, "aneurism"), ANEURISM),
-    "fetus phantom": Row(fetus, peers=UNBENT, toroidal=True, finer=8, part=0.25),
-    "us_aplio_convex": Row(shells, SHELLS, peers=UNBENT, toroidal=True, finer=8, part=0.25),
+    "fetus phantom": Row(partial(scan, "fetus phantom"), **TOROIDAL),
+    "us_aplio_convex": Row(partial(scan, "us_aplio_convex"), scan_conversion.APLIO, **TOROIDAL),
     f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=TEMPLATES, lit=True, finer=4, part=0.5),
     "engine, lit": Row(lit_engine, ENGINE, peers=TEMPLATES, lit=True, finer=4, part=0.25),
     "engine, shaded": Row(partial(shaded, "engine"), ENGINE, lit=True, shaded=True),
@@ -198,9 +163,3 @@ ROWS: dict[str, Row] = {
     "engine, in bricks": Row(partial(real, "engine"), ENGINE, peers=WHOLE, bricks=True),
     "engine, isosurface": Row(surface, ENGINE, peers=SURFACES, lit=True, surface=True),
 }
-
-
-def copied(volume: jv.Volume) -> jv.Volume:
-    """The same volume in arrays of its own: what is computed once for each array of voxels, such as baked
-    light, is then kept apart."""
-    return jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)

@@ -9,7 +9,6 @@ reference is recorded, too.
 
 import time
 from argparse import Namespace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from . import common, timing
-from .common import plt
+from . import charts, harness, timing
+from .harness import experiment, show
 
 
 EXPLAINED = (
@@ -92,16 +91,16 @@ def measure(
         images[name] = image * scale
         as_it_is, error = (float(np.sqrt(np.mean((i - reference) ** 2))) for i in (image, images[name]))
         rows[name] = {
-            **common.row(taken[name], taken[UNLIT], error),
+            **harness.row(taken[name], taken[UNLIT], error),
             "scale": scale,
             "rmse as it is": as_it_is,
         }
     return rows, images
 
 
-def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
+def pictures(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
     columns = (len(images) + 1) // 2
-    figure, axes = plt.subplots(2, columns, figsize=(3 * columns, 7.4), layout="constrained")
+    figure, axes = charts.panels(2, columns, 3 * columns, 7.4)
     for axis in axes.flat[len(images) :]:
         axis.set_axis_off()
     axes.flat[-1].text(0, 1, EXPLAINED, va="top", fontsize=9, linespacing=1.5, wrap=True)
@@ -115,10 +114,10 @@ def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> Non
             else f"noise {row['standard error']:.3f}, {row['seconds']:.1f} s with compilation"
         )
         axis.set(title=name, xlabel=caption, xticks=[], yticks=[])
-    common.save(figure, path.with_suffix(".webp"))  # images, which are smaller so
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "path_traced",
     "How near do scatterer templates come to path tracing, and in what time?",
     __doc__,
@@ -127,17 +126,14 @@ def draw(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> Non
     resolution=96,
     paths=128,
     templates={"type": int, "default": 8, "help": "for each material"},
+    quick={"size": 16, "resolution": 16, "paths": 2, "templates": 2, "repetitions": 1},
 )
-def main(chosen: Namespace) -> common.Answer:
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions = 16, 16, 2, 2, 1
-    rows, images = measure(
-        chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions, chosen.seed
-    )
-    for name, row in rows.items():
-        print(name, {key: value for key, value in row.items() if key != "all seconds"})
-    result = {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows}
-    return result, partial(draw, rows, images)
+def main(chosen: Namespace) -> dict[str, Any]:
+    sizes = chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions
+    rows, images = measure(*sizes, chosen.seed)
+    show(rows)
+    pictures(rows, images, chosen.output / "path_traced.webp")
+    return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows}
 
 
 if __name__ == "__main__":

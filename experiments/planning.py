@@ -32,8 +32,8 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import common, timing
-from .common import plt
+from . import charts, timing
+from .harness import data, experiment, show
 
 
 TOLERANCES = (1e-2, 3e-3, 1e-3)
@@ -295,7 +295,7 @@ def summary(rows: list[dict[str, Any]], costs: dict[str, dict[str, dict[str, flo
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Error over tolerance, scene by scene; and time over that of the fastest march found."""
-    figure, (errors, times) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    figure, ((errors, times),) = charts.panels(1, 2, 9, 3.6)
     for column, tolerance in enumerate(TOLERANCES):
         plans = [row["plans"][f"{tolerance:g}"] for row in result["scenes"]]
         spread = np.random.default_rng(0).uniform(-0.3, 0.3, len(plans))
@@ -317,44 +317,38 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set_xlim(-0.5, len(TOLERANCES) - 0.5)
     errors.set_title(f"{len(result['scenes'])} random scenes; below 1: within the tolerance", fontsize=9)
     times.set_title("some of them; below 1: faster than a search found", fontsize=9)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "planning",
     "Does a plan hold its tolerance, and is anything faster within it?",
     __doc__,
+    draw,
     scenes=200,
     size=192,
     every={"type": int, "default": 10, "help": "search every so many scenes exhaustively"},
     repetitions=5,
+    large={
+        "type": int,
+        "default": 512,
+        "help": "pixels along a side of the images that plans are timed with",
+    },
+    quick={"scenes": 2, "size": 24, "every": 2, "repetitions": 1, "large": 32},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, large = common.data(), 512
-    if chosen.quick:
-        folder, chosen.scenes, chosen.size, chosen.every, chosen.repetitions, large = None, 2, 24, 2, 1, 32
+def main(chosen: Namespace) -> dict[str, Any]:
     rows, costs, shape = [], {}, None
+    folder = None if chosen.quick else data()
     for number, scene in enumerate(scenes(folder, chosen.scenes, chosen.size, chosen.seed)):
         if scene.volume.shape != shape:
             jax.clear_caches()  # a process cannot hold the programs of all volumes
             shape = scene.volume.shape
         rows.append(measure(scene, number, number % chosen.every == 0, chosen.repetitions))
         if scene.name not in costs:
-            costs[scene.name] = cost(scene, large)
-        told = "  ".join(
-            f"{t}: {p['error'] / float(t):.2f}{' x' + format(p['ratio'], '.2f') if p.get('fastest') else ''}"
-            for t, p in rows[-1]["plans"].items()
-        )
-        print(f"{number:3} {scene.name:16} {told}", flush=True)
-    result = {
-        "pixels": chosen.size,
-        "summary": summary(rows, costs),
-        "planning": costs,
-        "scenes": rows,
-    }
-    print(result["summary"])
+            costs[scene.name] = cost(scene, chosen.large)
+        show(rows[-1]["plans"], number, scene.name)
     jax.clear_caches()
-    return result, partial(draw, result)
+    return {"pixels": chosen.size, "summary": summary(rows, costs), "planning": costs, "scenes": rows}
 
 
 if __name__ == "__main__":

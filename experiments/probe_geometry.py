@@ -15,7 +15,6 @@ known only up to scale; and shells, which are alike at all angles, seen through 
 import warnings
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,8 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import common
-from .common import plt
+from . import charts, harness
+from .harness import experiment, show
 
 
 OFF, GOAL, NOISE = 0.2, 0.005, 0.01
@@ -218,7 +217,7 @@ VARIANTS = {
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Errors of each number, and how well each variant of the problem determines it."""
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained")
+    figure, (axes,) = charts.panels(1, 2, 12, 4.2)
     at, rows = np.arange(len(NAMES)), result["recovered"]
     together = np.array([name.startswith("all") for name in rows])
     errors = np.array([[abs(row["errors"][name]) for name in NAMES] for row in rows.values()])
@@ -235,7 +234,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[0].axhline(100 * GOAL, color="k", linestyle="--", linewidth=1, label="goal")
     ylabel = "error, % of the number (angles: of half their range)"
     axes[0].set(yscale="log", xticks=at, xticklabels=NAMES, ylabel=ylabel)
-    common.plain_numbers(axes[0])
+    charts.plain_numbers(axes[0])
     axes[0].set_title("numbers of the probe, found from images", fontsize=9)
     axes[0].legend(fontsize=7, loc="upper right", bbox_to_anchor=(1, 0.95))
     cases = result["left open"]
@@ -247,33 +246,31 @@ def draw(result: dict[str, Any], path: Path) -> None:
         axes[1].text(j, i, text, ha="center", va="center", fontsize=8)
     axes[1].set(xticks=at, xticklabels=NAMES, yticks=range(len(cases)), yticklabels=list(cases))
     axes[1].set_title("standard error by the covariance, %; open: not determined", fontsize=9)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "probe_geometry",
     "Is the geometry of a swept probe found from images, and what do the images leave open?",
     __doc__,
+    draw,
     size=32,
     resolution=64,
     starts=5,
     threads=3,
+    quick={"size": 12, "resolution": 24, "starts": 1},
 )
-def main(chosen: Namespace) -> common.Answer:
-    variants = VARIANTS
+def main(chosen: Namespace) -> dict[str, Any]:
+    starts, variants = directions(np.random.default_rng(chosen.seed), chosen.starts), VARIANTS
     if chosen.quick:  # each of the other variants takes a program of its own
-        chosen.size, chosen.resolution, chosen.starts = 12, 24, 1
-        variants = {"spheres and wires": as_it_is}
-    starts = directions(np.random.default_rng(chosen.seed), chosen.starts)
-    if chosen.quick:
-        starts = dict(list(starts.items())[:1])
+        starts, variants = dict(list(starts.items())[:1]), {"spheres and wires": as_it_is}
 
     def found_from(number: int) -> dict[str, Any]:
         name, signs = list(starts.items())[number]
         scene, truth = phantom(chosen.resolution, seed=chosen.seed + number)
-        targets = views(scene, truth, chosen.size, NOISE, chosen.seed + number, common.FINER)
+        targets = views(scene, truth, chosen.size, NOISE, chosen.seed + number, harness.FINER)
         row = recovered(scene, targets, truth, moved(truth, signs))
-        print(f"{name:10} worst error {row['worst']:8.3%} after {row['steps']} steps", flush=True)
+        show({key: row[key] for key in ("worst", "steps", "message")}, name)
         return row
 
     with ThreadPoolExecutor(chosen.threads) as pool:
@@ -284,11 +281,7 @@ def main(chosen: Namespace) -> common.Answer:
         first = found_from(0)  # compiles what the others share
         rows = [first, *pool.map(found_from, range(1, len(starts)))]
         left_open = {name: of_variants[name].result() for name in reversed(variants)}
-    share = np.mean([row["worst"] < GOAL for row in rows])
-    print(f"{share:.0%} of starts lead back to within {GOAL:.1%}")
-    for case, row in left_open.items():
-        print(f"{case}: {row['undetermined'] or 'everything is determined'}")
-    result = {
+    return {
         "image": [chosen.size, chosen.size],
         "off": OFF,
         "noise": NOISE,
@@ -298,7 +291,6 @@ def main(chosen: Namespace) -> common.Answer:
         "recovered": dict(zip(starts, rows, strict=True)),
         "left open": left_open,
     }
-    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -5,9 +5,6 @@ Cartesian grids of different spacing, in distances between the samples of a beam
 the converged image of the volume as acquired. Beside the error of a frame at steps of one such distance is
 that of converged frames, which resampling alone brings; and the time of a frame, the time of the conversion,
 and the size of the grid. 8-bit voxels stay 8-bit; one grid is measured in float32, too.
-
-The scan `us_aplio_convex` is read from the folder that JAXVOL_DATA names; without one, only the phantom of
-wires is measured.
 """
 
 import time
@@ -17,12 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import common, elevation_angle, probe_geometry, timing
-from .common import plt
+from . import charts, harness, probe_geometry, timing
+from .harness import experiment, show, some_of
 
 
 SPACINGS = (8.0, 4.0, 2.0, 1.0)
@@ -32,6 +30,7 @@ FLOAT = 2.0
 """The spacing at which a grid of float32 is measured, too: what rounding to 8 bits adds."""
 FINER = 4
 """How many times finer the step of the frames is that show what resampling alone brings."""
+APLIO = "us_aplio_convex_239x128x91_uint8.raw.gz"
 BODY = [(50, (0.1, 0.04, 0.03), 0.0), (90, (0.8, 0.5, 0.35), 0.1), (170, (1.0, 0.9, 0.8), 0.5)]
 
 
@@ -49,6 +48,7 @@ class Scene(NamedTuple):
 
 
 def phantom(name: str, folder: Path | None, size: int, resolution: int) -> Scene:
+    """Spheres and wires, or a fetus."""
     volume, probe = jv.toroidal_phantom(name, (resolution // 3, resolution // 2, resolution))
     camera = jv.Camera((60, -150, -110), (0, 0, 95), (1, 0, 0), 30.0, size=(size, size))
     points = BODY if name == "fetus" else probe_geometry.TISSUE
@@ -56,9 +56,13 @@ def phantom(name: str, folder: Path | None, size: int, resolution: int) -> Scene
 
 
 def scan(folder: Path | None, size: int, resolution: int) -> Scene:
+    """A real convex scan of reverberation; its file has the beam's samples first. Half of its angles and its
+    lengths, mm, are from its header; the angle of elevation is taken as the whole one."""
     assert folder is not None
-    volume = jv.Volume(elevation_angle.scan(folder))
-    probe = elevation_angle.probe_of(elevation_angle.READINGS["whole angle"])
+    data = np.asarray(jv.load(folder / APLIO).data)
+    volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
+    beta, sigma = (np.deg2rad((90 - half, 90 + half)) for half in (54.45 / 2, 38.55))
+    probe = jv.ToroidalMap(22.70 - 52.70, 52.70, beta, sigma, (0, 69.58))
     camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
     return Scene(volume, probe, jv.colormap("gray", (60, 200), (0.0, 0.5)), camera)
 
@@ -88,10 +92,10 @@ def measure(scene: Scene, spacings: tuple[float, ...], repetitions: int) -> dict
         march = jv.March(scene.sample / finer, (*located, jv.AlphaCorrection()), "midpoint")
         return jv.render(grids[name], scene.transfer, scene.camera, march, outputs="rgba")
 
-    truth = frame(DIRECT, common.FINER).rgba
+    truth = frame(DIRECT, harness.FINER).rgba
     seconds = timing.interleaved({name: partial(frame, name) for name in grids}, repetitions)
     for name, row in rows.items():
-        row |= common.row(seconds[name], seconds[DIRECT], rmse(frame(name).rgba, truth))
+        row |= harness.row(seconds[name], seconds[DIRECT], rmse(frame(name).rgba, truth))
         row["rmse, converged"] = rmse(frame(name, FINER).rgba, truth)
         row["MiB"] = round(grids[name].data.nbytes / 2**20, 3)
         row["shape"] = grids[name].shape
@@ -102,7 +106,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     """Error and time of frames against the spacing; as acquired, which has none, as lines."""
     panels = {"rmse, converged": "RMSE by resampling alone", "rmse": "RMSE of a frame"}
     panels |= {"seconds": "seconds for a frame (dotted: and to convert)", "MiB": "size of the voxels, MiB"}
-    figure, axes = plt.subplots(1, len(panels), figsize=(13, 3.4), layout="constrained")
+    figure, (axes,) = charts.panels(1, len(panels), 13, 3.4)
     for number, (scene, rows) in enumerate(result["scenes"].items()):
         mine = [row for name, row in rows.items() if row["spacing"] and "," not in name]
         at = [row["spacing"] for row in mine]
@@ -112,54 +116,42 @@ def draw(result: dict[str, Any], path: Path) -> None:
             if key == "seconds":
                 panel.plot(at, [row[key] + row["convert seconds"] for row in mine], f"C{number}:")
     for panel, label in zip(axes, panels.values(), strict=True):
-        panel.set_xscale("log", base=2)
-        panel.set_yscale("log")
+        charts.logarithmic(panel, x=2, y=10)
         panel.set_xlabel("spacing of the grid / distance between samples", fontsize=8)
-        panel.xaxis.set_major_formatter("{x:g}")
         panel.tick_params(labelsize=8, which="both")
-        panel.yaxis.set_major_formatter("{x:g}")
         panel.set_title(label, fontsize=9)
     figure.suptitle(
         "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid",
         fontsize=9,
     )
     axes[0].legend(fontsize=7)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "scan_conversion",
     "What error does scan conversion bring against rendering as acquired, and what does it cost?",
     __doc__,
+    draw,
     repetitions=7,
     size=128,
     resolution=160,
-    only=common.some_of(SCENES, "SCENE"),
+    only=some_of(SCENES, "SCENE"),
+    spacings=SPACINGS,
+    quick={"size": 24, "resolution": 24, "repetitions": 1, "spacings": (4.0, 2.0)},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, names = common.available(chosen, PHANTOM)
-    spacings = SPACINGS
-    if chosen.quick:
-        chosen.size, chosen.resolution, chosen.repetitions, spacings = 24, 24, 1, (4.0, 2.0)
-    scenes = {}
-    for name in names:
-        scenes[name] = measure(
-            SCENES[name](folder, chosen.size, chosen.resolution), spacings, chosen.repetitions
-        )
-        for grid, row in scenes[name].items():
-            print(
-                f"{name:16} {grid:14} RMSE {row['rmse']:.5f}, converged {row['rmse, converged']:.5f}"
-                f"  {1e3 * row['seconds']:7.1f} ms  to convert {1e3 * row['convert seconds']:7.1f} ms"
-                f"  {row['MiB']:8.2f} MiB",
-                flush=True,
-            )
-    result = {
+def main(chosen: Namespace) -> dict[str, Any]:
+    folder, scenes = harness.data(), {}
+    for name in [PHANTOM] if folder is None or chosen.quick else chosen.only:
+        scene = SCENES[name](folder, chosen.size, chosen.resolution)
+        scenes[name] = measure(scene, chosen.spacings, chosen.repetitions)
+        show(scenes[name], name)
+    return {
         "image": [chosen.size] * 2,
         "repetitions": chosen.repetitions,
-        "spacings": spacings,
+        "spacings": chosen.spacings,
         "scenes": scenes,
     }
-    return result, partial(draw, result)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 import jaxvol as jv
 
 
@@ -86,3 +88,43 @@ SCENES: dict[str, Callable[..., Scene]] = {
     "lidc0314_airway": airway,
     "aneurism": aneurism,
 }
+
+
+def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) -> jv.Volume:
+    """The part of a volume between two corners, given as fractions of its sides."""
+    first, last = (
+        [int(part * n) for part, n in zip(corner, volume.shape, strict=True)] for corner in (low, high)
+    )
+    part = np.asarray(volume.data)[tuple(map(slice, first, last))]
+    origin = np.asarray(volume.origin) + np.array(first) * np.asarray(volume.spacing)
+    return jv.Volume(part, volume.spacing, origin)
+
+
+def inside(scene: Scene, size: int) -> Scene:
+    """The scene seen from its widest empty place, towards what is visible."""
+    from scipy.ndimage import distance_transform_edt  # not at the top: the first image of a process is timed
+
+    volume, transfer = scene.volume, scene.transfer
+    data, spacing = np.asarray(volume.data, np.float64), np.asarray(volume.spacing, np.float64)
+    extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
+    away = np.asarray(distance_transform_edt(extinction <= 0, sampling=spacing))
+    middle = np.zeros(data.shape, bool)
+    middle[tuple(slice(n // 4, -(-3 * n // 4)) for n in data.shape)] = True
+    place = np.unravel_index(np.argmax(np.where(middle, away, -1)), data.shape)
+    origin = np.asarray(volume.origin, np.float64)
+    target = origin + spacing * np.argwhere(extinction > 0).mean(axis=0)
+    camera = jv.Camera(origin + spacing * place, target, (0.1, 0.2, 1.0), 75.0, size=(size, size))
+    return scene._replace(camera=camera)
+
+
+def peaked(scene: Scene) -> Scene:
+    """The scene under a peak 1 % as wide as the range of its voxels, where it becomes opaque."""
+    extinction, values = np.asarray(scene.transfer.extinction), np.asarray(scene.transfer.values)
+    data = np.asarray(scene.volume.data)
+    spread = float(data.max()) - float(data.min())
+    first = int(np.argmax(extinction >= extinction.max() / 2))
+    middle, half = float(values[first]), 0.005 * spread
+    points = middle + half * np.array([-2, -1, 0, 1, 2])
+    colors = np.full((5, 3), (0.9, 0.6, 0.3))
+    # a layer of one voxel at the peak lets through 2 %
+    return scene._replace(transfer=jv.TransferFunction(points, colors, [0, 0, 4 / scene.step, 0, 0]))

@@ -11,60 +11,34 @@ only jaxvol is measured.
 """
 
 from argparse import Namespace
-from collections.abc import Callable
-from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-import jaxvol as jv
 from jaxvol.lighting import Phong
 from jaxvol.metrics import rmse
 
-from . import common, marches, peer_vtk, timing
-from .accuracy import LEFT
-from .common import plt
+from . import charts, marches, programs, timing
+from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
+from .programs import Case, is_here
 from .scenes import PHANTOM, SCENES, Scene
-from .speed import THREADS
 
 
 GOALS = {"over unshaded": 1.8, "VTK's shaded over ours": 2.0}
 OURS, PLAIN, VTK, VTK_PLAIN = "Phong", "unshaded", "VTK, ShadeOn", "VTK, unshaded"
 
 
-def frame(scene: Scene, lighting: Phong | None, step: float) -> Any:
-    transforms = jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
-    march = jv.March(step, transforms, "midpoint")
-    return jv.render(*scene[:3], march, lighting=lighting, outputs="rgba").rgba
-
-
-def over_white(rgba: Any) -> np.ndarray:
-    image = np.asarray(rgba)
-    return image[..., :3] + 1 - image[..., 3:]
-
-
-def by_vtk(scene: Scene, lighting: Phong | None, step: float) -> peer_vtk.Drawn:
-    return peer_vtk.prepare(*scene[:3], step, THREADS, shade=lighting)
-
-
-def measure(scene: Scene, repetitions: int, finer: int) -> dict[str, Any]:
+def measure(scene: Scene, there: dict[str, str], repetitions: int, finer: int) -> dict[str, Any]:
     """Times, their ratios, and the errors of the shaded images."""
-    phong = Phong()
-    programs: dict[str, Callable[[], Any]] = {
-        PLAIN: partial(frame, scene, None, scene.step),
-        OURS: partial(frame, scene, phong, scene.step),
-    }
-    exact = jv.render(*scene[:3], marches.converged(scene.step, finer), lighting=phong, outputs="rgba").rgba
-    errors = {OURS: rmse(over_white(programs[OURS]()), over_white(exact))}
-    if find_spec("vtk") is not None:
-        drawn = {VTK_PLAIN: by_vtk(scene, None, scene.step), VTK: by_vtk(scene, phong, scene.step)}
-        programs |= {name: each.draw for name, each in drawn.items()}
-        errors[VTK] = rmse(drawn[VTK].image(), by_vtk(scene, phong, scene.step / finer).image())
-    seconds = timing.interleaved(programs, repetitions)
+    plain, lit = Case(scene), Case(scene, lighting=Phong)
+    made = {PLAIN: programs.ours()(plain), OURS: programs.ours(lighting=programs.lighting_of)(lit)}
+    exact = programs.program(lit, marches.converged(scene.step, finer), Phong()).image()
+    errors = {OURS: rmse(made[OURS].image(), exact)}
+    if is_here(there, programs.VTK):
+        made |= {VTK_PLAIN: programs.by_vtk(1, plain), VTK: programs.by_vtk(1, lit)}
+        errors[VTK] = rmse(made[VTK].image(), programs.by_vtk(1 / finer, lit).image())
+    seconds = timing.interleaved({name: each.draw for name, each in made.items()}, repetitions)
     found: dict[str, Any] = {
-        "seconds": {name: round(float(np.median(all_)), 5) for name, all_ in seconds.items()},
+        "seconds": {name: timing.median(all_) for name, all_ in seconds.items()},
         "over unshaded": timing.ratio(seconds[OURS], seconds[PLAIN]),
         "rmse": {name: float(error) for name, error in errors.items()},
     }
@@ -74,10 +48,9 @@ def measure(scene: Scene, repetitions: int, finer: int) -> dict[str, Any]:
     return found
 
 
-def draw(scenes: dict[str, Any], path: Path) -> None:
-    figure, axes = plt.subplots(
-        1, len(scenes), figsize=(4.6 * len(scenes), 3), squeeze=False, layout="constrained"
-    )
+def draw(result: dict[str, Any], path: Path) -> None:
+    scenes = result["scenes"]
+    figure, axes = charts.panels(1, len(scenes), 4.6 * len(scenes), 3)
     for panel, (name, row) in zip(axes[0], scenes.items(), strict=True):
         bars = {n: s * 1e3 for n, s in row["seconds"].items()}
         panel.bar(range(len(bars)), list(bars.values()), color=["#bbb", "C2", "#bbb", "C0"][: len(bars)])
@@ -86,34 +59,32 @@ def draw(scenes: dict[str, Any], path: Path) -> None:
         panel.set_title(name, fontsize=9)
     axes[0][0].set_ylabel("time of a frame, ms", fontsize=9)
     figure.suptitle("Frames shaded by the gradient (RMSE: of the shaded image), and unshaded", fontsize=9)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "shading",
     "What does shading by gradients cost, beside the unshaded frame and beside VTK's?",
     __doc__,
+    draw,
     repetitions=15,
     size=512,
-    only=common.some_of(("engine", "bonsai"), "SCENE"),
+    resolution=192,
+    finer={"type": int, "default": 8, "help": "how many times finer the converged image's step is"},
+    only=some_of(("engine", "bonsai"), "SCENE"),
+    quick={"size": 32, "repetitions": 2, "finer": 2, "resolution": 32},
 )
-def main(chosen: Namespace) -> common.Answer:
-    folder, names = common.available(chosen, PHANTOM)
-    finer, more = common.FINER, {}
-    if chosen.quick:
-        chosen.size, chosen.repetitions, finer, more = 32, 2, 2, {"resolution": 32}
-    scenes = {}
-    for name in names:
-        row = scenes[name] = measure(SCENES[name](folder, chosen.size, **more), chosen.repetitions, finer)
-        print(name, row, flush=True)
+def main(chosen: Namespace) -> dict[str, Any]:
+    scenes, there = {}, programs.peers()
+    for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
+        scenes[name] = measure(scene, there, chosen.repetitions, chosen.finer)
+        show(scenes[name], name)
     means = {
-        key: common.geometric_mean(row[key]["median"] for row in scenes.values())
+        key: geometric_mean(row[key]["median"] for row in scenes.values())
         for key in GOALS
         if all(key in row for row in scenes.values())
     }
-    print(means, "the goals are", GOALS)
-    result = {"image": [chosen.size] * 2, "goals": GOALS, "geometric means": means, "scenes": scenes}
-    return result, partial(draw, scenes)
+    return {"image": [chosen.size] * 2, "goals": GOALS, "geometric means": means, "scenes": scenes}
 
 
 if __name__ == "__main__":

@@ -35,3 +35,8 @@ def ratio(seconds: list[float], base: list[float], seed: int = 0) -> dict[str, f
     lower, upper = np.quantile(ratios, (0.25, 0.75))
     found = {"median": np.median(ratios), "lower quartile": lower, "upper quartile": upper}
     return {k: round(float(v), 4) for k, v in {**found, "low": low, "high": high}.items()}
+
+
+def median(seconds: list[float]) -> float:
+    """Of one program's runs."""
+    return round(float(np.median(seconds)), 5)

@@ -20,7 +20,6 @@ error are recorded.
 import time
 from argparse import Namespace
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,8 +34,9 @@ from skimage.transform import iradon, iradon_sart
 import jaxvol as jv
 from jaxvol.metrics import psnr
 
-from . import common
-from .common import plt
+from . import charts
+from .charts import plt
+from .harness import experiment, show
 
 
 DENSEST = 0.1
@@ -192,7 +192,7 @@ def measure(truth: Density, views: int, photons: float | None, setting: Setting,
     return rows
 
 
-def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
+def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
     size = (13.4, 3.5 * len(result) + 3.2)
     figure = plt.figure(figsize=size, layout=ConstrainedLayoutEngine(h_pad=0.08))
@@ -227,10 +227,10 @@ def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     )
     by_time.set(xlabel="seconds, compilation left out")
     by_count.legend(fontsize=7)
-    common.save(figure, path)
+    charts.save(figure, path)
 
 
-@common.experiment(
+@experiment(
     "tomography",
     "Is a density recovered from 24 X-ray views, beside filtered back projection and SART?",
     __doc__,
@@ -239,35 +239,26 @@ def draw(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     photons={"nargs": "*", "type": float, "default": [1e4], "help": "photons per ray; also without noise"},
     sweeps={"type": int, "default": 30, "help": "sweeps of SART"},
     evaluations={"type": int, "default": 45, "help": "of the fit's loss and its gradient"},
+    quick={"resolution": 16, "views": 8, "sweeps": 5, "evaluations": 25},
 )
-def main(chosen: Namespace) -> common.Answer:
-    if chosen.quick:
-        chosen.resolution, chosen.views, chosen.sweeps, chosen.evaluations = 16, 8, 5, 25
-
-    head = jv.phantom("head", chosen.resolution)
-    truth = np.asarray(head.data, np.float32) / 255 * DENSEST
+def main(chosen: Namespace) -> dict[str, Any]:
+    truth = np.asarray(jv.phantom("head", chosen.resolution).data, np.float32) / 255 * DENSEST
     setting = Setting(chosen.sweeps, chosen.evaluations)
-    result = {}
+    found: dict[str, Any] = {}
     for photons in (None, *chosen.photons):
         name = "no noise" if photons is None else f"{photons:g} photons a ray"
-        result[name] = measure(truth, chosen.views, photons, setting, chosen.seed)
-        for method, row in result[name].items():
-            print(
-                f"{name:22} {method:7} RMSE {row['rmse']:.6f} ({row['psnr']:.2f} dB) at {row['at']},"
-                f" at the end {row['rmse at the end']:.6f}; {len(row['all'])} {row['counted in']},"
-                f" {row['all'][-1]['seconds']:.1f} s",
-                flush=True,
-            )
+        found[name] = measure(truth, chosen.views, photons, setting, chosen.seed)
+    pictures(found, truth, chosen.output / "tomography.png")
+    for row in (row for rows in found.values() for row in rows.values()):
+        del row["slice"]
+    show(found)
     return {
         "voxels": list(truth.shape),
         "views": chosen.views,
         "densest": float(truth.max()),
         "steps": {"views": setting.step_of_views, "fit": setting.step},
-        "photons": {
-            name: {method: {k: v for k, v in row.items() if k != "slice"} for method, row in rows.items()}
-            for name, rows in result.items()
-        },
-    }, partial(draw, result, truth)
+        "photons": found,
+    }
 
 
 if __name__ == "__main__":

@@ -1,5 +1,4 @@
-"""How long after the pointer moves does the viewer's coarse image follow, in either face, and how long does a
-viewer take to start, with and without kept programs?
+"""How long after the pointer moves does the viewer's coarse image follow, in either face?
 
 Headless Chromium shows each face, on the same machine as the viewer: it draws without a GPU and takes its
 share of the cores. A move of the pointer is timed from the browser's event until the next coarse image is
@@ -8,8 +7,6 @@ decodes it and draws it after that). Moves come at rest; while a fine image is b
 second, in a drag.
 """
 
-import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -27,8 +24,8 @@ from jaxvol.app.viewer.tiles import SIDE
 from tests.app.viewer.notebook_server import notebook
 from tests.browser import Page, opened
 
-from . import common
-from .common import plt
+from . import charts
+from .harness import experiment, show
 
 
 GOAL = 0.15
@@ -62,30 +59,6 @@ window.Worker = class extends Worker {
 };
 """
 """Notes when the pointer moves and when images arrive, and how wide these are."""
-
-START = """
-import sys, time
-begun = float(sys.argv[1])
-import jaxvol as jv
-from jaxvol.app.viewer.model import Model
-from jaxvol.app.viewer.state import initial
-jv.keep_programs(sys.argv[3])
-volume = jv.load(sys.argv[2])
-how = {"lighting": None, "lit": True, "compositing": "over", "background": (1, 1, 1), "size": (640, 480)}
-scene = initial(volume, jv.preset("head", unit_distance=0.01), None, None, **how)
-seconds = []
-
-
-def show(pixels, stage):
-    seconds.append(time.time() - begun)
-    model.close()
-
-
-model = Model(*scene, show, lambda text: None)
-model.ask(model.state)
-model._thread.join()
-print(seconds[0])
-"""
 
 
 class Watched:
@@ -190,54 +163,9 @@ def _middle(page: Page, element: str) -> tuple[float, float]:
 FACES = {"notebook": in_notebook, "page": on_page}
 
 
-def starts(file: Path, repetitions: int) -> dict[str, Any]:
-    """Seconds from the start of a process until its first image, as a model without a face shows it."""
-    seconds: dict[str, list[float]] = {"nothing kept": [], "kept programs": []}
-    settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
-    for _ in range(repetitions):
-        with tempfile.TemporaryDirectory() as folder:
-            for taken in seconds.values():
-                ran = subprocess.run(
-                    [sys.executable, "-c", START, str(time.time()), str(file), folder],
-                    env=settings,
-                    capture_output=True,
-                    text=True,
-                    check=True,
-                )
-                taken.append(float(ran.stdout))
-    return {name: summary(taken) for name, taken in seconds.items()}
-
-
-@common.experiment(
-    "viewer_latency",
-    "How long after the pointer moves does the viewer's coarse image follow?",
-    __doc__,
-    resolution=256,
-    repetitions=12,
-)
-def main(chosen: Namespace) -> common.Answer:
-    resolution, repetitions = (48, 2) if chosen.quick else (chosen.resolution, chosen.repetitions)
-    found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        head = jv.phantom("head", resolution)
-        file = jv.save(head, folder / "head.npz")
-        begun = {} if chosen.quick else starts(file, 2)
-        for face, shown in FACES.items():
-            found[face] = {}
-            for light, lit in (("unlit", False), ("lit", True)):
-                own = folder / f"{face} {light}"
-                own.mkdir()
-                with shown(file, own, lit=lit) as watched:
-                    found[face][light] = watched.measure(repetitions)
-                print(face, light, json.dumps(found[face][light])[:400], flush=True)
-    result = {"voxels": resolution, "goal": GOAL, "faces": found, "seconds until the first image": begun}
-    return result, lambda path: draw(result, path)
-
-
 def draw(result: dict[str, Any], path: Path) -> None:
     """A dot for each time, a bar at the median."""
-    figure, panel = plt.subplots(figsize=(9, 4.2), layout="constrained")
+    figure, ((panel,),) = charts.panels(1, 1, 9, 4.2)
     labels, place = [], 0
     for face, lights in result["faces"].items():
         for light, kinds in lights.items():
@@ -258,7 +186,32 @@ def draw(result: dict[str, Any], path: Path) -> None:
         f"From a move of the pointer to the viewer's next coarse image, {voxels}³ voxels on two cores;\n"
         "in a drag, from one image to the next"
     )
-    common.save(figure, path)
+    charts.save(figure, path)
+
+
+@experiment(
+    "viewer_latency",
+    "How long after the pointer moves does the viewer's coarse image follow?",
+    __doc__,
+    draw,
+    resolution=256,
+    repetitions=12,
+    quick={"resolution": 48, "repetitions": 2},
+)
+def main(chosen: Namespace) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        file = jv.save(jv.phantom("head", chosen.resolution), folder / "head.npz")
+        for face, shown in FACES.items():
+            found[face] = {}
+            for light, lit in (("unlit", False), ("lit", True)):
+                own = folder / f"{face} {light}"
+                own.mkdir()
+                with shown(file, own, lit=lit) as watched:
+                    found[face][light] = watched.measure(chosen.repetitions)
+        show(found)
+    return {"voxels": chosen.resolution, "goal": GOAL, "faces": found}
 
 
 if __name__ == "__main__":

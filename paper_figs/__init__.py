@@ -1,5 +1,5 @@
 """Figures and tables of the source papers, one script each. Run `python -m paper_figs.NAME`.
 
-Times and errors come from the records of experiments/ (`chae_fig5`, `kisti_table`, `table1`). Scripts that
-show pictures or templates make them; the measures under a picture are of that picture, at any size.
+They compute nothing. Charts and tables are drawn from the records of experiments/; pictures of scenes are
+rendered by `experiments.pictures`, and the measures under a picture are of that picture, at any size.
 """

@@ -2,26 +2,22 @@
 `experiments/minimum_distance.py`, with the number in the paper's text: at R = 8, 53 % less than the distance
 map alone."""
 
-from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from experiments import record
-from experiments.command import command
-from experiments.common import plt, save
+from experiments import charts
 from experiments.minimum_distance import HIERARCHY, MAP, OF_VOXELS, PROVEN, PUBLISHED, VOXELS, named
 
-from .common import OUTPUT, RECORDS
+from .common import from_record
 
 
 PAPER = 8, 0.47  # R, time over that of the distance map
 
 
-def draw(measured: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any], path: Path) -> None:
     """A panel for each scene; below the points of the published method, their shares of wrong pixels."""
-    scenes, cells = measured["result"]["scenes"], measured["result"]["cells"]
-    size = (4.2 * len(scenes) + 0.4, 3.6)
-    figure, (axes,) = plt.subplots(1, len(scenes), figsize=size, squeeze=False, layout="constrained")
+    scenes, cells = result["scenes"], result["cells"]
+    figure, (axes,) = charts.panels(1, len(scenes), 4.2 * len(scenes) + 0.4, 3.6)
     for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for method, style in ((PUBLISHED, "C3o-"), (OF_VOXELS, "C1^-"), (PROVEN, "C0s-")):
             ratios = [rows[named(method, cell)]["ratio"] for cell in cells]
@@ -43,16 +39,11 @@ def draw(measured: dict[str, Any], path: Path) -> None:
         panel.tick_params(labelsize=8)
     axes[0].set_ylabel("time / that by the distance map", fontsize=9)
     figure.suptitle("Bands: 95 % intervals. Red numbers: wrong pixels under min_distance", fontsize=9)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    save(figure, path)
-    print(path)
+    charts.legend_below(figure, axes[0], 3)
+    charts.save(figure, path)
 
 
-@command(__doc__, OUTPUT, results=RECORDS)
-def main(chosen: Namespace) -> None:
-    measured = record.read(chosen.results / "minimum_distance.json")
-    draw(measured, chosen.output / "chae_fig5.webp")
-
+main = from_record(__doc__, "chae_fig5.webp", "minimum_distance", draw)
 
 if __name__ == "__main__":
     main()

@@ -4,7 +4,6 @@
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 
 PAPERS = {
@@ -24,8 +23,8 @@ class Entry:
     - `name`: of the script, and of what it writes.
     - `paper`: a key of `PAPERS`. `title`: what the paper calls it, and what it is about.
     - `reported`: what the paper shows and reports. `ours`: what to look at in ours.
-    - `source`: `"record"`: drawn from the record `record` of an experiment; `"formula"`: computed in seconds;
-      `"scene"`: a scene is rendered, which takes minutes, so that the kept picture is its record.
+    - `record`: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes,
+      so that the kept picture is its record.
     - `data`: whether the kept picture shows real volumes (`--data`).
     """
 
@@ -34,7 +33,6 @@ class Entry:
     title: str
     reported: str
     ours: str
-    source: Literal["record", "formula", "scene"] = "scene"
     record: str | None = None
     data: bool = False
 
@@ -108,7 +106,6 @@ ENTRIES = (
         '"All samples": no ray leaps or ends early; "as in the paper": with early termination and leaps '
         "in all columns, which makes frames shorter and the same cost a larger part of them. Ours cost "
         "more than the paper's: 6 % in the geometric mean with all samples, and 16 % as in the paper.",
-        "record",
         "overhead",
     ),
     Entry(
@@ -120,7 +117,6 @@ ENTRIES = (
         "The cross is the paper's number. Ours, off a distance map of voxels (orange points against the "
         "orange line), gains 16 % in the colon and nothing in the airway: that map alone leaves little to "
         "gain. Bands are 95 % intervals of medians of few runs, and may begin or end at the median.",
-        "record",
         "minimum_distance",
     ),
     Entry(
@@ -140,7 +136,6 @@ ENTRIES = (
         "The formula gives the paper's overlap column, up to a unit that is not explained. Rates follow "
         "the number of loads, not the overlap. In brackets, 95 % intervals of medians of few runs, which "
         "may begin at the median; the splits that take longest were timed once.",
-        "record",
         "bricks",
     ),
     Entry(
@@ -164,7 +159,6 @@ ENTRIES = (
         "Fig. 9: rate against the size of bricks",
         "The best rates lie between 4 and 64 bricks; some splits are 10 times slower than their neighbours.",
         "The paper's rates above, ours below, on the same splits.",
-        "record",
         "bricks",
     ),
     Entry(
@@ -188,7 +182,6 @@ ENTRIES = (
         '"shading skipped", which makes the engine slower here (below 1), since gathering the visible '
         'samples takes longer than shading all. "ESS" alone is `SpaceLeaping`, which skips fetching as '
         "well.",
-        "record",
         "kisti",
     ),
     Entry(
@@ -197,6 +190,7 @@ ENTRIES = (
         "Fig. 1: one packet, and four",
         "A template grown from one packet of light is lopsided; four packets spread it.",
         "The centre of light lies farther from the sample (the cross) with one packet.",
+        "templates",
     ),
     Entry(
         "lee_tables",
@@ -205,7 +199,7 @@ ENTRIES = (
         "Intensities of the brightest photons (last column). First photons are α/4 of four packets; some "
         "are brighter, where light landed on another photon. 0.00945, 0.48284 and 0.48282 lack a zero.",
         "Other random draws, so that only the first rows of each table need agree.",
-        "formula",
+        "templates",
     ),
     Entry(
         "lee_fig_steps",

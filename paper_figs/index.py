@@ -17,8 +17,8 @@ from itertools import starmap
 from pathlib import Path
 from types import ModuleType
 
-from experiments import common, record
-from jaxvol._util.whole_files import whole_file
+from experiments import harness, record
+from experiments.charts import whole_file
 
 from .common import OUTPUT
 from .contents import ENTRIES, PAPERS, Entry
@@ -95,12 +95,10 @@ def _measure(entries: Sequence[Entry], results: Path, quick: bool, say: Callable
 
 def _draw(entry: Entry, folder: Path, results: Path, run: bool, quick: bool) -> None:
     given = ["--output", str(folder)]
-    if entry.source == "record":
+    if entry.record:
         _script("paper_figs", entry.name).main([*given, "--results", str(results)])
-    elif entry.source == "formula":
-        _script("paper_figs", entry.name).main(given)
     elif run:
-        folder_of_data = None if quick else common.data()
+        folder_of_data = None if quick else harness.data()
         real = ["--data", str(folder_of_data)] if folder_of_data and entry.data else []
         _script("paper_figs", entry.name).main([*given, *real, *(["--quick"] if quick else [])])
     elif folder.resolve() != OUTPUT.resolve():
@@ -152,8 +150,6 @@ def origin(entry: Entry, results: Path, run: bool) -> str:
             f"{command}, from the record of `{found['command']}`: commit {found['commit']}, "
             f"{device['processor']}, {device['cores']} cores, JAX {found['versions']['jax']}."
         )
-    if entry.source == "formula":
-        return f"{command}, computed for this page."
     return f"{command}, rendered for this page." if run else f"A picture that was kept; {command} renders it."
 
 

@@ -1,60 +1,48 @@
 """Kim, Kwon and Shin, Fig. 9: rate against the size of bricks. Draws the record of `experiments/bricks.py`,
 with the rates that the paper prints in its Table 1."""
 
-from argparse import Namespace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
-import numpy as np
+from experiments import charts
 
-from experiments import record
-from experiments.bricks import WHOLE
-from experiments.bricks_paper import BEST
-from experiments.command import command
-from experiments.common import plt, save
-
-from .common import OUTPUT, RECORDS
+from .common import from_record
 
 
-def draw(measured: dict[str, Any], path: Path) -> None:
+BEST = "2,4,2"
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
     """Above the paper's rates, below ours, from the largest bricks to the smallest."""
-    rows = measured["result"]["splits"]
+    rows = result["splits"]
     names = sorted(rows, key=lambda name: (rows[name]["bricks"], name))
-    at = np.arange(len(names))
-    figure, (theirs, ours) = plt.subplots(2, 1, figsize=(9, 5.6), sharex=True, layout="constrained")
+    at = range(len(names))
+    figure, ((theirs,), (ours,)) = charts.panels(2, 1, 9, 5.6, sharex=True)
     theirs.plot(at, [rows[n]["paper"]["proposed"] for n in names], "C0o-", label="proposed (overlap)")
     theirs.plot(at, [rows[n]["paper"]["reload"] for n in names], "C1s-", label="reload")
     for method, style in (("overlap", "C0o-"), ("reload", "C1s-"), ("naive", "C3x:")):
         label = "naive, wrong" if method == "naive" else method
         ours.plot(at, [1 / rows[n][method]["seconds"] for n in names], style, label=label)
-    ours.axhline(
-        float(np.median([1 / rows[n][WHOLE]["seconds"] for n in names])),
-        color="0.5",
-        linestyle="--",
-        label="the whole volume at once",
-    )
-    best = ",".join(map(str, BEST))
+    whole = median(1 / rows[n]["whole"]["seconds"] for n in names)
+    ours.axhline(whole, color="0.5", linestyle="--", label="the whole volume at once")
     for panel, title in ((theirs, "the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels"), (ours, None)):
-        voxels, image = measured["result"]["voxels"], measured["result"]["image"]
+        voxels, image = result["voxels"], result["image"]
         mine = f"measured: {' x '.join(map(str, voxels[::-1]))} voxels, {image[0]} x {image[1]} pixels"
         panel.set_title(title or mine, fontsize=9)
         panel.set_yscale("log")
         panel.set_ylabel("frames per second", fontsize=8)
         panel.legend(fontsize=7)
         panel.tick_params(labelsize=7)
-        if best in names:
-            panel.axvline(names.index(best), color="0.8", linewidth=6, zorder=0)
+        if BEST in names:
+            panel.axvline(names.index(BEST), color="0.8", linewidth=6, zorder=0)
     labels = [f"{n}\n{rows[n]['bricks']}" for n in names]
     ours.set_xticks(at, labels, fontsize=7)
     ours.set_xlabel("split β,σ,γ and number of bricks; grey: the paper's best", fontsize=8)
-    save(figure, path)
-    print(path)
+    charts.save(figure, path)
 
 
-@command(__doc__, OUTPUT, results=RECORDS)
-def main(chosen: Namespace) -> None:
-    draw(record.read(chosen.results / "bricks.json"), chosen.output / "kim_fig9.webp")
-
+main = from_record(__doc__, "kim_fig9.webp", "bricks", draw)
 
 if __name__ == "__main__":
     main()

@@ -1,17 +1,15 @@
 """Kim, Kwon and Shin, Table 1: overlap and rates by how a scan is split into bricks. Writes the record of
 `experiments/bricks.py` in Markdown, beside the numbers that the paper prints."""
 
-from argparse import Namespace
 from typing import Any
 
-from experiments import record
-from experiments.bricks import METHODS, WHOLE
-from experiments.command import command
-
-from .common import OUTPUT, RECORDS, write_table
+from .common import table_from_record
 
 
-def table(measured: dict[str, Any]) -> str:
+METHODS = ("overlap", "reload", "naive", "whole")
+
+
+def table(result: dict[str, Any]) -> str:
     """A row for each split: overlap as printed, by the formula, and for the voxels that are measured; what
     was read, loads, and rates, of the paper and ours."""
     head = [
@@ -26,10 +24,10 @@ def table(measured: dict[str, Any]) -> str:
         "time of reload / overlap",
     ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for name, row in measured["result"]["splits"].items():
+    for name, row in result["splits"].items():
         paper, overlap, reload = row["paper"], row["overlap"], row["reload"]
         read = (method["read, times the volume"] for method in (overlap, reload))
-        rates = (1 / row[method]["seconds"] for method in (*METHODS, WHOLE))
+        rates = (1 / row[method]["seconds"] for method in METHODS)
         ratio = reload["ratio to overlap"]
         cells = [
             name.replace(",", " × "),
@@ -48,10 +46,7 @@ def table(measured: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-@command(__doc__, OUTPUT, results=RECORDS)
-def main(chosen: Namespace) -> None:
-    write_table(table(record.read(chosen.results / "bricks.json")), chosen.output / "kim_table1.md")
-
+main = table_from_record(__doc__, "kim_table1.md", "bricks", table)
 
 if __name__ == "__main__":
     main()

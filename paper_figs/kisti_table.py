@@ -3,20 +3,16 @@ Writes the record of `experiments/kisti.py` in Markdown, with shading on as in t
 the report's table, with the quotient of both speed-ups.
 """
 
-from argparse import Namespace
 from typing import Any
 
-from experiments import record
-from experiments.command import command
 from experiments.kisti import BOTH, BOTH_SKIPPED, ERT, ESS, NEITHER, REPORT, SKIPPED
 
-from .common import OUTPUT, RECORDS, write_table
+from .common import table_from_record
 
 
-def table(measured: dict[str, Any], shading: str) -> str:
+def table(result: dict[str, Any], shading: str) -> str:
     """One half of the record of `experiments/kisti.py`, "scenes" (unshaded) or "shaded", and the report's
     table, as one Markdown table."""
-    result = measured["result"]
     sizes, scenes = [str(size) for size in result["sizes"]], result[shading]
     lines = ["| | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
 
@@ -50,9 +46,9 @@ def table(measured: dict[str, Any], shading: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def tested_every(measured: dict[str, Any]) -> str:
+def tested_every(result: dict[str, Any]) -> str:
     """What early termination gains where ended rays are looked for every so many samples."""
-    rows = measured["result"]["ended rays are looked for every so many samples"]
+    rows = result["ended rays are looked for every so many samples"]
     counts = list(rows[next(iter(REPORT))])
     lines = ["| samples | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
     for count in counts:
@@ -64,16 +60,12 @@ def tested_every(measured: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def tables(measured: dict[str, Any]) -> str:
+def tables(result: dict[str, Any]) -> str:
     """All three."""
-    return "\n".join((table(measured, "shaded"), table(measured, "scenes"), tested_every(measured)))
+    return "\n".join((table(result, "shaded"), table(result, "scenes"), tested_every(result)))
 
 
-@command(__doc__, OUTPUT, results=RECORDS)
-def main(chosen: Namespace) -> None:
-    measured = record.read(chosen.results / "kisti.json")
-    write_table(tables(measured), chosen.output / "kisti_table.md")
-
+main = table_from_record(__doc__, "kisti_table.md", "kisti", tables)
 
 if __name__ == "__main__":
     main()

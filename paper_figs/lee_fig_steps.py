@@ -1,157 +1,19 @@
 """Lee, Kwon and Shin, the six steps of shading with a template: the effect of each on an image.
 
-For each step, a scene in which only that step matters is drawn twice: as it is above, and with one thing
-changed below. The template is made by hand, of photons evenly around a sample, so that there is no noise;
-surfaces are so opaque that what lies under them shows only by the light that comes from there. The text under
-each image is the mean of its visible pixels, as linear red, green and blue.
+For each step, a scene in which only that step matters: as it is above, and with one thing changed below.
 """
 
-from argparse import Namespace
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from experiments.pictures.lee_steps import lee_fig_steps
 
-import jax.numpy as jnp
-import numpy as np
-
-import jaxvol as jv
-from jaxvol._util.vec3 import golden_spiral
-from jaxvol.lighting import ConstantLight, DirectionalLight, Light, ScattererTemplate, ScattererTemplates
-
-from .common import BLACK, Page, figure
-
-
-FAR = 0.2
-"""Distance of photons from their sample; the cube is 2 wide."""
-AIR, SKIN, DEEP, DEEPER, VEIL = 0.0, 1.0, 2.0, 3.0, 0.25
-PALE, RED, BLUE, GREY = (0.75, 0.6, 0.5), (0.9, 0.1, 0.05), (0.1, 0.2, 0.9), (0.1, 0.1, 0.1)
-LEFT = DirectionalLight((1.0, 0.3, -0.4), (28.0, 28.0, 28.0))
-BESIDE = DirectionalLight((1.0, -0.25, -0.15), (28.0, 28.0, 28.0))
-ABOVE = DirectionalLight((0.7, 0.1, -0.8), (19.0, 19.0, 19.0))
-SKY = ConstantLight((1.0, 1.0, 1.0))
-Place = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-class Look(NamedTuple):
-    """A scene and its lighting. `values`: the volume's values at points of the cube; `seen`: colours of
-    `DEEP` and `DEEPER`; `inside`: the material of both."""
-
-    caption: str
-    values: Callable[[Place, float], np.ndarray]
-    seen: tuple[Any, Any] = (PALE, PALE)
-    lights: tuple[Light, ...] = (LEFT, SKY)
-    bright: float = 1.0
-    inside: tuple[float, float] = (0.5, 1.4)
-    """Opacity, and refractive index."""
-    cutoff: float = 0.0
-
-
-def inside(distance: np.ndarray, voxel: float) -> np.ndarray:
-    """1 where a distance is below 0, 0 where it is above, with a ramp two voxels wide in between."""
-    return np.clip(0.5 - distance / voxel / 2, 0, 1)
-
-
-def ball(place: Place, voxel: float) -> np.ndarray:
-    x, y, z = place
-    return SKIN * inside(np.sqrt(x**2 + y**2 + z**2) - 0.8, voxel)
-
-
-def floor(place: Place, voxel: float) -> np.ndarray:
-    return SKIN * inside(place[2] + 0.4, voxel)
-
-
-def below_a_ball(place: Place, voxel: float) -> np.ndarray:
-    x, y, z = place
-    above = SKIN * inside(np.sqrt(x**2 + y**2 + z**2) - 0.35, voxel)
-    return np.maximum(floor(place, voxel), above)
-
-
-def layers(place: Place, voxel: float) -> np.ndarray:
-    """A ball of skin with `DEEP` under one half of its surface, and `DEEPER` under that."""
-    x, y, z = place
-    r = np.sqrt(x**2 + y**2 + z**2)
-    half = inside(-z, voxel)
-    values = ball(place, voxel)
-    values = values + half * (DEEP - SKIN) * inside(r - 0.7, voxel)
-    return values + half * (DEEPER - DEEP) * inside(r - 0.53, voxel)
-
-
-def veiled(place: Place, voxel: float) -> np.ndarray:
-    """A ball, and a veil without material before one half of it."""
-    x, y, z = place
-    r = np.sqrt(x**2 + y**2 + z**2)
-    veil = inside(-z, voxel) * inside(abs(r - 0.92) - 0.03, voxel)
-    return np.maximum(ball(place, voxel), VEIL * veil)
+from .common import pictures
 
 
 TITLE = (
     "Lee, Kwon and Shin: the steps of shading, one at a time. "
     "Numbers: mean linear red, green and blue of what is visible"
 )
-STEPS: dict[str, tuple[Look, Look]] = {
-    "1: photons nearer to the light": (
-        Look("a sky, nearer to all", ball, lights=(ConstantLight((4.0, 4.0, 4.0)),)),
-        Look("a sun from the left", ball, lights=(BESIDE,)),
-    ),
-    "2: that are not hidden": (
-        Look("a floor", floor, lights=(ABOVE,)),
-        Look("a ball above it", below_a_ball, lights=(ABOVE,)),
-    ),
-    "3: by their intensity": (Look("0.4 in all", ball, bright=0.4), Look("1 in all", ball)),
-    "4: colour of the same material": (
-        Look("pale inside", layers),
-        Look("red inside, above", layers, seen=(RED, RED)),
-    ),
-    "5: of another material": (
-        Look("red, and blue below", layers, seen=(RED, BLUE), inside=(0.5, 1.4001)),
-        Look("n / n' = 2, α' / α = 1.6", layers, seen=(RED, BLUE), inside=(0.8, 0.7)),
-    ),
-    "6: not where little is seen": (
-        Look("all behind the veil", veiled),
-        Look("cut off there", veiled, cutoff=0.006),
-    ),
-}
 
-
-def around(far: float, count: int = 48) -> ScattererTemplate:
-    """Photons evenly in all directions, whose intensities add to 1."""
-    offset = jnp.asarray(far * golden_spiral(count))
-    return ScattererTemplate(offset[None], jnp.full((1, count), 1 / count))
-
-
-def render(look: Look, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """The image, and which pixels are visible."""
-    spacing = 2 / (resolution - 1)
-    x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
-    volume = jv.Volume(look.values((x, y, z), spacing), (spacing,) * 3, (-1.0,) * 3)
-    deep, deeper = look.seen
-    points = [(0.1, GREY, 0.0), (VEIL, GREY, 0.45), (0.4, GREY, 0.45), (0.5, PALE, 0.45), (0.9, PALE, 0.95)]
-    points += [(1.3, PALE, 0.95), (1.7, deep, 0.95), (2.3, deep, 0.95), (2.7, deeper, 0.95)]
-    transfer = jv.TransferFunction.from_points(points, unit_distance=0.03)
-    camera = jv.Camera.looking_at(volume, (-0.25, -1, 0.3), size=(size, size)).zoom(1.5)
-    march = jv.March(spacing / 4, (jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination()))
-    opacity, index = look.inside
-    materials = [
-        jv.Material(0.5, FAR, 1.4, values=(0.4, 1.5)),
-        jv.Material(opacity, FAR, index, values=(1.5, 4.0)),
-    ]
-    one = around(FAR)
-    both = ScattererTemplate(*(jnp.stack([leaf] * 2) for leaf in (one.offset, look.bright * one.intensity)))
-    lighting = ScattererTemplates(materials, look.lights, given=both, cutoff=look.cutoff)
-    rendering = jv.render(volume, transfer, camera, march, lighting=lighting)
-    return np.asarray(rendering.image(BLACK)), np.asarray(rendering.rgba[..., 3] > 0.5)
-
-
-@figure(__doc__, resolution=96)
-def main(chosen: Namespace) -> None:
-    page = Page(len(STEPS), 2, chosen.size, TITLE)
-    for column, (title, looks) in enumerate(STEPS.items()):
-        for row, look in enumerate(looks):
-            image, visible = render(look, chosen.resolution, chosen.size)
-            mean = " ".join(f"{part:.2f}" for part in image[visible].mean(axis=0))
-            page.draw(row, column, image, f"{look.caption}\n{mean}", title if row == 0 else "")
-            print(f"lee_fig_steps {title}: {look.caption}: {mean}")
-    page.save(chosen.output / "lee_fig_steps.webp")
-
+main = pictures(__doc__, "lee_fig_steps.webp", TITLE, lee_fig_steps, resolution=96)
 
 if __name__ == "__main__":
     main()

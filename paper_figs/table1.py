@@ -2,14 +2,11 @@
 as ratios to ray casting, with those of the paper.
 """
 
-from argparse import Namespace
 from typing import Any
 
-from experiments import record
-from experiments.command import command
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 
-from .common import OUTPUT, RECORDS, write_table
+from .common import table_from_record
 
 
 COLUMNS = (JITTER, EMPTY, BOTH)
@@ -21,13 +18,12 @@ PAPER = {  # seconds, 1024 x 1024 pixels, in the order of the table's columns
 }
 
 
-def table(measured: dict[str, Any]) -> str:
+def table(result: dict[str, Any]) -> str:
     """The record of `experiments/overhead.py` and the paper's table, as one Markdown table."""
     lines = [
         f"| volume | pixels | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
         "|---|" + "---|" * (len(COLUMNS) + 4),
     ]
-    result = measured["result"]
     each = [
         (f"{name}, {said}", size, condition["volumes"][name][str(size)])
         for said, condition in result["conditions"].items()
@@ -47,11 +43,7 @@ def table(measured: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-@command(__doc__, OUTPUT, results=RECORDS)
-def main(chosen: Namespace) -> None:
-    measured = record.read(chosen.results / "overhead.json")
-    write_table(table(measured), chosen.output / "table1.md")
-
+main = table_from_record(__doc__, "table1.md", "overhead", table)
 
 if __name__ == "__main__":
     main()

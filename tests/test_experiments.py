@@ -1,6 +1,7 @@
 """Do the scripts of experiments/ run, at tiny sizes, and write what it takes to run them again?"""
 
 import importlib
+from argparse import Namespace
 from itertools import product
 from pathlib import Path
 
@@ -10,16 +11,9 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
-from experiments import (
-    again,
-    elevation_angle,
-    gradient_errors,
-    record,
-    redraw,
-)
+from experiments import charts, gradient_errors, record, redraw
+from experiments.harness import experiment, recorded
 from experiments.voxel_distances import distances
-
-from .scenes import slow
 
 
 ROOT = Path(__file__).parent.parent
@@ -30,34 +24,63 @@ EXPERIMENTS = sorted(name for name in RECORDS if (ROOT / "experiments" / f"{name
 """Those whose record has their name."""
 
 
-def gradients_miss_jumps_at_the_exit_alone(result):
-    rows = result["relative errors"]["left"]
+def draw_squares(result, path):
+    figure, ((panel,),) = charts.panels(1, 1, 4, 4)
+    panel.plot(list(map(int, result["squares"])), list(result["squares"].values()))
+    charts.save(figure, path)
+
+
+@experiment(
+    "squares",
+    "How large are squares?",
+    "Squares.",
+    draw_squares,
+    size=3,
+    sizes=(1, 2, 3),
+    quick={"size": 2, "sizes": (1, 2)},
+)
+def squares(chosen):
+    rows = {str(size): size**2 for size in chosen.sizes}
+    rows |= recorded("squares", chosen, "squares", (), {"size": 3})
+    return {"size": chosen.size, "squares": rows}
+
+
+def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(tmp_path):
+    squares(["--quick", f"--output={tmp_path}", "--seed", "4"])
+    found = record.read(tmp_path / "squares.json")
+    assert found["command"] == "python -m experiments.squares --quick --seed 4"
+    assert found["question"].endswith("?")
+    assert found["seed"] == 4
+    assert found["versions"]["jaxvol"]
+    assert found["device"]["platform"]
+    assert found["result"] == {"size": 2, "squares": {"1": 1, "2": 4}}
+    assert imread(tmp_path / "squares.png").std() > 10
+    squares(["--output", str(tmp_path)])
+    assert record.read(tmp_path / "squares.json")["result"]["squares"] == {"1": 1, "2": 4, "3": 9}
+
+
+def test_what_is_not_measured_again_is_kept_with_its_commit_if_it_is_of_the_same_sizes(tmp_path):
+    result = {"size": 3, "rows": {"a": {"seconds": 1}, "b": {"seconds": 2}}}
+    path = record.write(tmp_path / "kept.json", "?", result, seed=0, command=["experiments.kept"])
+    made = {key: record.read(path)[key] for key in ("commit", "command")}
+    chosen = Namespace(output=tmp_path, quick=False)
+    assert recorded("kept", chosen, "rows", ["b", "c"], {"size": 3}) == {
+        "b": {"measured": made, "seconds": 2}
+    }
+    assert recorded("kept", chosen, "rows", ["b"], {"size": 4}) == {}
+    chosen.quick = True
+    assert recorded("kept", chosen, "rows", ["b"], {"size": 3}) == {}
+
+
+@pytest.mark.slow
+def test_gradients_miss_jumps_at_the_exit_alone(tmp_path):
+    gradient_errors.main(["--quick", "--output", str(tmp_path)])
+    jax.clear_caches()
+    rows = record.read(tmp_path / "gradient_errors.json")["result"]["relative errors"]["left"]
     plain, aligned = rows["ray casting"], rows["ray casting" + gradient_errors.CUT]
     assert plain["position"][0] < 1e-6  # a short difference crosses no jump
     assert aligned["position"][-1] < 0.05 < 0.5 < plain["position"][-1]
     assert plain["colours"][-1] < 1e-6
-
-
-CHECKS = {
-    "gradient_errors": gradients_miss_jumps_at_the_exit_alone,
-    "elevation_angle": lambda result: None,
-}
-"""Experiments that are run, and what their results must show."""
-
-
-@pytest.mark.parametrize("name", ["elevation_angle", *slow("gradient_errors")])
-def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(name, tmp_path):
-    importlib.import_module(f"experiments.{name}").main(["--quick", "--output", str(tmp_path)])
-    jax.clear_caches()
-    found = record.read(tmp_path / f"{name}.json")
-    assert found["command"].startswith(f"python -m experiments.{name} --quick")
-    assert found["question"].endswith("?")
-    assert found["seed"] == 0
-    assert found["versions"]["jaxvol"]
-    assert found["device"]["platform"]
-    assert found["result"]
-    assert imread(tmp_path / f"{name}.png").std() > 10
-    CHECKS[name](found["result"])
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -68,46 +91,17 @@ def test_every_experiment_takes_its_options(name, capsys):
     assert "--quick" in capsys.readouterr().out
 
 
-def test_every_record_has_a_chart_that_can_be_drawn_and_can_be_made_again(tmp_path, capsys):
-    images = {"elevation_angle", "path_traced", "tomography"}  # which no record holds
+def test_every_record_has_a_chart_that_can_be_drawn(tmp_path):
+    images = {"path_traced", "tomography"}  # which no record holds
     assert set(redraw.DRAWN) - COMPARE == RECORDS - images
+    for name in redraw.DRAWN:  # a record of another name is of the experiment of its command
+        module = record.read(record.RESULTS / f"{name}.json")["command"].split()[2]
+        assert hasattr(importlib.import_module(module), "draw")
     redraw.main(["--only", "overhead", "--output", str(tmp_path)])
     assert min(imread(tmp_path / "overhead.png").shape[:2]) >= 256
-    assert set(again.NAMES) - COMPARE == {*EXPERIMENTS, *again.ARGUMENTS} - COMPARE
-    again.main(["--list", "--only", "speed"])
-    assert "speed" in capsys.readouterr().out
-
-
-def test_a_record_made_again_replaces_its_files_and_pictures_and_no_other(tmp_path, monkeypatch):
-    def run(command, check):
-        new = Path(command[-1])
-        (new / "pareto" / "engine").mkdir(parents=True)
-        for name in ("pareto.json", "pareto.png", "pareto/engine/left.webp", "pareto/engine/scene.json"):
-            (new / name).write_text("new")
-
-    monkeypatch.setattr(again.subprocess, "run", run)
-    (tmp_path / "pareto.json").write_text("old")
-    (tmp_path / "speed.json").write_text("old")
-    again.recorded("pareto", tmp_path)
-    files = {p.relative_to(tmp_path).as_posix(): p.read_text() for p in tmp_path.rglob("*") if p.is_file()}
-    made = dict.fromkeys(("pareto.json", "pareto.png", "pareto/engine/left.webp"), "new")
-    assert files == made | {"speed.json": "old"}
 
 
 # -- what experiments compute themselves ------------------------------------------------------------------
-
-
-def test_perfect_shells_tell_under_which_angle_they_were_made_unless_they_shift():
-    """Planes shifted at random by a fifth of a sample: the readings differ by a hundredth."""
-    rng, sample = np.random.default_rng(0), np.arange(elevation_angle.SHAPE[2])
-    for reading, half in elevation_angle.READINGS.items():
-        echo = elevation_angle.made(half, elevation_angle.SHAPE)
-        found = elevation_angle.measure(echo)
-        assert found["shape that leaves least"] == elevation_angle.COSINE
-        assert found["reading"] == reading
-        for plane in echo[1:]:
-            plane[:] = np.interp(sample + 0.2 * rng.normal(), sample, plane[0])
-        assert elevation_angle.measure(echo)["reading"] == "not settled"
 
 
 def test_distances_of_voxels_are_those_to_the_nearest_cell_that_shows_anything():

@@ -1,15 +1,15 @@
-"""Does `experiments.pareto` find the right fronts, resume, and make points again?"""
+"""Does `experiments.pareto` find the right fronts, and measure each setting beside the base?"""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from experiments import pareto, pareto_measure, pareto_points, pareto_reference
-from experiments.pareto_front import behind, front
+from experiments import pareto, pareto_measure, pareto_points
+from experiments.pareto import behind, front
 from experiments.pareto_points import BASE, SETTINGS, Setting
-from experiments.pareto_programs import Program
-from experiments.pareto_scenes import ROWS, Case
+from experiments.pareto_scenes import ROWS
+from experiments.programs import Case, Program
 from experiments.scenes import PHANTOM, Scene
 
 
@@ -53,48 +53,30 @@ def test_names_are_unique_as_files_and_settings_begin_with_the_base():
         assert "Dr.Jit" not in families
 
 
-@pytest.fixture
-def counted(monkeypatch):
-    """Settings that render nothing and count how often they are made; the reference is all grey."""
-    made = []
+def test_each_setting_is_measured_beside_the_base_and_has_a_picture(monkeypatch, tmp_path):
+    """Settings that render nothing; the reference is all grey."""
 
-    def setting(name, family, error):
-        def make(case):
-            made.append(name)
-            if made.count("stop") == 1 and name == "stop":
-                raise KeyboardInterrupt
-            return Program(lambda: jnp.zeros(()), lambda: np.full((32, 32, 3), 0.5 + error))
+    def setting(family, error):
+        return Setting(
+            family, lambda case: Program(lambda: jnp.zeros(()), lambda: np.full((32, 32, 3), 0.5 + error))
+        )
 
-        return Setting(family, make)
-
-    names = {BASE: ("midpoint", 0.25), "a": ("left", 0.125), "stop": ("adaptive", 0.0625)}
-    settings = {name: setting(name, *how) for name, how in names.items()}
+    settings = {BASE: setting("midpoint", 0.25), "a": setting("left", 0.125), "b": setting("left", 0.0625)}
     volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
     camera = jv.Camera.looking_at(volume, size=(32, 32))
     case = Case(Scene(volume, jv.preset("engine"), camera, 1.0))
-    monkeypatch.setattr(pareto_points, "of", lambda row, there: settings)
     monkeypatch.setattr(pareto_measure, "case_of", lambda row, sizes: case)
-    monkeypatch.setattr(pareto_reference, "converged", lambda case, *_: np.full((32, 32, 3), 0.5))
-    monkeypatch.setattr(pareto_reference, "own_error", lambda *_: {"rmse": 1e-3})
-    return made
-
-
-def test_what_is_finished_is_not_measured_again(counted, tmp_path):
-    def measured(sizes=SIZES):
-        counted[:] = [name for name in counted if name == "stop"]
-        return pareto_measure.scene(OPAQUE, tmp_path, sizes, {}, say=lambda _: None)
-
-    with pytest.raises(KeyboardInterrupt):
-        measured()
-    assert counted == [BASE, BASE, "a", "stop"]
-    kept = measured()
-    assert counted == ["stop", BASE, "stop"]  # what was not finished, beside the base
-    assert {n: p["rmse"] for n, p in kept["points"].items()} == {BASE: 0.25, "a": 0.125, "stop": 0.0625}
-    assert measured() == kept
-    assert counted == ["stop", "stop"]
-    measured(SIZES._replace(repetitions=3))
-    assert counted == ["stop", "stop", BASE, BASE, "a", "stop"]
-    assert {file.suffix for file in tmp_path.iterdir()} == {".json", ".npy", ".webp"}
+    monkeypatch.setattr(pareto_measure, "converged", lambda case, *_: np.full((32, 32, 3), 0.5))
+    monkeypatch.setattr(pareto_measure, "own_error", lambda *_: {"rmse": 1e-3})
+    found = pareto_measure.scene(OPAQUE, tmp_path, SIZES, settings)
+    assert {n: p["rmse"] for n, p in found["points"].items()} == {BASE: 0.25, "a": 0.125, "b": 0.0625}
+    assert found["points"][BASE]["ratio"]["median"] == 1
+    assert len(found["base seconds"]) == 2 * SIZES.repetitions  # beside each family
+    pictures = {file.stem for file in tmp_path.iterdir()}
+    assert pictures == {"reference", *map(pareto_measure.slug, settings)}
+    entry = pareto.concluded(OPAQUE, found, ["--quick"])
+    assert set(entry["points"]) == set(settings)
+    assert entry["points"]["a"]["command"].endswith("--point a --quick")
 
 
 def test_bad_options_are_named(tmp_path):

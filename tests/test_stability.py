@@ -45,13 +45,15 @@ def test_an_edge_is_the_first_value_beyond_the_limit():
 
 def test_record_and_page_hold_every_entry_with_the_edge_of_its_own_curve(tmp_path):
     some = dict(list(RECORDED.items())[:2])  # the documentation's build draws all
-    stability.draw({"entries": some}, record.RESULTS / "stability", tmp_path / "stability.png")
+    stability.draw({"entries": some}, tmp_path / "stability.png")
     text = (tmp_path / "stability.html").read_text(encoding="utf-8")
     assert list(RECORDED) == list(atlas.ENTRIES)
-    assert text.count("data:image/webp") == 2 * len(some)
+    assert text.count("data:image/webp") == 2 * sum(atlas.ENTRIES[name].picture is not None for name in some)
     assert all(f">{name}</h3>" in text for name in some)
     for name, found in RECORDED.items():
         entry = atlas.ENTRIES[name]
+        shown = len(list((record.RESULTS / "stability").glob(f"{name.replace(' ', '-')}.*.webp")))
+        assert shown == (0 if entry.picture is None else 2), name
         assert tuple(found["values"]) == entry.values
         again = edge(found["values"], found["curves"][entry.judged], entry.limit)
         assert again._asdict() == found["edge"]

@@ -1,34 +1,20 @@
 """Where do the methods of jaxvol fail? The entries of the failure atlas, a file for each family of them."""
 
-from . import (
-    adaptive,
-    bricks,
-    clips,
-    fits,
-    labels,
-    leaping,
-    light,
-    normals,
-    opacity,
-    precision,
-    probe,
-    sampling,
-    surfaces,
-)
+from . import adaptive, bricks, faces, fits, leaping, light, normals, opacity, precision, probe, sampling
 from .entry import Entry
 
 
 FAMILIES = {
-    "jitter and sampling": sampling.ENTRIES,
+    "jitter and sampling": (sampling.HAZE, faces.CUT, faces.LABELS, sampling.SHEETS, sampling.OFFSETS),
     "opacity and its gradient": opacity.ENTRIES,
     "adaptive strides": adaptive.ENTRIES,
     "space leaping": leaping.ENTRIES,
     "float types": precision.ENTRIES,
-    "faces of labels": labels.ENTRIES,
-    "clips": clips.ENTRIES,
+    "faces of labels": (faces.FACES,),
+    "clips": (faces.BEHIND,),
     "toroidal maps": probe.ENTRIES,
     "bricks": bricks.ENTRIES,
-    "isosurfaces": surfaces.ENTRIES,
+    "isosurfaces": (sampling.SURFACES,),
     "scatterer templates": light.ENTRIES,
     "shading": normals.ENTRIES,
     "fits": fits.ENTRIES,

@@ -44,11 +44,6 @@ def tolerances(tolerance: float, size: int) -> dict[str, float]:
     return found
 
 
-def tolerance_picture(tolerance: float, size: int) -> np.ndarray:
-    image = waves_image(size, jv.AdaptiveSampling(tolerance, 8))
-    return signed(image - _waves_truth(size), 0.05)
-
-
 TOLERANCE = Entry(
     name="tolerances finer than the finest cell",
     question="Down to which tolerance does adaptive sampling keep its promise?",
@@ -59,10 +54,11 @@ TOLERANCE = Entry(
     metric="RMSE of the image / tolerance",
     judged="finest=1",
     limit=1.0,
-    outcome="documented",
     does="No cell is shorter than a step, here a voxel / finest: below the error of an image of such cells "
     "the tolerance means nothing. A shorter step moves the edge.",
-    picture=tolerance_picture,
+    picture=lambda tolerance, size: signed(
+        waves_image(size, jv.AdaptiveSampling(tolerance, 8)) - _waves_truth(size), 0.05
+    ),
     shows="error of the image with finest=1, ± 0.05 from blue to red",
     pictured=(0.1, 1e-3),
     size=32,
@@ -107,12 +103,6 @@ def light(tolerance: float, size: int) -> dict[str, float]:
     }
 
 
-def light_picture(tolerance: float, size: int) -> np.ndarray:
-    sampling = jv.AdaptiveSampling(tolerance, 16)
-    truth = lit_image(size, PATH, transform=None, lit=True, finer=4)
-    return np.abs(lit_image(size, PATH, transform=sampling, lit=True) - truth) / tolerance
-
-
 LIGHT = Entry(
     name="adaptive strides under light",
     question="What does adaptive sampling miss where light varies and values do not?",
@@ -123,12 +113,9 @@ LIGHT = Entry(
     metric="RMSE of the image / tolerance",
     judged="lit",
     limit=1.0,
-    outcome="documented",
     does="Strides follow from values and transfer function alone, so that in a cube of one value all cells "
     "are as long as allowed, whatever the tolerance: without light that is exact, with light it is "
     "not. Rendering.error does not count it.",
-    picture=lambda tolerance, size: light_picture(tolerance, size // 2),
-    shows="error of a lit cube of one value, over the tolerance",
     size=24,
 )
 

@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 import jaxvol as jv
 
@@ -18,6 +19,9 @@ Curves = dict[str, float]
 """Measured numbers at one value of the regime, by name."""
 
 
+LEVEL = 1 / 255
+
+
 class Entry(NamedTuple):
     """One way in which a method fails.
 
@@ -27,9 +31,9 @@ class Entry(NamedTuple):
     - `regime`: what is swept, with its unit. `values`: from harmless to harmful.
     - `measure`: from a value and the number of pixels along a side to the measured numbers.
     - `metric`: what these numbers are. `judged`: the name of the one that finds the edge.
-    - `limit`: up to which that number counts as good; NaN never does.
-    - `outcome`, `does`: what jaxvol does, in a word and in a sentence.
-    - `picture`: linear RGB image at a value, in [0, 1]; `shows`: what it shows.
+    - `does`: what jaxvol does, in a sentence; `outcome`: in a word.
+    - `limit`: up to which that number counts as good, by default one level of 8 bits; NaN never does.
+    - `picture`: linear RGB image at a value, in [0, 1], where an image is measured; `shows`: what it shows.
     - `pictured`: the two values; by default the last one within the limit and the last one of all.
     - `said`: the name of the number by which jaxvol says that it fails (1) or not (0).
     - `scales`: of both axes of the chart, as in Matplotlib.
@@ -44,11 +48,11 @@ class Entry(NamedTuple):
     measure: Callable[[float, int], Curves]
     metric: str
     judged: str
-    limit: float
-    outcome: Outcome
     does: str
-    picture: Callable[[float, int], np.ndarray]
-    shows: str
+    outcome: Outcome = "documented"
+    limit: float = LEVEL
+    picture: Callable[[float, int], np.ndarray] | None = None
+    shows: str = ""
     pictured: tuple[float, float] | None = None
     said: str | None = None
     scales: tuple[str, str] = ("log", "log")
@@ -98,6 +102,42 @@ def colors(*parts: Any, **how: Any) -> np.ndarray:
     """Colour over black of an image, by the adjoint that compiles fastest."""
     rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
     return np.asarray(rendering.rgba[..., :3], np.float64)
+
+
+def opacities(*parts: Any, **how: Any) -> np.ndarray:
+    """Opacity of each pixel."""
+    rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
+    return np.asarray(rendering.rgba[..., 3], np.float64)
+
+
+def ray_opacities(volume: jv.Volume, transfer: Any, rays: Any, march: jv.March, **how: Any) -> Array:
+    """Opacity of rays, (origins, directions)."""
+    return jv.render_rays(volume, transfer, *rays, march, outputs="rgba", **how).rgba[..., 3]
+
+
+def value_and_slope(function: Callable[[Array], Array]) -> Callable[[Any], tuple[np.float64, np.float64]]:
+    """A function of one number, and its derivative, compiled."""
+    both = jax.jit(jax.value_and_grad(function))
+
+    def of(number: Any) -> tuple[np.float64, np.float64]:
+        value, slope = both(jnp.asarray(number, jnp.float32))
+        return np.float64(value), np.float64(slope)
+
+    return of
+
+
+def rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def along_z(size: int, scale: float = 0.5) -> jv.Camera:
+    """An orthographic camera that looks along z at the middle of [-1, 1]³."""
+    return jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
+
+
+def of_field(field: jv.Field) -> jv.Volume:
+    """The values of a field on [-1, 1]³."""
+    return jv.Volume(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3, field=field)
 
 
 def uniform(extinction: Any, color: White = (1.0, 1.0, 1.0)) -> jv.TransferFunction:

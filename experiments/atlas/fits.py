@@ -83,8 +83,6 @@ UNDETERMINED = Entry(
     outcome="detected and said",
     does="A warning names the parameters that the images do not determine, and their standard errors are "
     "infinite. All others are fitted as if these were not there.",
-    picture=lambda beyond, size: image(transfer(int(beyond)), size),
-    shows="the image that is fitted",
     said="warning",
     scales=("linear", "linear"),
 )
@@ -100,10 +98,6 @@ def start_from(extinction: float, size: int) -> dict[str, float]:
     return {"RMSE after 30 steps": rest, "not converged": float(not found.success)}
 
 
-def start_picture(extinction: float, size: int) -> np.ndarray:
-    return image(transfer(0, extinction), size)
-
-
 STARTS = Entry(
     name="fits from opaque starts",
     question="How opaque may the start of a fit be?",
@@ -114,13 +108,9 @@ STARTS = Entry(
     metric="RMSE of the fitted image",
     judged="RMSE after 30 steps",
     limit=0.001,
-    outcome="documented",
     does="A ray that is opaque from its first cell on shows nothing of what lies behind, and has no "
     "gradient by it: the fit ends in another minimum, or stalls. Start transparent, as jv.flat_grey "
     "does.",
-    picture=start_picture,
-    shows="the image at the start of the fit; that of the truth is the first one",
-    pictured=(1.0, 1000.0),
 )
 
 
@@ -148,11 +138,6 @@ def noisy(deviation: float, size: int) -> dict[str, float]:
     }
 
 
-def noisy_picture(deviation: float, size: int) -> np.ndarray:
-    clean = image(transfer(0), size)
-    return clean + deviation * np.random.default_rng(0).normal(size=clean.shape)
-
-
 NOISE = Entry(
     name="fits under noise",
     question="How noisy may an image be, and does the standard error say how wrong the fit is?",
@@ -167,8 +152,6 @@ NOISE = Entry(
     does="Fit.uncertainty gives the standard error of each number, to first order in the noise; it is "
     "infinite, and a warning says so, where a colour that reaches 0 or 1 no longer depends on its "
     "free variable.",
-    picture=noisy_picture,
-    shows="the image that is fitted",
     said="stated to be beyond",
 )
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, grey
+from .entry import Entry, colors
 
 
 LEVEL = 1 / 255
@@ -67,10 +67,6 @@ def lost(ratio: float, size: int) -> dict[str, float]:
     return found
 
 
-def lost_picture(ratio: float, size: int) -> np.ndarray:
-    return sheet_image(ratio * 16, size, "min_distance", 16)
-
-
 LOST = Entry(
     name="sheets thinner than a cell of rays",
     question="How wide must a structure be, in the image, for a minimum-distance grid with cells of R pixels "
@@ -82,11 +78,10 @@ LOST = Entry(
     metric="share of the sheet's pixels that are wrong",
     judged="min_distance, R = 16",
     limit=0.001,
-    outcome="documented",
     does='Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R '
     'no larger than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which '
     "lose nothing.",
-    picture=lost_picture,
+    picture=lambda ratio, size: sheet_image(ratio * 16, size, "min_distance", 16),
     shows='a sheet seen edge-on before a wall, under "min_distance" with R = 16',
     pictured=(1.0, 0.5),
     scales=("log", "linear"),
@@ -172,20 +167,6 @@ def leapt(extinction: float, size: int) -> dict[str, float]:
     return {"SpaceLeaping": float(abs(with_leaps - exact) / abs(exact))}
 
 
-def leapt_picture(extinction: float, size: int) -> np.ndarray:
-    """The derivative of each pixel's opacity by the extinction around the sphere, in forward mode."""
-    volume, camera = _surrounded(size)
-
-    def image(extinction: Array) -> Array:
-        levels = jnp.stack([extinction, extinction, jnp.full_like(extinction, 3.0)])
-        transfer = jv.TransferFunction([0.0, 0.3, 1.0], np.ones((3, 3)), levels)
-        march = jv.March(0.1, (jv.SpaceLeaping(), jv.AlphaCorrection()))
-        return jv.render(volume, transfer, camera, march, outputs="rgba", adjoint="forward").rgba[..., 3]
-
-    at = jnp.asarray(extinction, jnp.float32)
-    return grey(np.asarray(jax.jvp(image, (at,), (jnp.ones_like(at),))[1]) / 3)
-
-
 LEAPT = Entry(
     name="gradients of what is leapt over",
     question="How transparent may a region be and still get a gradient under space leaping?",
@@ -196,12 +177,9 @@ LEAPT = Entry(
     metric="relative error of the gradient",
     judged="SpaceLeaping",
     limit=0.05,
-    outcome="documented",
     does="What has any extinction above 0 is marched and has its gradient; what has none is leapt over and "
     "has none, although it would. A fit that should make invisible regions visible must start above "
     "0, or not leap.",
-    picture=leapt_picture,
-    shows="derivative of each pixel by the extinction around a sphere; white is 3",
     scales=("symlog", "linear"),
 )
 

@@ -16,22 +16,6 @@ COUNT = 8
 """Templates over which numbers are averaged."""
 
 
-def splats(templates: jv.lighting.ScattererTemplate, size: int, reach: float) -> np.ndarray:
-    """The photons of all templates, seen along z: brightness by intensity, on a logarithmic scale."""
-    offset, light = (np.asarray(part) for part in (templates.offset, templates.intensity))
-    pixels = np.floor((offset[..., :2] / reach + 1) / 2 * size).astype(int)
-    image = np.zeros((size, size))
-    inside = (pixels >= 1).all(axis=-1) & (pixels < size - 1).all(axis=-1)
-    for dx in (-1, 0, 1):
-        for dy in (-1, 0, 1):
-            at = pixels[inside][:, 1] + dy, pixels[inside][:, 0] + dx
-            np.add.at(image, at, light[inside])
-    part = np.clip(1 + np.log10(np.maximum(image, 1e-6)) / 3, 0, 1)
-    image = part[..., None] * np.array([1.0, 0.75, 0.3])
-    image[size // 2, :, 2] = image[:, size // 2, 2] = 0.2  # the sample is where the lines cross
-    return image
-
-
 # -- energy as printed ------------------------------------------------------------------------------------
 
 
@@ -46,11 +30,6 @@ def energy(opacity: float, size: int) -> dict[str, float]:
     return {**found, "α / (1 - α)": opacity / (1 - opacity)}
 
 
-def energy_picture(opacity: float, size: int) -> np.ndarray:
-    printed = printed_templates(jv.Material(opacity, 1.0), 0, count=1, merge=0.0, flights=False)
-    return splats(printed, size, 4.0)
-
-
 ENERGY = Entry(
     name="energy of templates as printed",
     question="At which opacity does a template hold more light than it was given?",
@@ -61,12 +40,8 @@ ENERGY = Entry(
     metric="energy of a template that begins with 1",
     judged="printed, without flights",
     limit=1.0,
-    outcome="documented",
     does="Equations (1) to (3) of the paper, to the letter, pass on α I where (1 - α) I is left: without the "
     "factors of flight, energy grows as α / (1 - α). jaxvol's form, conserving, never exceeds 1.",
-    picture=energy_picture,
-    shows="photons of a template of the printed form, by intensity, ± 4 mean free paths",
-    pictured=(0.45, 0.8),
     scales=("linear", "log"),
 )
 
@@ -86,10 +61,6 @@ def lopsided(packets: float, size: int) -> dict[str, float]:
     }
 
 
-def lopsided_picture(packets: float, size: int) -> np.ndarray:
-    return splats(scatterer_templates(jv.Material(0.4, 1.0), 0, count=1, packets=int(packets)), size, 4.0)
-
-
 LOPSIDED = Entry(
     name="lopsided templates",
     question="How many packets does a template need not to lean to one side?",
@@ -100,13 +71,9 @@ LOPSIDED = Entry(
     metric="distance of the centre of light from the sample, mean free paths",
     judged="one template",
     limit=1.0,
-    outcome="documented",
     does="One packet goes one way, and so does all that comes of it. By default there are four, spread "
     "evenly, which still lean by 0.6 mean free paths at an opacity of 0.4; blending templates takes "
     "off most of that.",
-    picture=lopsided_picture,
-    shows="photons of one template, by intensity, ± 4 mean free paths",
-    pictured=(4.0, 1.0),
 )
 
 
@@ -170,7 +137,6 @@ LONG = Entry(
     metric="difference from path tracing (radiance: powers of 2)",
     judged="pixels, scaled alike",
     limit=0.25,
-    outcome="documented",
     does="The sum of all radiance stays near that of path tracing. But photons of a template lie outside a "
     "ball that is thin against the mean free path, on all sides alike, so that its lit side is no "
     "longer where it was.",
@@ -190,7 +156,6 @@ SHORT = Entry(
     metric="difference from path tracing (radiance: powers of 2)",
     judged="total radiance",
     limit=0.35,
-    outcome="documented",
     does="A sphere of white matter is too dark by a quarter to a third, once it is several mean free paths "
     "thick: the template of a sample near a curved face has more photons outside than on the flat one "
     "that set its scale.",

@@ -65,7 +65,6 @@ NOISE = Entry(
     metric="mean angle between a normal and that without noise, degrees",
     judged="angle",
     limit=10.0,
-    outcome="documented",
     does="A central difference of noise is as large as that of a rise of 0.7 standard deviations per voxel; "
     "interpolation halves it. Angles grow by some 28 degrees times the ratio, up to the 57 of random "
     "normals: what is nearly homogeneous is shaded by its noise. Smooth such volumes.",

@@ -1,6 +1,7 @@
 """Where does accumulating opacity fail? Opaque rays, great extinction, short cells, early termination."""
 
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,57 +10,34 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, cube, finite, grey, signed, uniform
+from .entry import Entry, along_z, cube, finite, ray_opacities, signed, uniform, value_and_slope
 
 
-LEVEL = 1 / 255
 ALIGNED = (jv.AlphaCorrection(),)
+
+
+def one_ray(volume: jv.Volume, extinction: Any, step: float, origin: Any, direction: Any) -> Array:
+    """Opacity of a ray."""
+    rays = jnp.stack([jnp.asarray(each, jnp.float32) for each in origin])[None], jnp.array([direction])
+    return ray_opacities(volume, uniform(extinction), rays, jv.March(step, ALIGNED))[0]
 
 
 # -- opaque cells -----------------------------------------------------------------------------------------
 
-
-def along_z(offset: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """One ray along z through a cube, as arrays of one ray."""
-    return np.array([[offset, 0.2, -3.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32)
-
-
-@jax.jit
-def _opacity(extinction: Array) -> tuple[Array, Array]:
-    """Opacity of a cube of side 2 in four steps, and its derivative by the extinction."""
-
-    def opacity(extinction: Array) -> Array:
-        origins, directions = along_z()
-        march = jv.March(0.5, ALIGNED)
-        return jv.render_rays(cube(), uniform(extinction), origins, directions, march, outputs="rgba").rgba[
-            0, 3
-        ]
-
-    return jax.value_and_grad(opacity)(extinction)
+ORIGIN, AHEAD = (0.1, 0.2, -3.0), (0.0, 0.0, 1.0)
+through = value_and_slope(lambda extinction: one_ray(cube(), extinction, 0.5, ORIGIN, AHEAD))
+"""A cube of side 2, in four steps, by its extinction."""
 
 
 def opaque(depth: float, size: int) -> dict[str, float]:
     """`depth`: optical depth of the cube."""
-    extinction = np.float32(depth / 2)
-    value, slope = (np.float64(number) for number in _opacity(jnp.asarray(extinction)))
-    exact = 2 * np.exp(-2 * np.float64(extinction))
+    extinction = np.float64(np.float32(depth / 2))
+    value, slope = through(extinction)
+    exact = 2 * np.exp(-2 * extinction)
     return {
         "gradient, relative": float(abs(slope - exact) / exact),
-        "opacity": float(abs(value + np.expm1(-2 * np.float64(extinction)))),
+        "opacity": float(abs(value + np.expm1(-2 * extinction))),
     }
-
-
-def ball_picture(extinction: float, size: int) -> np.ndarray:
-    """A ball of this extinction, left rule, steps of 1/32."""
-    transfer = jv.TransferFunction([0.1, 0.5], [(0.9, 0.6, 0.3), (0.3, 0.6, 0.9)], [0.0, extinction])
-    volume = _sphere()
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.7)
-    return colors(volume, transfer, camera, jv.March(1 / 32, ALIGNED))
-
-
-@cache
-def _sphere() -> jv.Volume:
-    return jv.phantom("sphere", 32)
 
 
 OPAQUE = Entry(
@@ -72,23 +50,20 @@ OPAQUE = Entry(
     metric="error",
     judged="gradient, relative",
     limit=0.1,
-    outcome="documented",
     does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 "
     "cannot tell from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not "
     "move.",
-    picture=lambda depth, size: ball_picture(depth, size),
-    shows="a ball of this extinction per unit length, radius 1/2",
     scales=("linear", "log"),
 )
 
 
 def unbounded(extinction: float, size: int) -> dict[str, float]:
-    volume, camera = _sphere(), jv.Camera((0, 0, -3), (0, 0, 0), size=(8, 8), parallel_scale=0.7)
-    image, gradient = _image_and_gradient(volume, camera, jnp.asarray(extinction, jnp.float32))
-    value, slope = _opacity(jnp.asarray(extinction, jnp.float32))
+    camera = along_z(8, 0.7)
+    found = _image_and_gradient(jv.phantom("sphere", 32), camera, jnp.asarray(extinction, jnp.float32))
+    value, slope = through(extinction)
     exact = -np.expm1(-2 * np.float64(np.float32(extinction)))
     return {
-        "not finite": 0.0 if finite((image, gradient, value, slope)) else np.nan,
+        "not finite": 0.0 if finite((found, value, slope)) else np.nan,
         "opacity of a cube": float(abs(value - exact)),
     }
 
@@ -118,52 +93,25 @@ UNBOUNDED = Entry(
     outcome="bounded",
     does="Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to "
     "voxels, camera and extinction are finite up to the largest float32.",
-    picture=ball_picture,
-    shows="a ball of this extinction: beyond one opaque cell, its colour no longer changes",
-    pictured=(1.0, 1e38),
 )
 
 
 # -- grazing exits ----------------------------------------------------------------------------------------
 
-
-@jax.jit
-def _grazing(x: Array) -> tuple[Array, Array]:
-    """Opacity, and its derivative by x, of a ray that cuts an edge of the cube."""
-
-    def opacity(x: Array) -> Array:
-        origin = jnp.stack([x, jnp.full_like(x, -1.5), jnp.full_like(x, 0.1)])[None]
-        direction = jnp.array([[1.0, 1.0, 0.0]])
-        march = jv.March(0.25, ALIGNED)
-        return jv.render_rays(cube(), uniform(1.0), origin, direction, march, outputs="rgba").rgba[0, 3]
-
-    return jax.value_and_grad(opacity)(x)
+past_edge = value_and_slope(lambda x: one_ray(cube(), 1.0, 0.25, (x, -1.5, 0.1), (1.0, 1.0, 0.0)))
+"""A ray that cuts an edge of the cube, by its place x."""
 
 
 def grazing(length: float, size: int) -> dict[str, float]:
     """`length`: of the ray within the cube, at its edge x = 1, y = -1."""
-    x = np.float32(0.5 - length / np.sqrt(2))
-    exact = (0.5 - np.float64(x)) * np.sqrt(2)
-    value, slope = (np.float64(number) for number in _grazing(jnp.asarray(x)))
+    x = np.float64(np.float32(0.5 - length / np.sqrt(2)))
+    value, slope = past_edge(x)
+    exact = (0.5 - x) * np.sqrt(2)
     return {
         "gradient, relative": float(abs(slope + np.sqrt(2) * np.exp(-exact)) / (np.sqrt(2) * np.exp(-exact))),
         "opacity, relative": float(abs(value + np.expm1(-exact)) / max(-np.expm1(-exact), 1e-30)),
         "opacity": float(abs(value + np.expm1(-exact))),
     }
-
-
-def grazing_picture(length: float, size: int) -> np.ndarray:
-    """Opacity, relative to its largest, of a window this wide at an edge of the cube."""
-    line = (np.arange(size, dtype=np.float64) + 0.5) / size
-    x = (0.5 - line * length / np.sqrt(2)).astype(np.float32)
-    z = np.linspace(-0.5, 0.5, size, dtype=np.float32)
-    origins = np.stack(np.broadcast_arrays(x[None, :], np.float32(-1.5), z[:, None]), axis=-1)
-    directions = np.broadcast_to(np.array([1, 1, 0], np.float32), origins.shape)
-    march = jv.March(0.25, ALIGNED)
-    rgba = jv.render_rays(
-        cube(), uniform(1.0), origins, directions, march, outputs="rgba", adjoint="forward"
-    ).rgba
-    return grey(np.asarray(rgba[..., 3]) / -np.expm1(-length))
 
 
 GRAZING = Entry(
@@ -180,53 +128,29 @@ GRAZING = Entry(
     does="The width of the cut cell is a difference of two distances, so its error is that of rounding "
     "them, however short it is: some 1e-7 of the volume's size. The relative error of a nearly "
     "transparent pixel grows, that of the gradient does not.",
-    picture=grazing_picture,
-    shows="opacity of a window of this width at an edge of the cube, relative to its largest: exact, it is "
-    "an even ramp",
-    pictured=(1e-2, 2e-6),
 )
 
 
 # -- exits at the end of a cell ---------------------------------------------------------------------------
 
 
-@jax.jit
-def _at_end(spacing: Array) -> tuple[Array, Array]:
-    """Opacity, and its derivative by the spacing along the ray, of a cube of 8 spacings in steps of 1/4."""
-
-    def opacity(spacing: Array) -> Array:
-        along = jnp.stack([jnp.full_like(spacing, 0.25), jnp.full_like(spacing, 0.25), spacing])
-        volume = jv.Volume(np.ones((9, 9, 9), np.float32), along, [-1.0] * 3)
-        origins, directions = along_z()
-        march = jv.March(0.25, ALIGNED)
-        return jv.render_rays(volume, uniform(1.0), origins, directions, march, outputs="rgba").rgba[0, 3]
-
-    return jax.value_and_grad(opacity)(spacing)
+@value_and_slope
+def spaced(spacing: Array) -> Array:
+    """Opacity of a cube of 8 spacings in steps of 1/4, by the spacing along the ray."""
+    along = jnp.stack([jnp.full_like(spacing, 0.25), jnp.full_like(spacing, 0.25), spacing])
+    volume = jv.Volume(np.ones((9, 9, 9), np.float32), along, [-1.0] * 3)
+    return one_ray(volume, 1.0, 0.25, ORIGIN, AHEAD)
 
 
 def at_end(part: float, size: int) -> dict[str, float]:
     """`part`: of a step that the last cell is wide; 0 where the exit lies exactly at the end of a cell."""
-    spacing = np.float32(0.25 * (1 + part / 8))
-    exact = np.exp(-8 * np.float64(spacing))
-    value, slope = (np.float64(number) for number in _at_end(jnp.asarray(spacing)))
+    spacing = np.float64(np.float32(0.25 * (1 + part / 8)))
+    value, slope = spaced(spacing)
+    exact = np.exp(-8 * spacing)
     return {
         "gradient, relative": float(abs(slope - 8 * exact) / (8 * exact)),
         "opacity": float(abs(value - (1 - exact))),
     }
-
-
-def at_end_picture(part: float, size: int) -> np.ndarray:
-    """The derivative of each pixel by the spacing, over its largest, of an orthographic view."""
-    volume = jv.Volume(np.ones((9, 9, 9), np.float32), [0.25, 0.25, 0.25 * (1 + part / 8)], [-1.0] * 3)
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=1.2)
-
-    def image(spacing: Array) -> Array:
-        scaled = jv.Volume(volume.data, volume.spacing.at[2].set(spacing), volume.origin)
-        march = jv.March(0.25, ALIGNED)
-        return jv.render(scaled, uniform(1.0), camera, march, outputs="rgba", adjoint="forward").rgba[..., 3]
-
-    slope = jax.jvp(image, (volume.spacing[2],), (jnp.ones(()),))[1]
-    return grey(np.asarray(slope) / (8 * np.exp(-2)))
 
 
 AT_END = Entry(
@@ -243,13 +167,8 @@ AT_END = Entry(
     does="The gradient is exact for any e, and where the exit lies exactly at the end of a cell: then the "
     "last cell is not cut, but its width is the exit's to change. This happens in orthographic views along "
     "an axis with steps of one voxel.",
-    picture=at_end_picture,
-    shows="derivative of each pixel by the spacing, seen along z: it should be the same everywhere on the "
-    "cube",
-    pictured=(0.5, 0.0),
     scales=("symlog", "log"),
 )
-
 
 # -- early termination ------------------------------------------------------------------------------------
 
@@ -297,10 +216,6 @@ def termination(left: float, size: int) -> dict[str, float]:
     return found
 
 
-def termination_picture(left: float, size: int) -> np.ndarray:
-    return signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05)
-
-
 TERMINATION = Entry(
     name="early termination in gradients",
     question="How much transmittance may be left out before the gradient is wrong?",
@@ -311,11 +226,10 @@ TERMINATION = Entry(
     metric="error (of gradients: relative)",
     judged="opaque: gradient",
     limit=0.05,
-    outcome="documented",
     does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T "
     "log(1/T) of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or "
     "none.",
-    picture=termination_picture,
+    picture=lambda left, size: signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05),
     shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
     pictured=(1e-4, 0.1),
     size=32,

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors, cube, grey, signed, uniform
+from .entry import Entry, colors, cube, rms, uniform
 
 
 # -- voxels of 16-bit floats ------------------------------------------------------------------------------
@@ -42,10 +42,10 @@ def stored(offset: float, size: int, dtype: Any) -> np.ndarray:
 
 def halves(offset: float, size: int) -> dict[str, float]:
     truth = stored(0, size, jnp.float32)
-    found = {"float32": float(np.sqrt(np.mean((stored(offset, size, jnp.float32) - truth) ** 2)))}
+    found = {"float32": rms(stored(offset, size, jnp.float32) - truth)}
     for name, dtype in TYPES.items():
         try:
-            found[name] = float(np.sqrt(np.mean((stored(offset, size, dtype) - truth) ** 2)))
+            found[name] = rms(stored(offset, size, dtype) - truth)
         except ValueError:  # values that the type does not hold
             found[name] = np.nan
     return found
@@ -60,8 +60,6 @@ HALVES = Entry(
     measure=halves,
     metric="RMSE of the image",
     judged="bfloat16",
-    limit=1 / 255,
-    outcome="documented",
     does="A voxel keeps its type: 8 significant bits in bfloat16, 11 in float16, so that values around "
     "1000 (CT in Hounsfield units + 1000) are rounded to multiples of 4 and of 0.5. float16 ends at "
     "65504, and Volume refuses what is infinite (crosses). Integers of 16 bits keep all of it.",
@@ -96,25 +94,6 @@ def long(samples: float, size: int) -> dict[str, float]:
     }
 
 
-def long_picture(samples: float, size: int) -> np.ndarray:
-    """Error of the opacity of the cube."""
-    return signed(_cube_image(samples, size, None) + np.expm1(-2 * EXTINCTION), 1e-6)
-
-
-MOST = 64
-
-
-def exhausted_picture(samples: float, size: int) -> np.ndarray:
-    return grey(_cube_image(samples, size, MOST))
-
-
-def _cube_image(samples: float, size: int, most: int | None) -> np.ndarray:
-    """Opacity of the cube by rays that need so many samples."""
-    camera = jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.9)
-    march = jv.March(2 / samples, (jv.AlphaCorrection(),), max_samples=most)
-    return colors(cube(), uniform(EXTINCTION), camera, march)[..., 0]
-
-
 LONG = Entry(
     name="rays of very many samples",
     question="How many samples may a ray take before float32 shows?",
@@ -129,9 +108,6 @@ LONG = Entry(
     does="Depths are counted in steps, not summed, so the ten-thousandth sample is as exact as the first. "
     "Opacity is accumulated in float32; its rounding errors grow more slowly than the number of "
     "samples.",
-    picture=long_picture,
-    shows="error of the opacity of a cube, ± 1e-6 from blue to red",
-    pictured=(30.0, 1e3),
 )
 
 EXHAUSTED = Entry(
@@ -143,12 +119,8 @@ EXHAUSTED = Entry(
     measure=long,
     metric="error of the opacity",
     judged="float32",
-    limit=1 / 255,
     outcome="detected and said",
     does="What lies behind the last sample is missing, and Rendering.exhausted marks the ray.",
-    picture=exhausted_picture,
-    shows="a translucent cube, with max_samples=64",
-    pictured=(50.0, 150.0),
     said="exhausted",
 )
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, finite, grey, signed, uniform
+from .entry import Entry, finite, signed, uniform
 
 
 DEGREES = math.pi / 180
@@ -78,7 +78,6 @@ GAPS = Entry(
     metric="share of the gap that is taken for material; share of rays",
     judged="share of the gap",
     limit=0.05,
-    outcome="documented",
     does="Gaps are found ray by ray, whatever the step of the march, by steps that cannot pass a face. A ray "
     "that is nowhere farther outside than some roundings of float32 counts as inside.",
     picture=gap_picture,
@@ -137,19 +136,6 @@ def near_axis(offset: float, size: int) -> dict[str, float]:
     return {"opacity": error if finite((opacity, gradient)) else np.nan}
 
 
-def near_axis_picture(width: float, size: int) -> np.ndarray:
-    """Opacity of a window this wide around the axis, along z, over its largest."""
-    line = (np.arange(size) + 0.5) / size - 0.5
-    x, y = np.meshgrid(width * line, width * line)
-    origins = np.stack([x, y, np.full_like(x, -60.0)], axis=-1).astype(np.float32)
-    directions = np.broadcast_to(np.array([0, 0, 1], np.float32), origins.shape)
-    march = jv.March(2.0, (probe(*NEAR), jv.AlphaCorrection()))
-    rendering = jv.render_rays(
-        ones(), uniform(EXTINCTION), origins, directions, march, outputs="rgba", adjoint="forward"
-    )
-    return grey(np.asarray(rendering.rgba[..., 3]))
-
-
 AXIS = Entry(
     name="rays near the motor axis",
     question="Do image and gradients stay finite and right where a fan touches its axis of rotation?",
@@ -163,9 +149,6 @@ AXIS = Entry(
     outcome="bounded",
     does="On the axis and at the apex, where an angle has no gradient, it is taken as 0. Image and "
     "gradients with respect to probe, voxels and rays are finite.",
-    picture=near_axis_picture,
-    shows="opacity of a window of this width around the axis, seen along z",
-    pictured=(80.0, 1e-3),
     scales=("symlog", "log"),
 )
 

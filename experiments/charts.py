@@ -1,0 +1,65 @@
+"""How charts of experiments are drawn and saved."""
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+from jaxvol._util.whole_files import whole_file
+
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+def panels(rows: int, columns: int, width: float, height: float, **how: Any) -> tuple[Any, Any]:
+    """A figure of so many panels, (rows, columns); its size is in inches."""
+    return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **how)
+
+
+def interval(panel: Any, ratio: Mapping[str, float], y: float, color: str, label: str | None = None) -> None:
+    """A median ratio and its 95 % interval, at a height."""
+    panel.plot((ratio["low"], ratio["high"]), (y, y), color=color, linewidth=2, alpha=0.5)
+    panel.plot(ratio["median"], y, "o", color=color, label=label, markersize=5)
+
+
+def legend_below(figure: Any, panel: Any, columns: int) -> None:
+    """One legend for all panels, below them: that of one panel."""
+    handles = panel.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=8)
+
+
+def logarithmic(panel: Any, x: float | None = None, y: float | None = None) -> None:
+    """Logarithmic scales of these bases, labelled by numbers such as 0.002 and 20, not by powers."""
+    for axis, base, setter in ((panel.xaxis, x, panel.set_xscale), (panel.yaxis, y, panel.set_yscale)):
+        if base is not None:
+            setter("log", base=base)
+            axis.set_major_formatter("{x:g}")
+
+
+def plain_numbers(panel: Any) -> None:
+    """Label logarithmic axes by numbers such as 0.002 and 20, not by powers of ten; on axes of few decades
+    also between these."""
+    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+        if axis.get_scale() == "log" and low > 0:
+            axis.set_major_formatter("{x:g}")
+            leads = (2, 3, 5, 7) if high / low < 6 else (2, 5) if high / low < 30 else ()
+            axis.set_minor_formatter(partial(_labelled, leads))
+
+
+def _labelled(leads: Sequence[int], value: float, _: Any) -> str:
+    """The label of a value that is one of these digits times a power of ten; of others, none."""
+    lead = value / 10 ** math.floor(math.log10(value))
+    return f"{value:g}" if round(lead, 6) in leads else ""
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a chart. Equal results give equal files."""
+    with whole_file(path) as part:
+        exactly: dict[str, Any] = {"pil_kwargs": {"lossless": True}}
+        how = exactly if path.suffix == ".webp" else {"metadata": {"Software": None}}
+        figure.savefig(part, dpi=90, **how)
+    plt.close(figure)

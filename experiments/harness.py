@@ -1,0 +1,235 @@
+"""What all experiments share: options and quick mode, scenes, timed frames with their errors, and records.
+
+An experiment is a question, a function from its options to its result, and a function that draws the result:
+`experiment` makes a script of these, which writes `NAME.json` and `NAME.png`.
+"""
+
+import argparse
+import math
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+import jaxvol as jv
+from jaxvol.metrics import rmse
+
+from . import marches, record, timing
+from .scenes import Scene
+
+
+Main: TypeAlias = Callable[..., None]
+"""`main(argv)`; without `argv`, it takes the arguments of the command line."""
+
+Draw: TypeAlias = Callable[[Any, Path], None]
+"""Draws a result, as it was read from a record, into a file."""
+
+FINER = 8
+"""How many times finer the converged image's step is. By the midpoint rule, its error is some hundred times
+smaller."""
+
+QUICK = {"action": "store_true", "help": "tiny sizes, to check that the script runs"}
+
+HELP = {
+    "output": "default: %(default)s",
+    "size": "pixels along a side",
+    "sizes": "pixels along a side",
+    "resolution": "voxels along an axis of phantoms",
+    "paths": "paths through each pixel",
+}
+"""Of options that several scripts have."""
+
+POSITIONAL = ("commits",)
+
+
+# -- scripts ----------------------------------------------------------------------------------------------
+
+
+def command(about: str | None, output: Path, **options: Any) -> Callable[[Callable[[Namespace], None]], Main]:
+    """Decorator that makes a script's `main` of a function of its options.
+
+    - `about`: what the script does, its docstring.
+    - `output`: default of `--output`, the folder to write into, which is made.
+    - `options`: the other options, by name: the default of an integer, what `add_argument` takes (a dict), or
+      a tuple, which is handed on and cannot be given. Those of `POSITIONAL` are given without their names.
+
+    The arguments as they were given, but for the output, are `argv` among the options.
+    """
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options["output"] = {"type": Path, "default": output, "metavar": "FOLDER"}
+    constants = {name: option for name, option in options.items() if isinstance(option, tuple)}
+    for name, option in options.items():
+        if name not in constants:
+            how = option if isinstance(option, dict) else {"type": int, "default": option}
+            flag = name if name in POSITIONAL else "--" + name.replace("_", "-")
+            parser.add_argument(flag, **{"help": HELP.get(name), **how})
+
+    def made(run: Callable[[Namespace], None]) -> Main:
+        def main(argv: Sequence[str] | None = None) -> None:
+            given = sys.argv[1:] if argv is None else list(argv)
+            chosen = parser.parse_args(given, Namespace(argv=_without_output(given), **constants))
+            chosen.output.mkdir(parents=True, exist_ok=True)
+            run(chosen)
+
+        return main
+
+    return made
+
+
+def _without_output(given: Sequence[str]) -> list[str]:
+    """Arguments without `--output FOLDER` or `--output=FOLDER`."""
+    pairs = zip(["", *given], given, strict=False)
+    return [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]
+
+
+def experiment(
+    name: str,
+    question: str,
+    about: str | None,
+    draw: Draw | None = None,
+    *,
+    quick: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Callable[[Callable[[Namespace], Any]], Main]:
+    """Decorator that makes an experiment's `main` of a function from its options to its result: it writes the
+    record and draws the chart. A result of None writes nothing.
+
+    - `name`: of the module, and of the two files.
+    - `about`: the module's docstring.
+    - `draw`: draws the chart; None if a chart cannot be drawn from the record alone.
+    - `quick`: options and constants under `--quick`.
+    - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
+    """
+
+    if unknown := set(quick or ()) - set(options):
+        raise ValueError(f"quick of {name} must be some of its options; got {', '.join(sorted(unknown))}.")
+
+    def made(measure: Callable[[Namespace], Any]) -> Main:
+        @command(about, record.RESULTS, seed=0, quick=QUICK, **options)
+        def main(chosen: Namespace) -> None:
+            if chosen.quick:
+                vars(chosen).update(quick or {})
+            result = measure(chosen)
+            if result is None:
+                return
+            path = chosen.output / f"{name}.json"
+            record.write(path, question, result, seed=chosen.seed, command=ran(name, chosen))
+            if draw is not None:
+                draw(record.read(path)["result"], path.with_suffix(".png"))
+
+        return main
+
+    return made
+
+
+def ran(name: str, chosen: Namespace) -> list[str]:
+    """Module and arguments of an experiment that runs, as after `python -m`."""
+    return [f"experiments.{name}", *chosen.argv]
+
+
+def recorded(
+    name: str, chosen: Namespace, part: str, others: Iterable[str], same: Mapping[str, Any] = {}
+) -> dict[str, Any]:
+    """Of the record in the output, the rows of `part` with these names, with the commit and the command that
+    measured them; nothing if quick, or if what it says of `same` is something else."""
+    path = chosen.output / f"{name}.json"
+    if chosen.quick or not path.is_file():
+        return {}
+    found = record.read(path)
+    if any(found["result"][key] != value for key, value in same.items()):
+        return {}
+    made = {"commit": found["commit"], "command": found["command"]}
+    rows = found["result"][part]
+    return {each: {"measured": made, **rows[each]} for each in others if each in rows}
+
+
+def some_of(names: Iterable[str], metavar: str) -> dict[str, Any]:
+    """An option that takes some of the names, by default all."""
+    return {"nargs": "+", "choices": list(names), "default": list(names), "metavar": metavar}
+
+
+def show(found: Mapping[str, Any], *where: Any) -> None:
+    """Print a result, a line for each of its rows: the numbers of a row, ratios with their intervals."""
+    rows = {name: row for name, row in found.items() if isinstance(row, Mapping) and "median" not in row}
+    numbers = {n: v for n, v in found.items() if n not in rows and not isinstance(v, list | tuple)}
+    if numbers:
+        told = (f"{name} {_number(value)}" for name, value in numbers.items())
+        print(", ".join(map(str, where)) + ": " + "  ".join(told), flush=True)
+    for name, row in rows.items():
+        show(row, *where, name)
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, Mapping):
+        between = f" [{value['low']:.3f}, {value['high']:.3f}]" if "low" in value else ""
+        return f"{value['median']:.3f}{between}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+# -- scenes -----------------------------------------------------------------------------------------------
+
+
+def data() -> Path | None:
+    """The folder of real volumes that JAXVOL_DATA names, or None."""
+    folder = os.environ.get("JAXVOL_DATA")
+    return Path(folder) if folder else None
+
+
+def chosen_scenes(
+    chosen: Namespace, makers: Mapping[str, Callable[..., Scene]], phantom: str, size: int
+) -> Iterator[tuple[str, Scene]]:
+    """The scenes of `--only`, of this size; without the folder of real volumes, or if quick, the phantom's
+    alone, of `--resolution`."""
+    folder = data()
+    for name in [phantom] if folder is None or chosen.quick else chosen.only:
+        more = {"resolution": chosen.resolution} if name == phantom else {}
+        yield name, makers[name](folder, size, **more)
+
+
+def frame(scene: Scene, march: jv.March) -> jv.Rendering:
+    """The image with all its outputs."""
+    return jv.render(scene.volume, scene.transfer, scene.camera, march)
+
+
+def image(scene: Scene, march: jv.March) -> jv.Rendering:
+    """The image alone, as it is timed."""
+    return jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
+
+
+def entered(scene: Scene) -> np.ndarray:
+    """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
+    return np.asarray(frame(scene, jv.March(scene.step, max_samples=1)).rgba[..., 3] > 0)
+
+
+# -- measures ---------------------------------------------------------------------------------------------
+
+
+def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[str, dict[str, Any]]:
+    """Time and error of a scene's frame under every march. Ratios are relative to the first march."""
+    seconds = timing.interleaved({n: lambda m=m: image(scene, m) for n, m in under.items()}, repetitions)
+    truth = frame(scene, marches.converged(scene.step, FINER)).rgba
+    rows = {}
+    for name, march in under.items():
+        rendering = frame(scene, march)
+        assert not np.any(rendering.exhausted)
+        rows[name] = row(seconds[name], seconds[next(iter(under))], rmse(rendering.rgba, truth))
+        rows[name]["samples"] = int(np.sum(np.asarray(rendering.samples), dtype=np.int64))
+    return rows
+
+
+def row(seconds: list[float], base: list[float], error: Any) -> dict[str, Any]:
+    """A program's time, its ratio to that of another program, and the error of its image."""
+    return {
+        "seconds": timing.median(seconds),
+        "ratio": timing.ratio(seconds, base),
+        "rmse": float(error),
+        "all seconds": [round(s, 5) for s in seconds],
+    }
+
+
+def geometric_mean(values: Iterable[float]) -> float:
+    return round(math.exp(np.mean(np.log(list(values)))), 4)
