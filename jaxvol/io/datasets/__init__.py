@@ -154,7 +154,7 @@ def fetch(
         return target
     url = dataset.url if mirror is None else f"{mirror.rstrip('/')}/{dataset.name}/{dataset.file}"
     pooch.get_logger().setLevel("WARNING")
-    downloader = pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT)
+    downloader: Any = pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT)
     try:
         pooch.retrieve(url, f"sha512:{dataset.sha512}", target.name, target.parent, downloader=downloader)
     except OSError as fault:  # those of requests are among them
