@@ -137,9 +137,10 @@ class March(eqx.Module):
             )
         self.transforms = tuple(transforms)
         kinds = [type(transform) for transform in transforms]
-        for transform, kind in zip(transforms, kinds, strict=True):
+        for transform in transforms:
             if not isinstance(transform, Transform):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
+            kind = type(transform)
             if (count := kinds.count(kind)) > 1:
                 raise ValueError(f"transforms must each be given once; got {kind.__name__} {count} times.")
         if quadrature not in get_args(Quadrature):
