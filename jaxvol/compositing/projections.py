@@ -84,6 +84,9 @@ class Maximum(Extreme):
     Source: VTK's MAXIMUM_INTENSITY_BLEND; Wallis et al. 1989.
     """
 
+    def __init__(self, thickness: Any = 1.0):
+        super().__init__(thickness)
+
     def score(self, value: Scalar) -> Scalar:
         return value
 
@@ -104,6 +107,9 @@ class Minimum(Extreme):
 
     Source: VTK's MINIMUM_INTENSITY_BLEND.
     """
+
+    def __init__(self, thickness: Any = 1.0):
+        super().__init__(thickness)
 
     def score(self, value: Scalar) -> Scalar:
         return -value

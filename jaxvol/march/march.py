@@ -140,9 +140,9 @@ class March(eqx.Module):
         for transform in transforms:
             if not isinstance(transform, Transform):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
-            if (count := kinds.count(type(transform))) > 1:
-                name = type(transform).__name__
-                raise ValueError(f"transforms must each be given once; got {name} {count} times.")
+            kind = type(transform)
+            if (count := kinds.count(kind)) > 1:
+                raise ValueError(f"transforms must each be given once; got {kind.__name__} {count} times.")
         if quadrature not in get_args(Quadrature):
             names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")

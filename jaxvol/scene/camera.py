@@ -159,8 +159,8 @@ class Camera(eqx.Module):
 
         `center`: in fractions of width and height from the top left.
         """
-        factor, middle = number("zoom factor", factor, above=0), finite_array("center", center, (2,))
-        return self._showing(_zoomed(self.window, factor, middle), self.size)
+        factor = number("zoom factor", factor, above=0)
+        return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
 
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""

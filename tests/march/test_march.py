@@ -87,7 +87,7 @@ def opacity(quadrature="left", step=0.3, *, most=80, **on):
         "shift": Shift(),
         "late": Late(on.get("late", 0.0)),
         "halves": Halves(),
-        "long": Long(on.get("long", 1.0), on.get("beyond", 0.0)),
+        "long": Long(steps=on.get("long", 1.0), beyond=on.get("beyond", 0.0)),
         "aligned": jv.AlphaCorrection(),
         "ended": jv.EarlyTermination(on.get("ended", 0.5)),
     }
@@ -167,7 +167,7 @@ def test_stride_lengthens_cells(on, length, samples):
 
 def test_a_run_may_reach_past_the_exit_where_cells_are_cut_there():
     origin, direction = (jnp.asarray(end[0]) for end in RAY)
-    march = jv.March(0.06, (jv.AlphaCorrection(), Long(4.0)))
+    march = jv.March(0.06, (jv.AlphaCorrection(), Long(steps=4.0)))
     found = jv.render_ray_reference(BOX, uniform_transfer(1.0), origin, direction, march)
     assert float(found.rgba[3]) == seen(2)
     assert int(found.samples) == 9
@@ -176,7 +176,7 @@ def test_a_run_may_reach_past_the_exit_where_cells_are_cut_there():
 @pytest.mark.parametrize(("limit", "cells"), [(5, 2), *slow((1, 1), (33, 9))])
 def test_cells_of_several_steps_begin_within_the_limit(limit, cells):
     """Eight cells of four steps, and two of one, in all engines."""
-    march, box = jv.March(0.06, (Long(4),), max_samples=limit), (BOX, uniform_transfer(1.0))
+    march, box = jv.March(0.06, (Long(steps=4),), max_samples=limit), (BOX, uniform_transfer(1.0))
     found = [jv.render_rays(*box, *RAY, march, adjoint=adjoint) for adjoint in ("replay", "direct")]
     found.append(
         jv.render_rays(*box, *RAY, jv.March(0.06, (*march.transforms, jv.SpaceLeaping()), max_samples=limit))

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 from experiments import scenes as real_scenes
-from jaxvol.march.strides import RUN, Run, StrideControl, Strides, predicted, stride_control
+from jaxvol.march.strides import RUN, Run, StrideControl, Strides, predicted
 from jaxvol.march.transforms.adaptive_sampling import _coded, _decoded
 from jaxvol.metrics import rmse
 from jaxvol.scene.occupancy import BLOCK
@@ -37,7 +37,10 @@ OVER = jv.Over()
 def errors(volume, transfer, march, mode):
     """By level of stride and block, the predicted error."""
     known = predicted(march, Affine(volume), Windows.of(volume), partial(mode.variation, transfer))
-    return _decoded(stride_control(known).errors, jnp.float32)
+    (sampling,) = known.transforms
+    assert isinstance(sampling, jv.AdaptiveSampling)
+    assert sampling.errors is not None
+    return _decoded(sampling.errors, jnp.float32)
 
 
 def strides(volume, transfer, sampling, step=1.0, quadrature="preintegrated", mode: Any = OVER):
@@ -246,6 +249,7 @@ def strides_of(march, ray, first, index, stride, target, transmittance):
     at, no = Strides(stride, first, jnp.float32(0)), jnp.zeros((), bool)
     transmittance = transmittance.astype(jnp.float32)
     found, steps = at.next(march, ray, index, target - index, transmittance, leaves=no, finished=no)
+    assert found.error is not None
     return index + steps, found.steps, jnp.sqrt(found.error)
 
 
@@ -260,7 +264,7 @@ def test_runs_are_the_same_however_a_ray_comes_to_them(seed, share, first):
     steps before the ray."""
     random, steps = np.random.default_rng(seed), 16 * RUN * 4
     allowed = random.random((5, steps // RUN)) < share
-    march = jv.March(0.5, (Table(jnp.asarray(allowed), jnp.asarray(first)),))
+    march = jv.March(0.5, (Table(allowed=jnp.asarray(allowed), phase=jnp.asarray(first)),))
 
     def strides(*where):
         return strides_of(march, straight(), np.asarray(first, np.int32), *map(np.asarray, where))
