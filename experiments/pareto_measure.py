@@ -241,7 +241,7 @@ def relative(found: Any, truth: Any, transfer: jv.TransferFunction) -> dict[str,
     visible = np.asarray(transfer.extinction) > 0
 
     def of(g: jax.Array, exact: jax.Array) -> float:
-        g, exact = (np.asarray(each, np.float64)[visible] for each in (g, exact))
-        return float(np.linalg.norm(g - exact) / np.linalg.norm(exact))
+        ours, theirs = (np.asarray(each, np.float64)[visible] for each in (g, exact))
+        return float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
 
     return {"colours": of(found[0], truth[0]), "extinction": of(found[1], truth[1])}

@@ -6,19 +6,22 @@ that something else disturbed.
 """
 
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 
-def interleaved(programs: dict[str, Callable[[], Any]], repetitions: int) -> dict[str, list[float]]:
+Name = TypeVar("Name", bound=Hashable)
+
+
+def interleaved(programs: dict[Name, Callable[[], Any]], repetitions: int) -> dict[Name, list[float]]:
     """Seconds of every run of every program, warm: one run of each to compile it, then rounds of one run
     each, in an order that is reversed from one round to the next."""
     for program in programs.values():
         jax.block_until_ready(program())
-    seconds: dict[str, list[float]] = {name: [] for name in programs}
+    seconds: dict[Name, list[float]] = {name: [] for name in programs}
     for repetition in range(repetitions):
         for name in list(programs)[:: 1 if repetition % 2 == 0 else -1]:
             start = time.perf_counter()

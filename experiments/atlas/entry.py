@@ -110,7 +110,9 @@ def opacities(*parts: Any, **how: Any) -> np.ndarray:
     return np.asarray(rendering.rgba[..., 3], np.float64)
 
 
-def ray_opacities(volume: jv.Volume, transfer: Any, rays: Any, march: jv.March, **how: Any) -> Array:
+def ray_opacities(
+    volume: jv.Volume, transfer: Any, rays: tuple[Any, Any], march: jv.March, **how: Any
+) -> Array:
     """Opacity of rays, (origins, directions)."""
     return jv.render_rays(volume, transfer, *rays, march, outputs="rgba", **how).rgba[..., 3]
 

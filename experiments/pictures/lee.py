@@ -142,7 +142,7 @@ def lee_fig5(chosen: Namespace) -> Panels:
         "unlit": None,
         "Phong": Phong(DirectionalLight(sun.direction, (1.5, 1.5, 1.5)), ambient=0.15),
         "hard, one template for each material": ScattererTemplates(
-            materials, lights, occlusion="hard", choice="material", reach=REACH
+            materials, lights, occlusion="hard", templates=1, reach=REACH
         ),
         "soft, 4 templates blended": ScattererTemplates(materials, lights, **BLENDED),
     }

@@ -108,8 +108,8 @@ def scatterer_templates(
 ) -> ScattererTemplate:
     """Several templates for each of several materials, simulated at once.
 
-    **Arguments:** `materials`: one or several. `count`: templates per material. The others are as for
-    `scatterer_template`.
+    **Arguments:** `materials`: one or several. `count`: templates per material. The others, `key` among them,
+    as for `scatterer_template`.
 
     **Returns:** a `ScattererTemplate` with leading axes (materials, count). The draws are keyed by the index
     of the material and that of the template.

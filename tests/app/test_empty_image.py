@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxvol.compositing.compositing import Over
 
 import jaxvol as jv
 from jaxvol.app import empty_image
+from jaxvol.compositing.blending import Over
 
 
 VOLUME = jv.Volume(np.zeros((2, 2, 2), np.float32))

@@ -13,6 +13,7 @@ from jaxvol._util.vec3 import apart
 from jaxvol.compositing.isosurface import Crossing
 from jaxvol.compositing.selection import RaySampler
 from jaxvol.scene.space import Affine, enter, world_gradient
+from jaxvol.scene.transfer import classification_of
 
 from ..scenes import RESOLUTION, soft_transfer
 
@@ -98,7 +99,7 @@ def at_crossing(volume, value, origin, direction, front, back, rises):
     space, pixel = Affine(volume), (jnp.int32(0), jnp.int32(0))
     ray = enter(space, apart(jnp.stack(origin)), apart(jnp.stack(direction)), pixel)
     gradient = partial(world_gradient, volume, space)
-    sampler = RaySampler(ray, soft_transfer().classification(volume), gradient=gradient)
+    sampler = RaySampler(ray, classification_of(soft_transfer(), volume), gradient=gradient)
 
     def depth(value):
         mode = eqx.tree_at(lambda mode: mode.value, jv.Isosurface(0.0), value)

@@ -99,7 +99,8 @@ def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
     from imageio.v3 import imopen
 
     how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 2}
-    with imopen(path, "w", plugin="FFMPEG", legacy_mode=True) as file:
+    with imopen(path, "w", plugin="FFMPEG", legacy_mode=True) as opened:
+        file: Any = opened
         file.write(images, is_batch=True, fps=fps, ffmpeg_log_level="error", **how)
 
 
