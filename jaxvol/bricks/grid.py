@@ -99,8 +99,6 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     side of a brick need all of it: with less, they are blended in the wrong order. `render_bricks` does not
     use it: how far each brick is read is found from the rays.
 
-    Where it fails, and where not: `experiments/stability.py`, "overlap under k".
-
     **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
 
     **Returns:** K* of each face between two bricks, from the probe outwards, voxels.

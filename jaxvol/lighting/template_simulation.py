@@ -83,7 +83,8 @@ def scatterer_template(
     threshold as energy 1 could fill; differentiable in the material's mean free path, opacity and refractive
     index (at an index of 1, where the critical angle has no derivative, the derivative used is 0).
 
-    Where it fails, and where not: `experiments/stability.py`, "lopsided templates".
+    Where it fails, and where not: `experiments/stability.py`, "lopsided templates",
+    "energy of templates as printed".
 
     **Raises:** `ValueError` for numbers out of range, if `levels` are required but missing, for a tree that
     does not fit into memory, and if all photons are below the threshold. If the opacity is traced, the

@@ -13,13 +13,14 @@ from jaxvol.xla.persistent_cache import default_programs, keep_programs, keep_pr
 SCRIPT = """
 import socket, sys
 import jax, jaxvol as jv
+from jaxvol.xla import persistent_cache
 
 # so far nothing is computed: JAX can still be told of other processes, whose devices are to take part
 with socket.create_server(("localhost", 0)) as free:
     port = free.getsockname()[1]
 jax.distributed.initialize(f"localhost:{port}", 1, 0)
 jax.jit(lambda x: x + 1)(1.0)  # JAX has decided by now that it keeps no programs
-programs.SHORTEST = 0.0
+persistent_cache.SHORTEST = 0.0
 print(jv.keep_programs(sys.argv[1]))
 jax.jit(lambda x: x + 2)(1.0)
 """

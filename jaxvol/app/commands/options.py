@@ -56,7 +56,7 @@ class Command(NamedTuple):
 
 def memory_size(text: str | int) -> int:
     """A number of bytes, such as 1000000, 256M or 2G (powers of 1024)."""
-    found = re.fullmatch(r"(\d{1,15}\.?\d*|\.\d+)([KMG]?)", str(text).strip().upper())
+    found = re.fullmatch(r"(\d{1,15}(?:\.\d*)?|\.\d+)([KMG]?)", str(text).strip().upper())
     count = int(float(found[1]) * 1024 ** " KMG".index(found[2] or " ")) if found else 0
     if count < 1:
         raise argparse.ArgumentTypeError(f"must be a number of bytes, such as 256M or 2G; got {text!r}")

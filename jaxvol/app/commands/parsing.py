@@ -45,7 +45,9 @@ KINDS: Mapping[Any, tuple[str, Any]] = {
 class Parser(argparse.ArgumentParser):
     """Reports errors in one line: the usage of a command with many options would fill the screen."""
 
-    _negative_number_matcher = re.compile(r"^-(\d|\.\d)")  # argparse's own takes -1e-5 for a flag
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"^-(\d|\.\d)")  # argparse's own takes -1e-5 for a flag
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} ({self.prog} --help lists the options)\n")
