@@ -12,9 +12,8 @@ thirty-second of a voxel to four, with leaps and without. Of each kind, the two 
 largest tolerances of their own) within the tolerance are timed; the fastest of all, in turn with the planned
 one.
 
-Last, what planning itself takes, programs being compiled, in images of 512 x 512 pixels under the plan;
-and how long these take, over what was predicted. What a plan takes where programs are not compiled yet is
-the most of a volume's `planning seconds`.
+Last, what planning itself takes, programs being compiled, in images of 512 x 512 pixels under the plan. What a
+plan takes where programs are not compiled yet is the most of a volume's `planning seconds`.
 """
 
 import math
@@ -236,7 +235,7 @@ def measure(scene: Scene, number: int, search: bool, repetitions: int) -> dict[s
 
 
 def cost(scene: Scene, size: int) -> dict[str, dict[str, float]]:
-    """What planning takes, in images under the plan; and the time of these, over what was predicted."""
+    """What planning takes, in images under the plan."""
     c = scene.camera
     camera = jv.Camera(c.position, c.focal_point, c.view_up, c.view_angle, size=(size, size), window=c.window)
     scene = scene._replace(camera=camera)
@@ -249,10 +248,7 @@ def cost(scene: Scene, size: int) -> dict[str, dict[str, float]]:
         }
         times = timing.interleaved(programs, 3)
         taken = float(np.median(times["image"]))
-        found[f"{tolerance:g}"] = {
-            "images": float(np.median(times["plan"])) / taken,
-            "time over predicted": taken / planned.seconds,
-        }
+        found[f"{tolerance:g}"] = {"images": float(np.median(times["plan"])) / taken}
     return found
 
 
@@ -288,7 +284,6 @@ def summary(rows: list[dict[str, Any]], costs: dict[str, dict[str, dict[str, flo
     return {
         "by tolerance": by_tolerance,
         "planning, in images: largest": max((one["images"] for one in each), default=None),
-        "time over predicted": sorted(round(one["time over predicted"], 2) for one in each),
         "planning seconds, programs not compiled": cold,
     }
 

@@ -63,12 +63,6 @@ FAULTS: list[Fault] = [
         ("planning/test_probe.py::test_from_a_part_the_error_is_a_bound_in_most_cases",),
     ),
     Fault(
-        "plan: rounded voxels are kept whatever they change",
-        "planning.storage:stored",
-        lambda stored: lambda probe, setting, march, allowed: stored(probe, setting, march, 1.0),
-        ("planning/test_storage.py::test_type_of_the_voxels",),
-    ),
-    Fault(
         "plan: faces that a clip cuts are not looked at",
         "march.transforms.clip:_Clipped.visible_at_faces",
         lambda faces: lambda self, visible: faces(self, visible)[:6],
