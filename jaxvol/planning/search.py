@@ -82,10 +82,9 @@ class Search:
             found, truth = self._longest("preintegrated", FINEST)
             # the truth may be known better now: good enough for cheaper steps by the midpoint rule
             steps = [step for step, quadrature in self._images if quadrature == "midpoint"]
-            sampled = [self._trial(step, "midpoint", truth) for step in steps]
-            found = min(
-                [found, *(each for each in sampled if each.error <= self.goal)], key=lambda each: each.cost
-            )
+            trials = (found, *(self._trial(step, "midpoint", truth) for step in steps))
+            within = [trial for trial in trials if trial.error <= self.goal]
+            found = min(within, key=lambda trial: trial.cost, default=found)
         step = float(found.march.step) / self.voxel
         if not math.isfinite(found.error):
             why = "the image is not finite, or rays use up their samples"
