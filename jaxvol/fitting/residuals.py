@@ -161,7 +161,7 @@ class ImageResidual(Residual):
         self.scene = cast(SceneFunction, scene)
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
-        self.blur = None if blur is None else _not_negative("blur", blur)
+        self.blur = None if blur is None else not_negative("blur", blur)
         by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
         for number, view in enumerate(_pairs(views)):
             camera, image = _view(number, *view)
@@ -175,7 +175,7 @@ class ImageResidual(Residual):
 
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
-        sigma = None if blur is None else _not_negative("blur", blur)
+        sigma = None if blur is None else not_negative("blur", blur)
         return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
 
     def count(self) -> int:
@@ -258,7 +258,17 @@ class ImageResidual(Residual):
         return (*result, None) if len(result) == 4 else result
 
 
-def _not_negative(name: str, value: Arrayable) -> Float[Array, ""]:
+def cameras_of(residual: ImageResidual) -> list[Camera]:
+    """Cameras of all views of a residual."""
+    return [
+        jax.tree.map(lambda leaf, view=view: leaf[view], group.cameras)
+        for group in residual.groups
+        for view in range(len(group.images))
+    ]
+
+
+def not_negative(name: str, value: Arrayable) -> Float[Array, ""]:
+    """`value` as a number of at least 0."""
     message = f"{name} must not be negative; got {{got}}."
     return require(finite_array(name, value, ()), lambda sigma: sigma >= 0, message)
 
