@@ -123,10 +123,6 @@ def _first_of_each(parts: Sequence[Any], classes: tuple[int, ...]) -> tuple[Any,
 
 def _partitions(partitions: Any, parts: int) -> list[tuple[int, ...]]:
     chain = [tuple(integer("partitions", number, 0) for number in classes) for classes in partitions]
-    if not chain:
-        raise ValueError(
-            "partitions must hold the classes of the parts for at least one candidate; got none."
-        )
     for classes in chain:
         if len(classes) != parts or set(classes) != set(range(max(classes) + 1)):
             raise ValueError(

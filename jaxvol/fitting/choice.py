@@ -83,28 +83,22 @@ class Choice(NamedTuple):
     def __str__(self) -> str:
         best = min(row.held_out_loss for row in self.candidates)
         least = min(row.bic for row in self.candidates)
-        rows = [("", "numbers", "determined", "training", "held out", "worse by", "BIC", "fit")]
+        wide = max(len(row.name) for row in self.candidates)
+        titles = "numbers", "determined", "training", "held out", "worse by", "BIC", "fit"
+        lines = [f"  {'':{wide}}" + "".join(f"{title:>16}" for title in titles)]
         for at, row in enumerate(self.candidates):
-            excess = row.held_out_loss - best
-            rows.append(
-                (
-                    ("> " if at == self.chosen else "  ") + row.name,
-                    str(row.numbers),
-                    str(row.determined),
-                    f"{row.fit.loss:.4g}",
-                    f"{row.held_out_loss:.4g}",
-                    f"{excess:.2g} ± {row.standard_error:.1g}" if excess else "best",
-                    f"+{row.bic - least:.1f}",
-                    "converged" if row.fit.success else "not converged",
-                )
+            cells = (
+                row.numbers,
+                row.determined,
+                f"{row.fit.loss:.4g}",
+                f"{row.held_out_loss:.4g}",
+                f"{row.held_out_loss - best:.2g} ± {row.standard_error:.1g}",
+                f"+{row.bic - least:.1f}",
+                "converged" if row.fit.success else "not converged",
             )
-        wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        return "\n".join(
-            "  ".join(
-                [row[0].ljust(wide[0]), *(cell.rjust(n) for cell, n in zip(row[1:], wide[1:], strict=True))]
-            )
-            for row in rows
-        )
+            mark = ">" if at == self.chosen else " "
+            lines.append(f"{mark} {row.name:{wide}}" + "".join(f"{cell!s:>16}" for cell in cells))
+        return "\n".join(lines)
 
 
 def choose(
