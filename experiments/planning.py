@@ -12,8 +12,8 @@ thirty-second of a voxel to four, with leaps and without. Of each kind, the two 
 largest tolerances of their own) within the tolerance are timed; the fastest of all, in turn with the planned
 one.
 
-Last, what planning itself takes, programs being compiled, in images of 512 x 512 pixels under the plan. What a
-plan takes where programs are not compiled yet is the most of a volume's `planning seconds`.
+Last, what planning itself takes, programs being compiled, in images of 512 x 512 pixels under the plan. Where
+programs are not compiled yet, it takes the most of a volume's `planning seconds`.
 """
 
 import math

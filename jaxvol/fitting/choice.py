@@ -145,7 +145,7 @@ def choose(
       pixels, more for pictures that were smoothed or compressed.
     - `callback`: `callback(name, step, parameters, loss)`, of each fit.
     - `checkpoint`: a file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
-    - `options`: others of `fit`, such as `max_steps` and `progress`, for all candidates.
+    - `options`: others of `fit`, such as `max_steps`, for all candidates.
 
     **Returns:** a `Choice`, with the evidence for each candidate. If the largest is chosen, a larger one may
     be better still. Undetermined directions are counted there, in place of the warnings of `fit`.

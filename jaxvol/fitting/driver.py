@@ -38,7 +38,6 @@ UNDETERMINED = ".*directions are not determined"
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
 
-
 SELDOM = 9
 """Times as long as a checkpoint took, until the next one."""
 
@@ -164,7 +163,14 @@ def fit(
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     problem = Problem(residual, free, tile_entries(residual, y, max_jacobian, least_squares))
 
-    run = _Run.begin(solver, problem, y)
+    state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
+    run = _Run(y, state, y, y, None, done, optx.RESULTS.successful, [])
+    run = run.step(solver, problem)
+    if not math.isfinite(run.losses[0]):
+        raise ValueError(
+            "residual must be finite at the parameters that the fit starts from; half the sum of its squares "
+            f"is {run.losses[0]}."
+        )
     kinds = [type(bijection).__name__ for bijection in free.bijections]
     about = {
         "solver": type(solver).__name__,
@@ -225,20 +231,6 @@ class _Run(eqx.Module):
     done: Array
     result: Any
     losses: list[float] = eqx.field(static=True)
-
-    @classmethod
-    def begin(cls, solver: Any, problem: Problem, y: FreeVariables) -> "_Run":
-        """State after the first step, which evaluates the loss at the start."""
-        state = _init_state(solver, problem, y)
-        done = jnp.zeros((), bool)
-        run = cls(y, state, y, y, None, done, optx.RESULTS.successful, [])
-        run = run.step(solver, problem)
-        if not math.isfinite(run.losses[0]):
-            raise ValueError(
-                f"residual must be finite at the parameters that the fit starts from; half the sum of its "
-                f"squares is {run.losses[0]}."
-            )
-        return run
 
     def step(self, solver: Any, problem: Problem) -> "_Run":
         y, state, (loss, evaluated, triangle), done, result = _advance(solver, problem, self.y, self.state)

@@ -45,7 +45,6 @@ class Tiles(NamedTuple):
 
     residual: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
     items: PyTree
-    entries: int
 
 
 class Residual(eqx.Module):
@@ -100,7 +99,7 @@ class OwnResidual(Residual):
         def residual(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
             return ravel_pytree(self.function(parameters))[0]
 
-        return [Tiles(residual, jnp.zeros(1), self.length)]
+        return [Tiles(residual, jnp.zeros(1))]
 
 
 class _Group(eqx.Module):
@@ -229,7 +228,7 @@ class ImageResidual(Residual):
             return difference.reshape(-1)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
-        return Tiles(residual, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
+        return Tiles(residual, (jnp.asarray(view), jnp.asarray(piece * rows)))
 
     def _scene(
         self, parameters: PyTree, group: _Group, view: Int[Array, ""]
