@@ -130,9 +130,9 @@ def camera_of(random: np.random.Generator, volume: jv.Volume, size: int) -> jv.C
     return camera.zoom(2 ** random.uniform(-0.5, 2))
 
 
-def image(scene: Scene, march: jv.March, volume: jv.Volume | None = None) -> np.ndarray:
-    _, whole, transfer, camera = scene
-    return np.asarray(jv.render(volume or whole, transfer, camera, march, outputs="rgba").rgba, np.float64)
+def image(scene: Scene, march: jv.March) -> np.ndarray:
+    _, volume, transfer, camera = scene
+    return np.asarray(jv.render(volume, transfer, camera, march, outputs="rgba").rgba, np.float64)
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -204,7 +204,7 @@ def searched(
     once = {name: min(seconds(march) for _ in range(2)) for name, march in within.items()}
     best = sorted(once, key=lambda name: once[name])[:3]
     programs: dict[str, Any] = {name: partial(image, scene, within[name]) for name in best}
-    programs["plan"] = partial(image, scene, found.march, found.volume)
+    programs["plan"] = partial(image, scene, found.march)
     times = timing.interleaved(programs, repetitions)
     fastest = min(best, key=lambda name: float(np.median(times[name])))
     return {
@@ -219,7 +219,7 @@ def measure(scene: Scene, number: int, search: bool, repetitions: int) -> dict[s
     row: dict[str, Any] = {"volume": scene.name, "own error of the converged image": own, "plans": {}}
     for tolerance in TOLERANCES:
         found = jv.plan(scene.volume, scene.transfer, scene.camera, tolerance, seed=number)
-        error = distance(image(scene, found.march, found.volume), truth)
+        error = distance(image(scene, found.march), truth)
         each: dict[str, Any] = {
             "error": error,
             "predicted": found.error,
@@ -244,7 +244,7 @@ def cost(scene: Scene, size: int) -> dict[str, dict[str, float]]:
         planned = jv.plan(scene.volume, scene.transfer, camera, tolerance)
         programs = {
             "plan": lambda t=tolerance: jv.plan(scene.volume, scene.transfer, camera, t).march.step,
-            "image": lambda p=planned: image(scene, p.march, p.volume),
+            "image": lambda p=planned: image(scene, p.march),
         }
         times = timing.interleaved(programs, 3)
         taken = float(np.median(times["image"]))
