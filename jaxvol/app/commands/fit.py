@@ -40,7 +40,6 @@ def _fit(options: argparse.Namespace) -> None:
             solver=options.solver,
             max_steps=options.max_steps,
             checkpoint=options.checkpoint,
-            checkpoint_seconds=0,  # Ctrl-C may come at any time, and a checkpoint is small
             callback=lambda step, parameters, loss: report(step, options.max_steps),
         )
     path = write_transfer(options.output, result.parameters)

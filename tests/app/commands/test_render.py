@@ -159,7 +159,7 @@ def plans(monkeypatch):
 
     def plan(volume, transfer, camera, tolerance, **how):
         march, parts = jv.March(0.7, how["transforms"]), (Part("leaps", False, "nothing is empty"),)
-        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 0.1, 9.0, parts, 1.0)
+        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 9.0, parts, 1.0)
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
@@ -206,7 +206,7 @@ def test_render_needs_nothing_but_a_file_and_plan_says_how(volume_file, tmp_path
     assert main(["plan", str(volume_file), "--size", "16", "16", "--tolerance", str(1 / 255)]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"step [\d.e-]+, (midpoint|preintegrated)", printed)
-    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping", "voxels as uint8"):
+    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping"):
         assert word in printed
     for bad in ("0", "nan", "2"):
         assert main(["plan", str(volume_file), "--tolerance", bad]) == 2
