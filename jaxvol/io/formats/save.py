@@ -1,6 +1,7 @@
 """Writes volumes to files that `load` reads again as they were."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,7 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 
     **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
     of voxels that the format cannot hold, a file that cannot be written, and a `.raw` file beside an `.mhd`
-    that is not the `.mhd`'s own. `ImportError` if the format
-    needs SimpleITK, and it is missing.
+    that is not the `.mhd`'s own. `ImportError` if the format needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
         hint = " The volume comes first, as in save(volume, path)." if isinstance(path, Volume) else ""
@@ -78,15 +78,13 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 def _check_beside(path: Path) -> None:
     """**Raises** `ValueError` if voxels of something else lie where those of an `.mhd` are written."""
     voxels = path.with_suffix(".raw")
-    try:
-        own = not voxels.exists() or (path.is_file() and metaimage_data(path).resolve() == voxels.resolve())
-    except ValueError:  # what is replaced is no MetaImage
-        own = False
-    if not own:
-        raise ValueError(
-            f"path: the voxels of {path.name} would replace {voxels}, which does not belong to it. Save it "
-            "under another name, or as .mha, which is one file."
-        )
+    with suppress(ValueError):  # what is replaced is no MetaImage
+        if not voxels.exists() or (path.is_file() and metaimage_data(path).resolve() == voxels.resolve()):
+            return
+    raise ValueError(
+        f"path: the voxels of {path.name} would replace {voxels}, which does not belong to it. Save it under "
+        "another name, or as .mha, which is one file."
+    )
 
 
 def _write_npz(volume: Volume, path: Path) -> None:
