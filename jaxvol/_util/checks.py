@@ -96,9 +96,8 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
             given = value
         else:  # a sequence may hold traced numbers
             given = jnp.asarray(value) if is_traced(value) else np.asarray(value)
-        if (
-            getattr(given.dtype, "kind", "O") not in "biufV"
-        ):  # O: keys of `jax.random`; V: JAX's own 8- and 16-bit floats
+        # V: JAX's own 8- and 16-bit floats; keys of `jax.random` have no kind
+        if getattr(given.dtype, "kind", "O") not in "biufV":
             raise TypeError
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             cast = given.astype(jnp.result_type(float)) if isinstance(given, np.ndarray) else given
@@ -150,7 +149,7 @@ def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) ->
 
 
 def integer(name: str, value: Any, least: int, most: int | None = None, *, otherwise: str = "") -> int:
-    """`value` as an integer from `least` to `most`, inclusive. `otherwise`: an alternative for the message."""
+    """`value` as an integer from `least` to `most`, inclusive. `otherwise`: what else may come."""
     whole = None
     if not is_flag(value):
         with contextlib.suppress(TypeError):

@@ -6,8 +6,9 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Literal, TypeAlias
 
 import numpy as np
 
@@ -21,6 +22,9 @@ MOST_COMPRESSED = (
 # RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
+Stream: TypeAlias = BufferedIOBase | IO[bytes]
+"""Of a file, of gzip, of a member of a zip archive."""
+
 
 def file_size(path: Path) -> int:
     """Size in bytes of a regular, non-empty file."""
@@ -33,7 +37,7 @@ def file_size(path: Path) -> int:
     return size
 
 
-def read_all(path: Path, stream: IO[bytes], expected: int) -> bytearray:
+def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
     """All bytes of a stream, which must be `expected`; at most one more is read."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing
     while chunk := stream.read(min(expected + 1 - len(content), CHUNK)):

@@ -30,8 +30,8 @@ def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         step = even[1] - even[0] if at.size > 1 else 0.0
         if not (step and np.abs(at - even).max() <= 1e-3 * abs(step)):  # NaN, too
             raise ValueError(
-                f"data must have evenly spaced numbers as coordinates; got others along {name!r}. Interpolate "
-                "to even ones first (DataArray.interp), or drop them."
+                f"data must have evenly spaced numbers as coordinates; got others along {name!r}. "
+                "Interpolate to even ones first (DataArray.interp), or drop them."
             )
         if step < 0:
             data, at = np.flip(data, axis), at[::-1]

@@ -3,11 +3,10 @@
 import math
 import zipfile
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
-from .files import CORRUPT, MOST_VOXELS, as_array, check_size, decoding, file_size, read_all
+from .files import CORRUPT, MOST_VOXELS, Stream, as_array, check_size, decoding, file_size, read_all
 
 
 VOLUME = ("data", "spacing", "origin", "direction", "labels")
@@ -49,7 +48,7 @@ def npz_names(path: Path) -> list[str]:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
-def npy_header(path: Path, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, whether the first axis is fastest, and type of the array that a `.npy` stream holds; the stream
     then stands at its first byte."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -67,7 +66,7 @@ def npy_header(path: Path, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np
     return shape, fortran, dtype
 
 
-def _array(path: Path, stream: IO[bytes], size: int) -> np.ndarray:
+def _array(path: Path, stream: Stream, size: int) -> np.ndarray:
     shape, fortran, dtype = npy_header(path, stream)
     if not 0 < math.prod(shape) <= MOST_VOXELS or min(shape, default=1) < 0:
         raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")

@@ -134,8 +134,8 @@ def fetch(
     it; `ImportError` if a download needs pooch, and it is missing.
     """
     dataset = info(name)
-    own = Path(os.environ.get("JAXVOL_DATA", ""), dataset.file)
-    for path in (own, own.with_name(f"{own.name}.gz")) if "JAXVOL_DATA" in os.environ else ():
+    own = os.environ.get("JAXVOL_DATA")
+    for path in (Path(own, dataset.file), Path(own, f"{dataset.file}.gz")) if own else ():
         if path.is_file():
             return _of_right_size(path, dataset)
     try:
