@@ -98,9 +98,24 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
         beta = _ends(path, BETAS, np.array(read(BETAS, f"<{shape[0]}d")))
         sigma = _ends(path, SIGMAS, np.array(read(SIGMAS, f"<{shape[1]}d")))
         resolution, first, apex = (read(tag, "<d")[0] for tag in (RESOLUTION, OFFSET_B, OFFSET_A))
-        probe = _probe(path, 1000 * resolution, first, apex, beta, sigma, shape[2])
         stream.seek(items[VOXELS][0])
         content = stream.read(expected)
+    if not 0 < resolution < math.inf:
+        raise ValueError(
+            f"path: {path}: item {_name(RESOLUTION)} must be a positive length in metres; got {resolution}."
+        )
+    step = 1000 * resolution  # mm
+    a, b = apex * step, first * step
+    try:
+        probe = ToroidalMap(a, b, beta, sigma, (0.0, (shape[2] - 1) * step))
+    except ValueError as fault:
+        raise ValueError(f"path: {path} describes no probe: {fault}") from fault
+    nearest = float(probe.nearest_to_axis)
+    if nearest < -1e-6 * abs(a):  # 0 to within rounding is on the axis
+        raise ValueError(
+            f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the motor "
+            f"axis (b = {b:.4g} mm, a = {a:.4g} mm), where no sample is shown."
+        )
     return as_array(content, shape, np.dtype("u1"), "C"), probe
 
 
@@ -154,33 +169,6 @@ def _ends(path: Path, tag: Tag, angles: np.ndarray) -> tuple[float, float]:
             "Resample the volume at even angles first."
         )
     return first, last
-
-
-def _probe(
-    path: Path,
-    step: float,
-    first: float,
-    apex: float,
-    beta: tuple[float, float],
-    sigma: tuple[float, float],
-    samples: int,
-) -> ToroidalMap:
-    """The map of a probe whose samples are `step` mm apart; `first` and `apex` are in steps."""
-    if not 0 < step < math.inf:
-        raise ValueError(
-            f"path: {path}: item {_name(RESOLUTION)} must be a positive length in metres; got {step / 1000}."
-        )
-    try:
-        probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (samples - 1) * step))
-    except ValueError as fault:
-        raise ValueError(f"path: {path} describes no probe: {fault}") from fault
-    nearest = float(probe.nearest_to_axis)
-    if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
-        raise ValueError(
-            f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the "
-            f"motor axis (b = {first * step:.4g} mm, a = {apex * step:.4g} mm), where no sample is shown."
-        )
-    return probe
 
 
 def _name(tag: Tag) -> str:
