@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla.memory import gather
-from .piecewise_linear import Range, points_below, run_maxima
+from .piecewise_linear import Range, covering_runs, points_below, run_maxima
 from .vec3 import Scalar
 
 
@@ -65,16 +65,6 @@ def any_between(marked: Bool[Array, "n m"], rows: Range, columns: Range) -> Bool
 def greatest_between(table: Float[Array, "n m"], rows: Range, columns: Range) -> Float[Array, "*blocks"]:
     """The greatest entry where these lines cross, by the maxima of all rectangles of powers of two."""
     maxima = jnp.stack([jnp.stack(run_maxima(wide, 1)) for wide in run_maxima(table, 0)])
-
-    def starts(lines: Range, levels: int) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], ...]]:
-        """Two runs that cover some lines: the level of their length, and where they begin."""
-        first, last = lines
-        level = sum(
-            ((last - first + 1 >= 2**k).astype(jnp.int32) for k in range(1, levels)), jnp.zeros_like(first)
-        )
-        return level, (first, last + 1 - 2**level)
-
-    (wide, begins), (long, others) = (
-        starts(lines, maxima.shape[axis]) for axis, lines in enumerate((rows, columns))
-    )
+    wide, begins = covering_runs(rows, maxima.shape[0])
+    long, others = covering_runs(columns, maxima.shape[1])
     return jnp.max(jnp.stack([maxima[wide, long, i, j] for i in begins for j in others]), axis=0)

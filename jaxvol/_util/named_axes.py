@@ -26,7 +26,7 @@ def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return data, {}
     for axis, name in named:
         at = np.asarray(value.coords[name])
-        even = np.linspace(*at[[0, -1]].astype(float), at.size) if at.dtype.kind in "iuf" else np.zeros(2)
+        even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" else np.zeros(2)
         step = even[1] - even[0] if at.size > 1 else 0.0
         if not (step and np.abs(at - even).max() <= 1e-3 * abs(step)):  # NaN, too
             raise ValueError(

@@ -187,14 +187,20 @@ def _maximum_of_range(
     entries: Float[Array, " n"], first: Int[Array, "*batch"], end: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
     """Maximum of the entries from `first` to before `end`; 0 where there are none."""
-    runs = run_maxima(entries, 0)
-    table, n = jnp.stack(runs), entries.shape[0]
-    count = end - first
-    level = sum((count >= 2**k).astype(jnp.int32) for k in range(1, len(runs)))
-    level = jnp.broadcast_to(level, count.shape)
-    left = table[level, jnp.clip(first, 0, n - 1)]
-    right = table[level, jnp.clip(end - 2**level, 0, n - 1)]
-    return jnp.where(count > 0, jnp.maximum(left, right), 0)
+    table = jnp.stack(run_maxima(entries, 0))
+    begin = jnp.minimum(first, entries.shape[0] - 1)
+    level, (left, right) = covering_runs((begin, jnp.maximum(end - 1, begin)), len(table))
+    return jnp.where(end > first, jnp.maximum(table[level, left], table[level, right]), 0)
+
+
+def covering_runs(
+    entries: Range, levels: int
+) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]]:
+    """Two runs of 2**k entries that cover these ones: k, and where they begin."""
+    first, last = entries
+    reached = ((last - first + 1 >= 2**k).astype(jnp.int32) for k in range(1, levels))
+    level = sum(reached, jnp.zeros_like(first))
+    return level, (first, last + 1 - 2**level)
 
 
 def run_maxima(table: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:

@@ -78,7 +78,7 @@ def save_image(
             chunks = PngInfo()
             for keyword, content in (text or {}).items():
                 chunks.add_itxt(keyword, content, zip=True)
-            options = {"pnginfo": chunks} if ending == ".png" else {}
+            options: dict[str, Any] = {"pnginfo": chunks} if ending == ".png" else {}
             Image.fromarray(displayed(image)).save(part, **options)
     return path
 

@@ -68,11 +68,10 @@ def scan_convert(
     if not isinstance(probe, ToroidalMap):
         raise ValueError(f"probe must be a ToroidalMap; got {described(probe)}.")
     fill = _fill(fill_value, volume.data.dtype)
-    if spacing is None:
-        first, last = probe.gamma_range
-        spacing = (last - first) / (volume.shape[2] - 1)
+    first, last = probe.gamma_range
+    wide: Any = (last - first) / (volume.shape[2] - 1) if spacing is None else spacing
     steps = require(
-        finite_array("spacing", [spacing] * 3 if np.ndim(spacing) == 0 else spacing, (3,)),
+        finite_array("spacing", [wide] * 3 if np.ndim(wide) == 0 else wide, (3,)),
         lambda steps: steps > 0,
         "spacing must be positive along every axis; got {got}.",
     )
