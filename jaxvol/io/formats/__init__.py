@@ -72,8 +72,8 @@ def load(
     Medical images are rescaled (CT in HU), float64 becomes float32, and axes are exchanged and reversed so
     that x, y, z increase towards the patient's left, back and head (LPS). An oblique image keeps its voxels,
     and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie; their
-    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are
-    converted to smaller types, as described in `Volume`.
+    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are converted to
+    smaller types, as described in `Volume`.
 
     **Arguments:**
 
@@ -89,11 +89,11 @@ def load(
 
     **Returns:** the `Volume`, with voxels in the file's type except as described above.
 
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or
-    shorter than its header says, or without a header; for an image that is not 3-D or not scalar; for a
-    folder of several DICOM series, or in which slices are missing, there twice, or do not fit together; for
-    labels that lie elsewhere; for `.vol` files, which `load_ultrasound` reads; and for anything that `Volume`
-    rejects. `ImportError` for a format that needs SimpleITK or tifffile if it is missing.
+    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or shorter
+    than its header says, or without a header; for an image that is not 3-D or not scalar; for a folder of
+    several DICOM series, or of slices that do not fit together; for labels that lie elsewhere; for `.vol`
+    files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for a format
+    that needs SimpleITK or tifffile if it is missing.
     """
     path = _existing(path)
     if path.name.lower().endswith(RAW):

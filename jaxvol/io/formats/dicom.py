@@ -1,7 +1,6 @@
 """Reads series of DICOM slices with SimpleITK, sorted by where they lie."""
 
-from collections import Counter
-from itertools import pairwise
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,9 +31,8 @@ KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
 SERIES = "0020|000e"
 """The element that tells the series."""
 
-OVERLAP, AWAY = 0.01, 0.1
-"""Slices nearer to each other than this part of their usual distance lie in one place; and the part of a
-voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
+AWAY = 0.1
+"""The part of a voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
 
 
 class Slice(NamedTuple):
@@ -81,11 +79,10 @@ def read_dicom(path: Path) -> dict[str, Any]:
                     f"{expected.round(4).tolist()}, and {each.path.name} {found.round(4).tolist()}. Is one "
                     "of them an overview image?"
                 )
-    width, height = first.size
-    if len(slices) < 2 or width * height * len(slices) > MOST_VOXELS:
+    if not 2 <= len(slices) <= MOST_VOXELS // math.prod(first.size):
         raise ValueError(
             f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
-            f"{len(slices)} of {width} x {height} pixels."
+            f"{len(slices)} of {first.size} pixels."
         )
     direction = orthonormal(f"path: {path}: rows and columns of {first.path.name}", first.axes)
     normal = direction[:, 2]
@@ -106,15 +103,11 @@ def _slices(path: Path) -> list[Slice]:
         series = _text(_header(path), SERIES)
         return [_slice(file, found) for file, found in headers.items() if _text(found, SERIES) == series]
     found = [_slice(file, header) for file, header in headers.items()]
-    counts = Counter((each.series, each.description) for each in found)
-    if len({series for series, _ in counts}) > 1:
-        listed = "; ".join(
-            f"{description or 'no description'} ({series}): {count} files"
-            for (series, description), count in counts.items()
-        )
+    series = {each.series: f"{each.description or 'no description'} (as {each.path.name})" for each in found}
+    if len(series) > 1:
         raise ValueError(
-            f"path: {path} holds several series: {listed}. Give the path of one file of the series that "
-            "you want, or put each into a folder of its own."
+            f"path: {path} holds several series: {', '.join(series.values())}. Give the path of one file of "
+            "the series that you want, or put each into a folder of its own."
         )
     return found
 
@@ -164,19 +157,12 @@ def _distance(path: Path, slices: list[Slice], normal: np.ndarray) -> float:
     heights = positions @ normal
     gaps = np.diff(heights)
     step = float(np.median(gaps))
-    between = [f"{a.path.name} and {b.path.name}" for a, b in pairwise(slices)]
-    same = np.flatnonzero(gaps <= max(OVERLAP * step, 1e-6))
-    if same.size:
-        raise ValueError(
-            f"path: {path} holds {same.size} slices that lie where another one does: "
-            f"{', '.join(between[i] for i in same[:3])}. They are copies, or of different times; remove all "
-            "but one of each."
-        )
     uneven = np.abs(gaps - step)
-    if uneven.max() > AWAY * step:
+    if step < 1e-6 or uneven.max() > AWAY * step:
+        i = int(uneven.argmax())
         raise ValueError(
-            f"path: {path} has unevenly spaced slices, or some are missing: the median distance is {step:g}, "
-            f"and {between[uneven.argmax()]} are {gaps[uneven.argmax()]:g}."
+            f"path: {path} has unevenly spaced slices, or some are missing or there twice: the median "
+            f"distance is {step:g}, and {slices[i].path.name} and {slices[i + 1].path.name} are {gaps[i]:g} apart."
         )
     sideways = np.abs(positions - positions[0] - np.outer(heights - heights[0], normal)).max()
     if sideways > AWAY * min(slices[0].spacing):

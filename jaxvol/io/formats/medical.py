@@ -62,23 +62,16 @@ def read_nrrd(path: Path) -> dict[str, Any]:
         voxels = _read_header(path, reader)
         itemsize = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
         fields, begin, source = _nrrd_header(path)
-        if not source.is_file():
-            raise ValueError(
-                f"path: {path} must hold its voxels, or name one file of them; got {fields['datafile']!r}."
-            )
         encoding, expected = fields.get("encoding", "").lower(), voxels * itemsize
-        if encoding not in ("raw", "gzip", "gz", "ascii", "text", "txt"):
+        if encoding not in ("raw", "gzip", "gz") or not source.is_file():
             raise ValueError(
-                f"path: {path} must have the encoding raw, gzip or ascii; got {encoding!r}. Save it as one "
-                "of these."
+                f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
+                f"got {encoding!r} and {fields.get('datafile')!r}."
             )
         with source.open("rb") as stream:
             stream.seek(begin)
-            held = source.stat().st_size - begin
-            if encoding in ("gzip", "gz"):
-                held = gzip.GzipFile(fileobj=stream).seek(expected)
-            elif encoding != "raw":  # at least a digit and a space for each
-                held = (held + 1) // 2 * itemsize
+            packed = encoding != "raw"
+            held = gzip.GzipFile(fileobj=stream).seek(expected) if packed else source.stat().st_size - begin
         check_size(path, held, expected, more=True)
         return _volume(sitk, reader)
 

@@ -28,17 +28,16 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     | `.nrrd`, `.mha`, `.mhd` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
     | `.nii`, `.nii.gz` | the same; direction is rounded, to about 1e-7 |
 
-    Voxels are written in their own type, and read so: with the same values, spacing and origin. Medical
-    formats are read along the patient's axes: a volume whose axes are turned by more than 45 degrees comes
-    back with axes exchanged or reversed, and every voxel where it was in the world.
+    Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a
+    volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
+    voxel where it was in the world.
 
     A file that is there is replaced, at once when the new one is whole. `.mhd` are two files: the voxels go
     into one that ends in `.raw`, which is replaced first, and only if it belongs to the `.mhd` that is there.
 
     **Arguments:**
 
-    - `volume`: with voxels. It comes first; `save_png`, of images, has the path first. Of one that has a
-        `field`, voxels are not what is shown, and it is refused.
+    - `volume`: with voxels, not with a `field`. It comes first; `save_png`, of images, has the path first.
     - `path`: the file to write. Folders are made where they are missing.
 
     **Returns:** the path.
@@ -55,9 +54,7 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     if is_traced(volume):
         raise ValueError("volume must not be traced: save it outside of jit and grad.")
     if volume.field is not None:
-        raise ValueError(
-            "volume must have voxels; got one with a field. Save an array of the field's values."
-        )
+        raise ValueError("volume must have voxels; got one with a field. Save an array of its values.")
     path = output_file("path", path)
     name = path.name.lower()
     if not name.endswith(ENDINGS):

@@ -21,11 +21,6 @@ LENGTHS |= dict.fromkeys(("µm", "um", "micron", "\\u00b5m"), 1e-3)
 def read_tiff(path: Path) -> dict[str, Any]:
     """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
     images, spacing = _images(path)
-    if len(images) < 2:
-        raise ValueError(
-            f"path: {path} must hold at least 2 images; got {len(images)}. For a folder of images, give the "
-            "path of the folder."
-        )
     return {"data": images.transpose(2, 1, 0)} | spacing
 
 
@@ -95,16 +90,13 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             axes, whole = file.series[0].axes, file.is_imagej or len(pages) == 1
             # ImageJ may hold a stack in its only page
             shape = file.series[0].shape if whole else (len(pages), *first.shape)
-            several = file.is_ome and (len(file.series) > 1 or set(axes) & set("CT"))
-            if several or len(kinds) > 1 or len(shape) not in (2, 3) or first.samplesperpixel != 1:
+            several = len(kinds) > 1 or (file.is_ome and (len(file.series) > 1 or set(axes) & set("CT")))
+            known = first.dtype is not None and 0 < math.prod(shape) <= MOST_VOXELS
+            if several or not known or len(shape) not in (2, 3) or first.samplesperpixel != 1:
                 raise ValueError(
-                    f"path: {path} must hold one stack of images of one size, type and value per pixel; got "
-                    f"{len(file.series)} stacks, the first of shape {file.series[0].shape} ({axes}), and "
-                    f"pages of {len(kinds)} kinds. Save one stack alone."
-                )
-            if not 0 < math.prod(shape) <= MOST_VOXELS or first.dtype is None:
-                raise ValueError(
-                    f"path: {path} must hold 1 to 2**31 - 1 voxels of a known type; got shape {shape}."
+                    f"path: {path} must hold one stack of images of one size, type and value per pixel, and "
+                    f"fewer than 2**31 voxels; got {len(file.series)} stacks, the first of shape "
+                    f"{file.series[0].shape} ({axes}), and pages of {len(kinds)} kinds."
                 )
             packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
             check_pixels(path, math.prod(shape) * first.dtype.itemsize, compressed=packed)

@@ -171,15 +171,15 @@ BAD = {
     "a tilted gantry": (tilted, r"shifted sideways by up to 2.*tilted gantry"),
     "a slice is missing": (
         lambda folder, paths: paths[2].unlink(),
-        r"unevenly spaced slices, or some are missing: the median distance is 2\.5, .* are 5",
+        r"unevenly spaced slices, or some are missing .*: the median distance is 2\.5, .* are 5 apart",
     ),
     "a slice is there twice": (
         lambda folder, paths: (folder / "copy.dcm").write_bytes(paths[1].read_bytes()),
-        r"1 slices that lie where another one does: (IM\d+.dcm and copy.dcm|copy)",
+        r"there twice: the median distance is 2\.5, and (IM\d+.dcm and copy.dcm|copy.* and IM.*) are 0 apart",
     ),
     "two series": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, tags=OTHER),
-        r"holds several series: .*(chest|head) \(.*file of the series",
+        r"holds several series: .*(chest|head) \(as IM\d+.dcm\).*file of the series",
     ),
     "an overview": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, turned(90, 0, 0)),
