@@ -160,9 +160,10 @@ def _distance(path: Path, slices: list[Slice], normal: np.ndarray) -> float:
     uneven = np.abs(gaps - step)
     if step < 1e-6 or uneven.max() > AWAY * step:
         i = int(uneven.argmax())
+        one, other = (slices[k].path.name for k in (i, i + 1))
         raise ValueError(
             f"path: {path} has unevenly spaced slices, or some are missing or there twice: the median "
-            f"distance is {step:g}, and {slices[i].path.name} and {slices[i + 1].path.name} are {gaps[i]:g} apart."
+            f"distance is {step:g}, and {one} and {other} are {gaps[i]:g} apart."
         )
     sideways = np.abs(positions - positions[0] - np.outer(heights - heights[0], normal)).max()
     if sideways > AWAY * min(slices[0].spacing):
