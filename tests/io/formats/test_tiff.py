@@ -81,7 +81,7 @@ def test_a_folder_of_images_is_sorted_by_number_and_bad_stacks_are_refused(tmp_p
         "sizes.tif": "must hold one stack of images of one size.* pages of 2 kinds",
         "stacks": r"slice8\.tif must hold one image, as a slice of .*; got 5",
         "single": "at least 2 voxels along each axis",
-        "rgb.tif": "value per pixel; .*YXS",
+        "rgb.tif": "value per pixel.*YXS",
         **{name: name for name in cut},
     }
     for name, message in bad.items():
