@@ -91,8 +91,8 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             # ImageJ may hold a stack in its only page
             shape = file.series[0].shape if whole else (len(pages), *first.shape)
             several = len(kinds) > 1 or (file.is_ome and (len(file.series) > 1 or set(axes) & set("CT")))
-            known = first.dtype is not None and 0 < math.prod(shape) <= MOST_VOXELS
-            if several or not known or len(shape) not in (2, 3) or first.samplesperpixel != 1:
+            several = several or len(shape) not in (2, 3) or first.samplesperpixel != 1
+            if several or first.dtype is None or not 0 < math.prod(shape) <= MOST_VOXELS:
                 raise ValueError(
                     f"path: {path} must hold one stack of images of one size, type and value per pixel, and "
                     f"fewer than 2**31 voxels; got {len(file.series)} stacks, the first of shape "
