@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described
-from .._util.files import Header, check_size, decoding, file_size
+from .._util.files import check_size, decoding, file_size
 from .._util.named_axes import along_xyz, is_named
 from .._util.npy import npy_header
 from .._util.voxels import check_shape
@@ -112,7 +112,7 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
     name = path.name.lower()
     if name.endswith(".raw"):
         _refuse(str(path), options, OF_RAW)
-        return (_raw(path, Header(options.get("shape"), options.get("dtype")), place),)
+        return (_raw(path, options.get("shape"), options.get("dtype"), place),)
     if name.endswith(".npy"):
         _refuse(str(path), options, OF_ARRAY)
         return (_npy(path, **options, **place),)
@@ -128,8 +128,8 @@ def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tupl
     )
 
 
-def _raw(path: Path, header: Header, place: dict[str, Any]) -> VoxelSource:
-    size, stored, own = raw_header(path, header, 48)
+def _raw(path: Path, shape: Any, dtype: Any, place: dict[str, Any]) -> VoxelSource:
+    size, stored, own = raw_header(path, shape, dtype, 48)
     check_size(path, file_size(path), math.prod(size) * stored.itemsize)
     check_shape(size)
     mapped = np.memmap(path, stored, "r", shape=size, order="F")
