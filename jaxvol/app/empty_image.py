@@ -13,7 +13,7 @@ from ..compositing.isosurface import Isosurface
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import Rendering
-from ..scene.space import Affine, Ray, Space, enter
+from ..scene.space import Ray, Space, enter
 from ..scene.transfer import Transfer, TransferFunction
 from ..scene.volume import Volume
 
@@ -41,43 +41,30 @@ def why_empty(
     hit, values = _values_along(volume, camera, march.locate(volume))
     if not hit.any():
         low, high = (", ".join(f"{c:g}" for c in np.asarray(corner)) for corner in volume.corners)
-        extends = f"the volume, which extends from ({low}) to ({high})"
-        if _values_along(volume, camera, Affine(volume))[0].any():
-            return f"no ray of the camera meets what the clip leaves of {extends}. Change its box or planes."
-        return f"no ray of the camera meets {extends}. Point it at the center, as Camera.looking_at does."
-    if opacity > 0:
         return (
-            f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, which raises the "
-            "extinction, or higher opacities."
+            f"no ray of the camera meets the volume, from ({low}) to ({high}), or what the clip leaves of it. "
+            "Point it at the center, as Camera.looking_at does."
         )
+    if opacity > 0:
+        return f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, or higher opacities."
     low, high = float(np.nanmin(values[hit])), float(np.nanmax(values[hit]))
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
     if isinstance(compositing, Isosurface):
         return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     if not isinstance(transfer, TransferFunction):
-        return (
-            f"{where}, and the transfer function shows none of them, or only under another label or gradient."
-        )
-    ranges = " or ".join(_visible_ranges(transfer))
-    if not ranges:
+        return f"{where}, and the transfer function shows none of them."
+    extinction, at = np.asarray(transfer.extinction), np.asarray(transfer.values)
+    seen = np.flatnonzero(extinction > 0)
+    if not seen.size:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
-    advice = f" A clim from {low:g} to {high:g} would show something." if low < high else ""
-    return f"{where}, and the transfer function shows values {ranges}.{advice}"
-
-
-def _visible_ranges(transfer: TransferFunction) -> list[str]:
-    """Ranges of values that are not transparent. The opacity of a point extends to its neighbours, that of
-    the first and the last to infinity."""
-    positive = np.concatenate([[False], np.asarray(transfer.extinction) > 0, [False]])
-    values = np.concatenate([[-np.inf], np.asarray(transfer.values), [np.inf]])
-    found = []
-    for first, last in np.flatnonzero(positive[1:] != positive[:-1]).reshape(-1, 2):
-        low, high = values[first], values[last + 1]
-        if high == np.inf:
-            found.append(f"from {low:g} on" if low > -np.inf else "of any kind")
-        else:
-            found.append(f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}")
-    return found
+    # the opacity of a point extends to its neighbours, that of the first and the last to infinity
+    first, last = seen[0], seen[-1]
+    since = "" if first == 0 else f" from {at[first - 1]:g}"
+    until = "" if last == len(at) - 1 else f" to {at[last + 1]:g}"
+    return (
+        f"{where}, and the transfer function shows values{since}{until or ' on'}. A clim from {low:g} to "
+        f"{high:g} would show something."
+    )
 
 
 def _values_along(

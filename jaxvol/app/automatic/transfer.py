@@ -11,7 +11,7 @@ from ..._util.srgb import from_srgb
 from ...scene.transfer import TransferFunction, extinction_of
 from ...scene.volume import Volume
 from ...xla.platform import is_traced
-from .histogram import faces, is_body, sampled, thresholds, unit_of
+from .histogram import is_body, sampled, thresholds, unit_of
 
 
 CUT = 0.25
@@ -59,7 +59,8 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
         points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
     else:
         first, second = thresholds(values)
-        outer = np.concatenate([face.ravel() for face in faces(np.asarray(copy.data))]).astype(np.float32)
+        data = np.asarray(copy.data)
+        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
         whole = np.mean(outer > first) < CUT and is_body(part, first, second)
         points = _shell(low, first, second, high) if whole else _dense(first, second, high)
     at, colors, opacities = zip(*points, strict=True)
@@ -73,23 +74,15 @@ DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 
 
 def _shell(low: float, first: float, second: float, high: float) -> list[tuple[float, Any, float]]:
-    w = min(first - low, second - first) / 3
-    d = (second - first) / 4
-    return [
-        (first - w, EDGE, 0.0),
-        (first, SKIN, 0.3),
-        (first + w, SKIN, 0.07),
-        (second - d, TISSUE, 0.04),
-        (second, DENSE, 0.45),
-        (max((second + high) / 2, second + d / 2), BRIGHT, 0.9),
-    ]
+    w, d = min(first - low, second - first) / 3, (second - first) / 4
+    border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, 0.07)]
+    return [*border, (second - d, TISSUE, 0.04), *_densest(second, d, high)]
 
 
 def _dense(first: float, second: float, high: float) -> list[tuple[float, Any, float]]:
     d = (second - first) / 4
-    return [
-        (second - 2 * d, EDGE, 0.0),
-        (second - d, TISSUE, 0.02),
-        (second, DENSE, 0.45),
-        (max((second + high) / 2, second + d / 2), BRIGHT, 0.9),
-    ]
+    return [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *_densest(second, d, high)]
+
+
+def _densest(second: float, d: float, high: float) -> list[tuple[float, Any, float]]:
+    return [(second, DENSE, 0.45), (max((second + high) / 2, second + d / 2), BRIGHT, 0.9)]

@@ -104,7 +104,7 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     if "transfer" in found:
         settings["recorded_transfer"] = found["transfer"]
     if not named:
-        settings["file"] = volume_of_picture(path, **found["file"])
+        settings["file"] = volume_of_picture(path, found["file"]["name"], found["file"]["sha256"])
     return settings
 
 
