@@ -40,11 +40,8 @@ def why_empty(
         return None
     hit, values = _values_along(volume, camera, march.locate(volume))
     if not hit.any():
-        low, high = (", ".join(f"{c:g}" for c in np.asarray(corner)) for corner in volume.corners)
-        return (
-            f"no ray of the camera meets the volume, from ({low}) to ({high}), or what the clip leaves of it. "
-            "Point it at the center, as Camera.looking_at does."
-        )
+        bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
+        return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
     if opacity > 0:
         return f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, or higher opacities."
     low, high = float(np.nanmin(values[hit])), float(np.nanmax(values[hit]))
@@ -53,17 +50,14 @@ def why_empty(
         return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     if not isinstance(transfer, TransferFunction):
         return f"{where}, and the transfer function shows none of them."
-    extinction, at = np.asarray(transfer.extinction), np.asarray(transfer.values)
-    seen = np.flatnonzero(extinction > 0)
+    seen = np.flatnonzero(np.asarray(transfer.extinction) > 0)
     if not seen.size:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
     # the opacity of a point extends to its neighbours, that of the first and the last to infinity
-    first, last = seen[0], seen[-1]
-    since = "" if first == 0 else f" from {at[first - 1]:g}"
-    until = "" if last == len(at) - 1 else f" to {at[last + 1]:g}"
+    at = [-np.inf, *np.asarray(transfer.values), np.inf]
     return (
-        f"{where}, and the transfer function shows values{since}{until or ' on'}. A clim from {low:g} to "
-        f"{high:g} would show something."
+        f"{where}, and the transfer function shows values between {at[seen[0]]:g} and {at[seen[-1] + 2]:g}. "
+        f"A clim from {low:g} to {high:g} would show something."
     )
 
 

@@ -13,8 +13,8 @@ from .histogram import unit_of
 
 
 FEWEST_FLAT = 0.8
-"""Part of the voxels that are not the lowest whose neighbour has the same value: above it, whole numbers count
-as labels. It was 0.92 in a segmented frog, and 0.46 at most in scans, simulations and phantoms."""
+"""Part of the voxels that are not the lowest whose neighbour has the same value: above it, whole numbers are
+labels. It was 0.92 in a segmented frog, and 0.46 at most in scans, simulations and phantoms."""
 
 MOST_LABELS = 64
 

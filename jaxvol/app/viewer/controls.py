@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ...scene.labels import LabelTransferFunction
+from ...scene.transfer2d import TransferFunction2D
 from . import editing
 from .model import Model
 from .state import MAX_STEP, MIN_STEP
@@ -89,10 +90,11 @@ class _TransferControls:
     def controls(self) -> list[Control]:
         if isinstance(self.transfer, LabelTransferFunction):
             return self._label()
+        if isinstance(self.transfer, TransferFunction2D):
+            return [Html(lambda: "a function of value and gradient, which is not edited here")]
         if editing.has_editable_points(self.transfer):
             return [*self._range(), *self._point()]
-        points = " x ".join(map(str, self.transfer.extinction.shape))
-        return [*self._range(), Html(lambda: f"{points} points, not edited one by one")]
+        return self._range()
 
     @property
     def transfer(self) -> Any:
@@ -163,7 +165,7 @@ class _TransferControls:
             Field(
                 "color",
                 "color",
-                lambda: editing.point_color(self.transfer, self.chosen),
+                lambda: editing.display_color(np.asarray(self.transfer.colors)[self.chosen]),
                 lambda color: self.edit(editing.with_color, self.chosen, color),
             ),
             Slider(
@@ -227,6 +229,7 @@ def _march_controls(model: Model) -> list[Control]:
         step=MIN_STEP,
         logarithmic=True,
     )
-    light = Field("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
-    is_lightable = model.scene.lighting is not None
-    return [step, *map(switch, model.scene.transform_names), *([light] if is_lightable else [])]
+    switches = [switch(type(transform).__name__) for transform in model.scene.transforms]
+    if model.scene.lighting is not None:
+        switches.append(Field("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on)))
+    return [step, *switches]

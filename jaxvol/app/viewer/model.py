@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 from .state import Scene, State
@@ -24,41 +24,22 @@ INTERVAL = 0.25
 """Seconds after which an unfinished fine image is shown again."""
 
 BUDGET = 0.06
-"""Seconds that a coarse image may take: of the 150 ms in which it is to follow the pointer, what is left
-once a tile that was being drawn is finished, and the image was encoded and sent to the browser."""
+"""Seconds that a coarse image may take, of the 150 ms in which it is to follow the pointer."""
 
 LEVELS = ((1, 4.0), (1, 2.0), (1, 1.0), (2, 1.0), (4, 1.0), (6, 1.0), (9, 1.0), (16, 1.0))
 """Coarse images, from the coarsest on: tiles, and how many times as long their steps are. One takes up to
 some two times as long as the one before."""
 
-FIRST_LEVEL = 2
 
-
-@dataclass
-class CoarseLevel:
-    """The finest coarse image that is drawn within `BUDGET`: an index of `LEVELS`."""
-
-    index: int = FIRST_LEVEL
-
-    @property
-    def tiles(self) -> int:
-        """How many tiles the next coarse image has."""
-        return LEVELS[self.index][0]
-
-    @property
-    def step_factor(self) -> float:
-        """How many times as long its steps are."""
-        return LEVELS[self.index][1]
-
-    def adapt(self, seconds: float, fine_tiles: int) -> None:
-        """To the time that the last one took, without compilation. A coarse image has at most half as many
-        tiles as the fine one."""
-        if seconds > BUDGET:
-            self.index -= 2 if seconds > 2 * BUDGET else 1
-        elif seconds < BUDGET / 2.5:
-            self.index += 1
-        allowed = sum(tiles <= max(1, fine_tiles // 2) for tiles, _ in LEVELS)
-        self.index = min(max(self.index, 0), allowed - 1)
+def adapted(level: int, seconds: float, fine_tiles: int) -> int:
+    """The index of `LEVELS` of the next coarse image, after one that took so long. A coarse image has at most
+    half as many tiles as the fine one."""
+    if seconds > BUDGET:
+        level -= 2 if seconds > 2 * BUDGET else 1
+    elif seconds < BUDGET / 2.5:
+        level += 1
+    allowed = sum(tiles <= max(1, fine_tiles // 2) for tiles, _ in LEVELS)
+    return min(max(level, 0), allowed - 1)
 
 
 class Model(Worker[State]):
@@ -82,8 +63,8 @@ class Model(Worker[State]):
     ):
         self.scene, self.state = scene, state
         self._face = show, tell
-        self._levels: dict[Any, CoarseLevel] = {}
-        self._last: Pixels | None = None
+        self._level = 2
+        self._compiled: set[Any] = set()
         super().__init__(rest)
 
     def change(self, **changes: Any) -> None:
@@ -110,7 +91,6 @@ class Model(Worker[State]):
 
     def _show(self, pixels: Pixels, stage: Stage, seconds: float, step: float) -> str:
         """Show an image. Returns what there is to say of it. `step`: voxels."""
-        self._last = pixels
         if not self._closed:
             self._face[0](pixels, stage)
         height, width, _ = pixels.shape
@@ -120,24 +100,22 @@ class Model(Worker[State]):
         if not self._closed:
             self._face[1](text)
 
-    def _coarse(self, request: State) -> None:
-        renderer = TileRenderer(self.scene, request)
-        if renderer.program_key not in self._levels:
+    def _draw(self, request: State) -> Generator[None]:
+        renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
+        if renderer.program_key not in self._compiled:
             self._tell("compiling …\nfor these transforms; the program is kept for the next time")
             begun = time.perf_counter()
             renderer.overview()
+            self._compiled.add(renderer.program_key)
             self._tell(f"compiled in {time.perf_counter() - begun:.1f} s\n")
-        level = self._levels.setdefault(renderer.program_key, CoarseLevel())
-        begun, step_factor = time.perf_counter(), level.step_factor
-        pixels = TileRenderer(self.scene, request, step_factor).image(Grid.coarse(request.size, level.tiles))
+        begun, (tiles, factor) = time.perf_counter(), LEVELS[self._level]
+        coarse = TileRenderer(self.scene, request, factor).image(Grid.coarse(request.size, tiles))
         seconds = time.perf_counter() - begun
-        level.adapt(seconds, len(Grid.fine(request.size)))
-        self._tell(self._show(pixels, "coarse", seconds, request.step * step_factor))
+        self._level = adapted(self._level, seconds, len(grid))
+        self._tell(self._show(coarse, "coarse", seconds, request.step * factor))
+        yield
 
-    def _fine(self, request: State) -> Generator[None]:
-        assert self._last is not None
-        renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
-        pixels, (width, height) = grid.canvas(self._last), grid.size
+        pixels, (width, height) = grid.canvas(coarse), grid.size
         begun = shown = time.perf_counter()
 
         def show(stage: Stage) -> str:

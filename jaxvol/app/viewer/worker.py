@@ -1,6 +1,5 @@
 """Which image is drawn next? A thread draws what was asked for last, coarse at once and fine at rest."""
 
-import contextlib
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Generator
@@ -15,8 +14,7 @@ REST = 0.12
 
 class Worker(ABC, Generic[T]):
     """A thread that draws. A newer request replaces one that has not been begun, and cancels a fine image
-    between two of its parts. A coarse image that was begun is finished, so that images follow a drag however
-    fast requests come.
+    between two of its parts. A coarse image that was begun is finished, so that images follow a drag.
 
     **Arguments:** `rest`: seconds without a new request after which a fine image is begun.
     """
@@ -30,16 +28,12 @@ class Worker(ABC, Generic[T]):
         self._thread.start()
 
     @abstractmethod
-    def _coarse(self, request: T) -> None:
-        """Draw a request."""
-
-    @abstractmethod
-    def _fine(self, request: T) -> Generator[None]:
-        """Draw it better; yields after each part, and is closed where it is cancelled."""
+    def _draw(self, request: T) -> Generator[None]:
+        """Draw a request: yields after the coarse image, and after each part of the fine one."""
 
     @abstractmethod
     def _failed(self, fault: Exception) -> None:
-        """Called with an exception of these two. The thread goes on."""
+        """Called with an exception of `_draw`. The thread goes on."""
 
     def ask(self, request: T) -> None:
         """Ask for an image, in place of all that was asked for before."""
@@ -72,19 +66,12 @@ class Worker(ABC, Generic[T]):
                 assert self._next is not None
                 request, self._next = self._next, None
             try:
-                self._draw(request)
+                for part, _ in enumerate(self._draw(request)):
+                    with self._changed:  # rest before the fine image
+                        if self._changed.wait_for(self._newer, 0 if part else self._rest):
+                            break
             except Exception as fault:  # told to the user, who may ask for another image
                 self._failed(fault)
             with self._changed:
                 self._idle = self._next is None
                 self._changed.notify_all()
-
-    def _draw(self, request: T) -> None:
-        self._coarse(request)
-        with self._changed:
-            if self._changed.wait_for(self._newer, self._rest):
-                return
-        with contextlib.closing(self._fine(request)) as parts:
-            for _ in parts:
-                if self._newer():
-                    return
