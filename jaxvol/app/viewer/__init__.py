@@ -39,8 +39,8 @@ def view(
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
-    return. Beside the image are window and level, the points of the transfer function in front of the
-    volume's histogram, or its labels, the step, and every transform and the light to be turned on and off.
+    return. Beside the image are window and level, the volume's histogram, the points of the transfer
+    function, or its labels, the step, and every transform and the light to be turned on and off.
     While something changes, the image is as coarse as it must be to follow within some 150 ms; at rest it has
     all pixels. Its time, its step and an estimate of its error are shown live. It needs
     `pip install jaxvol[notebooks]`.
@@ -52,8 +52,7 @@ def view(
 
     - `volume`: what is looked at.
     - `transfer`: a `TransferFunction`, by default one that is found from the volume's values; one of 16
-      points or fewer can be edited point by point. A `TransferFunction2D` is moved and stretched along the
-      values. Labels of a `LabelTransferFunction` are hidden, and made fainter or denser; such a one is the
+      points or fewer can be edited point by point. A `TransferFunction2D` is shown only. Labels of a `LabelTransferFunction` are hidden, and made fainter or denser; such a one is the
       default for voxels that seem to be labels, each in its own colour.
     - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
       it. Its size does not count.

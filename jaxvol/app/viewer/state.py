@@ -113,7 +113,7 @@ def initial(
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
         seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
-    given = March(1.0, [kind() for kind in ENABLED], "midpoint") if march is None else march
+    given = March(1.0, (), "midpoint") if march is None else march
     names = {"volume": volume, "transfer": transfer, "camera": seen, "march": given, "lighting": lighting}
     check_arguments("view(volume, transfer, camera, march)", **names)
     mode = compositing_of(compositing)
@@ -151,5 +151,5 @@ def initial(
         background=(r, g, b),
         histogram=Histogram.of(volume),
     )
-    enabled = frozenset(kind.__name__ for kind in own)
+    enabled = frozenset(kind.__name__ for kind in (ENABLED if march is None else own))
     return scene, State(Orbit.of(seen), whole.size, transfer, step, enabled, lit and can_be_lit)

@@ -57,6 +57,11 @@ class Worker(ABC, Generic[T]):
     def _newer(self) -> bool:
         return self._next is not None or self._closed
 
+    def _cancelled(self, seconds: float) -> bool:
+        """Whether a newer request comes within so many seconds."""
+        with self._changed:
+            return self._changed.wait_for(self._newer, seconds)
+
     def _run(self) -> None:
         while True:
             with self._changed:
@@ -67,9 +72,8 @@ class Worker(ABC, Generic[T]):
                 request, self._next = self._next, None
             try:
                 for part, _ in enumerate(self._draw(request)):
-                    with self._changed:  # rest before the fine image
-                        if self._changed.wait_for(self._newer, 0 if part else self._rest):
-                            break
+                    if self._cancelled(0 if part else self._rest):
+                        break
             except Exception as fault:  # told to the user, who may ask for another image
                 self._failed(fault)
             with self._changed:

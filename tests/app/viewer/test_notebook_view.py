@@ -91,7 +91,7 @@ def test_what_is_shown_can_be_rendered(shown):
 
 def widgets(view) -> dict[str, Any]:
     """The controls by their descriptions, and the buttons."""
-    found = {control.label: widget for widget, control in view._widgets if hasattr(control, "label")}
+    found = {control.label: widget for widget, control in view._widgets if control.label}
     rows = [row.children for row in view.children[1].children if isinstance(row, ipywidgets.HBox)]
     return found | {button.description: button for row in rows for button in row}
 
@@ -99,7 +99,6 @@ def widgets(view) -> dict[str, Any]:
 def test_the_widgets_change_the_model_and_show_what_it_has(shown):
     found, plot = widgets(shown), shown._widgets[0][0]
     before = plot.value
-    assert before.count("<circle") == 2  # the third lies beyond the volume's values
     found["level"].value = 150.0
     assert window_level(shown.transfer)[1] == pytest.approx(150)
     assert plot.value != before

@@ -19,13 +19,12 @@ class Log(Worker[int]):
     def _failed(self, fault):
         self.faults.append(fault)
 
-    def _coarse(self, request):
+    def _draw(self, request):
         if request < 0:
             raise ValueError("negative")
         self.gate.acquire()
         self.done.append(("coarse", request))
-
-    def _fine(self, request):
+        yield
         try:
             for part in range(self.parts):
                 self.gate.acquire()
