@@ -7,6 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
@@ -40,9 +42,6 @@ def _animate(options: argparse.Namespace) -> None:
         raise ValueError(f"--fps of a {kind} must be above 0, and {fastest} at most; got {options.fps:g}.")
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise ImportError('--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]".')
-    if kind == ".mp4" and any(side % 2 for side in options.size):
-        width, height = options.size
-        raise ValueError(f"--size: an .mp4 has an even number of pixels on each side; got {width} {height}.")
 
     def views(camera: Camera, count: int) -> list[Camera]:
         axis = options.axis or options.view_up
@@ -56,10 +55,8 @@ def _animate(options: argparse.Namespace) -> None:
         for camera in views(scene.camera, count)
     )
     with whole_file(path) as part:
-        if kind == ".gif":
-            write_gif(part, images, options.fps, count)
-        else:
-            _write_mp4(part, images, options.fps)
+        write = _write_gif if kind == ".gif" else _write_mp4
+        write(part, images, options.fps)
     took = time.perf_counter() - begun
     print(f"{path}: {count} frames of {' x '.join(map(str, options.size))} pixels in {took:.1f} s")
 
@@ -75,15 +72,8 @@ def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
     position, focal, up = (
         np.asarray(v, float) for v in (camera.position, camera.focal_point, camera.view_up)
     )
-    return Camera(
-        focal + rotation.apply(position - focal),
-        focal,
-        rotation.apply(up),
-        camera.view_angle,
-        size=camera.size,
-        parallel_scale=camera.parallel_scale,
-        window=camera.window,
-    )
+    place = jnp.asarray(focal + rotation.apply(position - focal)), jnp.asarray(rotation.apply(up))
+    return eqx.tree_at(lambda c: (c.position, c.view_up), camera, place)
 
 
 def angles_of(degrees: float, frames: int) -> list[float]:
@@ -93,16 +83,13 @@ def angles_of(degrees: float, frames: int) -> list[float]:
     return [degrees * i / max(frames if closed else frames - 1, 1) for i in range(frames)]
 
 
-def write_gif(path: Path, images: Iterator[Picture], fps: float, count: int) -> None:
-    """Each frame with 256 colours of its own; it is shown again and again."""
+def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
+    """Each frame with 256 colours of its own, for whole hundredths of a second; it is shown again and again."""
     from PIL import Image
 
-    # frames last whole hundredths of a second: their ends are rounded, so that the whole lasts as it should
-    ends = np.round(np.arange(count + 1) * 100 / fps)
-    milliseconds = (10 * np.diff(ends)).astype(int).tolist()
     pictures = (Image.fromarray(image).quantize(256) for image in images)
-    first = next(pictures)
-    first.save(path, save_all=True, append_images=pictures, duration=milliseconds, loop=0, disposal=1)
+    how: dict[str, Any] = {"duration": 10 * round(100 / fps), "loop": 0, "disposal": 1}
+    next(pictures).save(path, save_all=True, append_images=pictures, **how)
 
 
 def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:

@@ -28,15 +28,10 @@ def window_level(transfer: TransferFunction) -> tuple[float, float]:
 
 
 def with_window_level(transfer: TransferFunction, window: float, level: float) -> TransferFunction:
-    """The same function, its values moved and stretched to another range; a window of 0 is for two values.
-
-    **Raises:** `ValueError` for a window that is not positive, and numbers that are not finite."""
-    values = np.asarray(transfer.values, np.float64)
-    wide_enough = window >= 0 if len(values) == 2 else window > 0
-    if not (math.isfinite(level) and math.isfinite(window) and wide_enough):
-        raise ValueError(f"window must be above 0, and level a number; got {window} and {level}.")
+    """The same function, its values moved and stretched to another range. **Raises** `ValueError` for a
+    window or a level that leaves no increasing, finite values."""
     old_window, old_level = window_level(transfer)
-    relative = (values - old_level) / old_window if old_window else np.array([-0.5, 0.5])
+    relative = (np.asarray(transfer.values, np.float64) - old_level) / (old_window or 1.0)
     return _with_points(transfer, values=level + window * relative)
 
 

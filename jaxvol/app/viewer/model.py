@@ -1,6 +1,7 @@
-"""A viewer without a face: its state, and a thread that draws it."""
+"""A viewer without a face: its state, and a thread that draws it, coarse at once and fine at rest."""
 
 import math
+import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import replace
@@ -8,7 +9,6 @@ from typing import Any, Literal
 
 from .state import Scene, State
 from .tiles import Grid, Pixels, TileRenderer, estimated_error
-from .worker import REST, Worker
 
 
 Stage = Literal["coarse", "drawing", "fine"]
@@ -16,6 +16,9 @@ Stage = Literal["coarse", "drawing", "fine"]
 
 JPEG_QUALITY: dict[Stage, int] = {"coarse": 85, "drawing": 88, "fine": 94}
 """With which images are sent to a browser."""
+
+REST = 0.12
+"""Seconds without a change after which a fine image is begun."""
 
 MAX_SIDE = 2048
 """Pixels of a view's width and height."""
@@ -42,8 +45,9 @@ def adapted(level: int, seconds: float, fine_tiles: int) -> int:
     return min(max(level, 0), allowed - 1)
 
 
-class Model(Worker[State]):
-    """The state of a viewer, drawn whenever it changes.
+class Model:
+    """The state of a viewer, drawn whenever it changes, by a thread of its own. A newer state cancels a fine
+    image between two tiles. A coarse image that was begun is finished, so that images follow a drag.
 
     **Arguments:**
 
@@ -65,7 +69,31 @@ class Model(Worker[State]):
         self._face = show, tell
         self._level = 2
         self._compiled: set[Any] = set()
-        super().__init__(rest)
+        self._rest = rest
+        self._changed = threading.Condition()
+        self._next: State | None = None
+        self._idle, self._closed = True, False
+        self._thread = threading.Thread(target=self._run, daemon=True, name="jaxvol viewer")
+        self._thread.start()
+
+    def ask(self, request: State) -> None:
+        """Ask for an image, in place of all that was asked for before."""
+        with self._changed:
+            self._next, self._idle = request, False
+            self._changed.notify_all()
+
+    def close(self, *, wait: bool = True) -> None:
+        """Draw no more. `wait` until a part that was begun is finished."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if wait and threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def wait(self, seconds: float = 600) -> bool:
+        """Wait until all that was asked for is drawn, fine; False if that takes longer."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._idle or self._closed, seconds)
 
     def change(self, **changes: Any) -> None:
         """Replace fields of the state, and draw it."""
@@ -100,7 +128,34 @@ class Model(Worker[State]):
         if not self._closed:
             self._face[1](text)
 
+    def _newer(self) -> bool:
+        return self._next is not None or self._closed
+
+    def _cancelled(self, seconds: float) -> bool:
+        """Whether a newer request comes within so many seconds."""
+        with self._changed:
+            return self._changed.wait_for(self._newer, seconds)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(self._newer)
+                if self._closed:
+                    return
+                assert self._next is not None
+                request, self._next = self._next, None
+            try:
+                for part, _ in enumerate(self._draw(request)):
+                    if self._cancelled(0 if part else self._rest):
+                        break
+            except Exception as fault:  # told to the user, who may ask for another image
+                self._tell(f"not drawn:\n{' '.join(str(fault).split())}")
+            with self._changed:
+                self._idle = self._next is None
+                self._changed.notify_all()
+
     def _draw(self, request: State) -> Generator[None]:
+        """Yields after the coarse image, and after each part of the fine one."""
         renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
         if renderer.program_key not in self._compiled:
             self._tell("compiling …\nfor these transforms; the program is kept for the next time")
@@ -135,6 +190,3 @@ class Model(Worker[State]):
         doubled = TileRenderer(self.scene, request, 2.0).overview()
         error = estimated_error(image, doubled, self.scene.quadrature)
         self._tell(f"{summary}, RMSE {error:.2g} (estimate)")
-
-    def _failed(self, fault: Exception) -> None:
-        self._tell(f"not drawn:\n{' '.join(str(fault).split())}")

@@ -9,7 +9,7 @@ from PIL import Image
 
 import jaxvol as jv
 from jaxvol.app.cli import main
-from jaxvol.app.commands.animate import angles_of, turned, write_gif
+from jaxvol.app.commands.animate import angles_of, turned
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
@@ -63,14 +63,7 @@ def test_a_gif_holds_all_frames_and_lasts_as_long_as_it_should(volume_file, tmp_
     found, lasting = zip(*frames_in(output), strict=True)
     assert lasting == (200,) * 6
     assert all((one != other).any() for one, other in itertools.pairwise(found))
-
-    images = [np.full((8, 8, 3), 20 * number, np.uint8) for number in range(12)]
-    write_gif(tmp_path / "b.gif", iter(images), 12, 12)  # 8 and 1/3 hundredths of a second each
-    found, lasting = zip(*frames_in(tmp_path / "b.gif"), strict=True)
-    np.testing.assert_array_equal(found, images)
-    assert sum(lasting) == 1000
-    assert set(lasting) == {80, 90}
-    assert Image.open(tmp_path / "b.gif").info["loop"] == 0
+    assert Image.open(output).info["loop"] == 0
 
 
 def test_an_mp4_holds_all_frames(volume_file, tmp_path, drawn):
@@ -92,7 +85,6 @@ BAD = {
     "fps of a gif": (["--fps", "60"], "--fps of a .gif must be above 0, and 50 at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
     "step and tolerance": (["--tolerance", "0.1"], "--step and --tolerance exclude"),
-    "odd mp4": (["-o", "a.mp4", "--size", "9", "8"], "--size: an .mp4 has an even number of pixels"),
     "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }
 
