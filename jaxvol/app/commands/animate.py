@@ -84,7 +84,7 @@ def angles_of(degrees: float, frames: int) -> list[float]:
 
 
 def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
-    """Each frame with 256 colours of its own, for whole hundredths of a second; it is shown again and again."""
+    """Each frame has 256 colours of its own, and lasts for whole hundredths of a second."""
     from PIL import Image
 
     pictures = (Image.fromarray(image).quantize(256) for image in images)
