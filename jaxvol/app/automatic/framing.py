@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     """Points in the world around what a transfer function of `automatic_transfer` or `labels_shown` shows,
     specks left out; the corners of the volume where nothing is visible."""
     from scipy.ndimage import label, maximum_filter
+    from scipy.spatial import ConvexHull, QhullError
 
     data = sampled(volume)
     if isinstance(transfer, LabelTransferFunction):
@@ -59,6 +61,8 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     rows = shown.any(axis=2)  # of voxels along z, of which only the ends count
     ends = shown.argmax(axis=2)[rows], shown.shape[2] - 1 - shown[..., ::-1].argmax(axis=2)[rows]
     voxels = np.concatenate([np.column_stack([*np.nonzero(rows), z]) for z in ends]).astype(np.float64)
+    with suppress(QhullError):  # voxels in a plane have no hull, and all are kept
+        voxels = voxels[ConvexHull(voxels).vertices]
     around = stride_of(volume.shape) * voxels[:, None] + 2 * CORNERS - 1  # a voxel ends at the next
     return _in_world(volume, np.clip(around.reshape(-1, 3), 0, np.array(volume.shape) - 1))
 

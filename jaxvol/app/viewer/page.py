@@ -161,7 +161,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
     if control.kind == "html":
         return gui.add_html(control.get())
     if control.kind == "buttons":
-        return gui.add_button_group(control.label, control.choices())
+        return gui.add_button_group(control.label, tuple(control.choices()))
     label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
     value = _to_viser(control.get())
     if control.kind in ("slider", "log slider"):
