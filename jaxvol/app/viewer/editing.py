@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -83,22 +82,22 @@ def with_point_after(transfer: TransferFunction, index: int) -> TransferFunction
     is_last = index + 1 == len(values)
     if is_last or len(values) >= MAX_POINTS or values[index] == values[index + 1]:
         raise ValueError(f"there is no room for another of {MAX_POINTS} points behind point {index + 1}.")
-    points = {name: np.asarray(getattr(transfer, name)) for name in POINTS}
-    between = {n: np.insert(p, index + 1, (p[index] + p[index + 1]) / 2, axis=0) for n, p in points.items()}
-    return _with_points(transfer, **between)
+    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
+    between = (np.insert(p, index + 1, (p[index] + p[index + 1]) / 2, axis=0) for p in points)
+    return TransferFunction(*between)
 
 
 def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
     """Without a point, of which at least two remain."""
     if len(transfer.values) <= 2:
         raise ValueError("a transfer function has at least 2 points.")
-    left = {name: np.delete(np.asarray(getattr(transfer, name)), index, axis=0) for name in POINTS}
-    return _with_points(transfer, **left)
+    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
+    return TransferFunction(*(np.delete(p, index, axis=0) for p in points))
 
 
 def padded(transfer: Any) -> Any:
     """The same function by `MAX_POINTS` points where there are fewer: beyond the last one it is constant."""
-    if type(transfer) is not TransferFunction or not has_editable_points(transfer):
+    if not isinstance(transfer, TransferFunction) or not has_editable_points(transfer):
         return transfer
     missing = MAX_POINTS - len(transfer.values)
     values, colors, extinction = (np.asarray(getattr(transfer, name)) for name in POINTS)
@@ -122,7 +121,4 @@ def label_color(transfer: LabelTransferFunction, label: int) -> str:
 
 
 def _with_points(transfer: TransferFunction, **changed: Any) -> TransferFunction:
-    checked = TransferFunction(**{name: getattr(transfer, name) for name in POINTS} | changed)
-    return eqx.tree_at(
-        lambda t: [getattr(t, name) for name in POINTS], transfer, [getattr(checked, name) for name in POINTS]
-    )
+    return TransferFunction(**{name: getattr(transfer, name) for name in POINTS} | changed)
