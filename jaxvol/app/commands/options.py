@@ -148,6 +148,6 @@ def _add_clip(parser: Parser) -> None:
         "show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) points; "
         "may be given several times"
     )
-    add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append", default=())
+    add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append", default=[])
     text = "cut away what is inside the box and on that side of all planes, and show the rest"
     group.add_argument("--clip-inside-out", action=SWITCH, default=False, help=text)

@@ -51,7 +51,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
-    """The options of a command, from all sources, and its `run`. `words`: of the command line.
+    """The options of a command, from all sources, their `defaults`, and its `run`.
 
     **Raises:** `ValueError` for a file that cannot be read, and for an option that the command does not have,
     or whose value is of another kind, naming the file if it is from one."""
@@ -70,11 +70,12 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     for source in sources:
         settings = _without_overridden(settings, source) | source
     _refuse_conflicts(settings)
-    options = FIXED | command.defaults() | settings
+    defaults = command.defaults()
+    options = FIXED | defaults | settings
     needed = ("file", "images", "cameras")
     if missing := [name for name in needed if options.get(name, "") is None]:
         command.error(f"the following arguments are required: {', '.join(missing)}")
-    return argparse.Namespace(run=found.run, parser=command, **options)
+    return argparse.Namespace(run=found.run, defaults=defaults, **options)
 
 
 def _of_toml(command: Parser, path: Path) -> dict[str, Any]:

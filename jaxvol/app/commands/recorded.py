@@ -24,7 +24,7 @@ def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
     function is written out if a file or a picture held it."""
     settings = {
         name.replace("_", "-"): value
-        for name, default in options.parser.defaults().items()
+        for name, default in options.defaults.items()
         if (value := getattr(options, name)) != default and not isinstance(value, Path)
     }
     file = {"name": str(options.file), "sha256": checksum(options.file)}
