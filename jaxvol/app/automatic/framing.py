@@ -74,16 +74,11 @@ def _in_world(volume: Volume, grid: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
 
 def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:
     """A camera with the directions, the angle and the size of another, placed so that the points just fill
-    its picture, the whole window.
+    its picture, the whole window; or those of all `views` of it, turned about the middle of the points.
 
-    From a perspective camera at distance D from its focal point f, a point that lies x to the right of f, and
-    z nearer to the camera than f, is in the picture if |x| <= t (D - z), where t is the tangent of half the
-    angle. So D must be at least the mean of max(x / t + z) and max(-x / t + z), if f is shifted so that both
-    sides are as free. For parallel rays, z does not count, and D is the half height of the view.
-
-    `views`: the camera turned about its focal point in all ways that are to show the points, by default as it
-    is. The focal point of several is the middle of the points, without a shift.
-    """
+    From a distance D, a point that lies x beside the focal point, and z nearer than it, is in the picture if
+    |x| <= t (D - z), where t is the tangent of half the angle. For parallel rays, z does not count, and D is
+    the half height of the view."""
     views = views or [camera]
     width, height = camera.size
     middle = (points.min(axis=0) + points.max(axis=0)) / 2

@@ -26,11 +26,8 @@ INSIDE = 255
 
 
 def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
-    """A volume and a transfer function that show each label in its own colour; None if there are no labels.
-
-    Voxels count as labels if they are whole numbers of few kinds, and nearly all have an equal neighbour. The
-    lowest is the background. The volume returned is smooth, 255 inside of all labels, and its labels reach
-    two voxels beyond."""
+    """A volume and a transfer function that show each label but the lowest in its own colour; None if there
+    are no labels. The volume is smooth, 255 inside of all labels, and its labels reach two voxels beyond."""
     import matplotlib
     from matplotlib.colors import ListedColormap
     from scipy.ndimage import gaussian_filter, maximum_filter

@@ -23,13 +23,9 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
     Two thresholds part the values into three classes so that the variance within each is least (Otsu): what
     is around the object, the object, and what is dense in it. The border of the object is shown translucent,
-    what is dense in it nearly opaque. Where the volume's faces cut through the object, as through the body in
-    most CT scans, the object would be a block; where it is grain, as in ultrasound, it would be fog; and
-    where only the borders of what is dense have its values, as in angiograms, it would veil them. Only what
-    is dense is shown then, and its surroundings are faint.
-
-    It is a guess. Opacities refer to a part of the volume's diagonal, so that they do not depend on its
-    units.
+    what is dense in it nearly opaque. Where the volume's faces cut the object, as in most CT scans, where it
+    is grain, as in ultrasound, or only borders of what is dense, as in angiograms, it would hide what is
+    dense, which alone is shown then. It is a guess. Opacities do not depend on the volume's units.
 
     **Arguments:** `volume`: the `Volume`. Of more than 2 million voxels, every n-th is looked at.
 
@@ -51,8 +47,7 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
-    """The same for a volume of which there is a copy of every n-th voxel, in the same place, and a part as it
-    is: whether values are grain, a copy does not tell."""
+    """The same by a copy of every n-th voxel, and a part of the volume as it is, which tells what is grain."""
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
