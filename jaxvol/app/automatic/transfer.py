@@ -47,7 +47,7 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
-    """The same by a copy of every n-th voxel, and a part of the volume as it is, which tells what is grain."""
+    """The same by a copy of every n-th voxel, and a part as it is, which tells what is grain."""
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
