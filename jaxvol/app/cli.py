@@ -24,6 +24,8 @@ from .commands.render import add_render
 from .commands.view import add_view
 
 
+COMMANDS = add_demo, add_render, add_animate, add_plan, add_fit, add_figures, add_info, add_datasets, add_view
+
 EXAMPLES = """\
 examples:
   jaxvol demo
@@ -98,16 +100,6 @@ def parser_of_all() -> Parser:
         version = "(not installed)"
     parser.add_argument("--version", action="version", version=f"%(prog)s {version} (jax {jax.__version__})")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (
-        add_demo,
-        add_render,
-        add_animate,
-        add_plan,
-        add_fit,
-        add_figures,
-        add_info,
-        add_datasets,
-        add_view,
-    ):
+    for add in COMMANDS:
         add(commands)
     return parser

@@ -103,7 +103,6 @@ def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
 
 
 def add_animate(commands: Any) -> None:
-    """Its options."""
     text = "render a volume file from a camera that turns about it"
     parser = add_command(commands, "animate", text, _animate)
     add_scene(parser)

@@ -26,7 +26,6 @@ def _datasets(options: argparse.Namespace) -> None:
 
 
 def add_datasets(commands: Any) -> None:
-    """Its options."""
     text = "list the public Open SciVis volumes; or print the path of one, downloaded if need be"
     parser = add_command(commands, "datasets", text, _datasets)
     parser.add_argument("action", choices=("list", "fetch"), help="what to do")

@@ -3,7 +3,6 @@
 import argparse
 import html
 import inspect
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -82,9 +81,7 @@ def _demo(options: argparse.Namespace) -> None:
     with whole_folder(options.output) as folder:
         for section, pictures in PICTURES.items():
             print(f"{options.output}: {', '.join(pictures)}", flush=True)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # two images leave open what no image shows
-                section(folder, tuple(options.size), options.resolution)
+            section(folder, tuple(options.size), options.resolution)
             images = "".join(f'<img src="{name}.png" alt="{name}"> ' for name in pictures)
             text, code = inspect.getdoc(section) or "", inspect.getsource(section)
             page += f"<p>{html.escape(text)}</p>{images}<pre>{html.escape(code)}</pre>\n"
@@ -93,7 +90,6 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def add_demo(commands: Any) -> None:
-    """Its options."""
     text = "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them"
     parser = add_command(commands, "demo", text, _demo)
     add_output(parser, "jaxvol-demo", "folder to write")

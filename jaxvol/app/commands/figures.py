@@ -32,7 +32,6 @@ def checkout() -> Path:
 
 
 def add_figures(commands: Any) -> None:
-    """Its options."""
     text = "make the figures and tables of the source papers, and a page of them, from recorded results"
     parser = add_command(commands, "figures", text, _figures)
     add_output(parser, "jaxvol-figures", "folder to write")

@@ -56,7 +56,6 @@ def _undetermined(found: Uncertainty | None) -> list[int]:
 
 
 def add_fit(commands: Any) -> None:
-    """Its options."""
     parser = add_command(commands, "fit", "fit a transfer function to images of a volume", _fit)
     add_volume(parser)
     add_sampling(parser)

@@ -54,6 +54,5 @@ def _numbers(values: Any, between: str = " ") -> str:
 
 
 def add_info(commands: Any) -> None:
-    """Its options."""
     text = "print shape, type, place in the world and values of a volume file, as jaxvol loads it"
     add_volume(add_command(commands, "info", text, _info))

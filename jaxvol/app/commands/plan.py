@@ -17,6 +17,5 @@ def _plan(options: argparse.Namespace) -> None:
 
 
 def add_plan(commands: Any) -> None:
-    """Its options."""
     text = "show the cheapest way to render a volume file within a tolerance, and why"
     add_scene(add_command(commands, "plan", text, _plan))

@@ -63,7 +63,6 @@ def _print_facts(path: Path, frames: Frames, rendering: Rendering, spent: str) -
 
 
 def add_render(commands: Any) -> None:
-    """Its options."""
     parser = add_command(commands, "render", "render a volume file to an image", _render)
     add_scene(parser)
     text = (

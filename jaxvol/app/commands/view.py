@@ -22,7 +22,6 @@ def _view(options: argparse.Namespace) -> None:
 
 
 def add_view(commands: Any) -> None:
-    """Its options."""
     text = "look at a volume file in the browser; only this machine can connect, and Ctrl-C ends it"
     parser = add_command(commands, "view", text, _view)
     add_volume(parser)

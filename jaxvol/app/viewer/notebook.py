@@ -132,8 +132,7 @@ class NotebookView(ipywidgets.HBox):
         shown: list[ipywidgets.Widget] = [self._status]
         for heading, controls in controls_of(self.model).items():
             shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
-        reset = Control("buttons", set=self._reset, choices=lambda: ["reset view"])
-        return [*shown, self._widget(reset)]
+        return shown
 
     def _widget(self, control: Control) -> ipywidgets.Widget:
         """A widget that shows what a control describes, and changes the model."""

@@ -117,10 +117,6 @@ def test_the_widgets_change_the_model_and_show_what_it_has(shown):
     assert shown.model.state.step == 1
     found["Jitter"].value = True
     assert "Jitter" in shown.model.state.enabled
-    orbit = shown.model.state.orbit
-    shown.model.change(orbit=orbit.turned(0.1, 0))
-    found["reset view"].click()
-    assert shown.model.state.orbit is orbit
 
 
 def test_a_step_alone_is_moved_by_its_level():
