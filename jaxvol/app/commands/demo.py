@@ -73,18 +73,15 @@ def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
 PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit_found", "fit_true")}
 """What each function writes, from left to right."""
 
-STYLE = "body { font-family: sans-serif; max-width: 72rem; margin: auto } img { max-width: 32% }"
-
 
 def _demo(options: argparse.Namespace) -> None:
-    page = f'<!doctype html><meta charset="utf-8"><title>jaxvol demo</title><style>{STYLE}</style>'
+    page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'
     with whole_folder(options.output) as folder:
         for section, pictures in PICTURES.items():
             print(f"{options.output}: {', '.join(pictures)}", flush=True)
             section(folder, tuple(options.size), options.resolution)
-            images = "".join(f'<img src="{name}.png" alt="{name}"> ' for name in pictures)
-            text, code = inspect.getdoc(section) or "", inspect.getsource(section)
-            page += f"<p>{html.escape(text)}</p>{images}<pre>{html.escape(code)}</pre>\n"
+            images = "".join(f'<img src="{name}.png" alt="{name}" width="32%"> ' for name in pictures)
+            page += f"{images}<pre>{html.escape(inspect.getsource(section))}</pre>\n"
         (folder / "index.html").write_text(page, encoding="utf-8")
     print(f"open {options.output / 'index.html'}")
 
