@@ -19,7 +19,6 @@ def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
     import jaxvol as jv
 
     phantom = jv.phantom("head", resolution)
-    # 16 bits hold 128 levels for each of the phantom's
     smooth = gaussian_filter(128 * np.asarray(phantom.data, np.float32), 1.5)
     volume = jv.Volume(np.round(smooth).astype(np.uint16), phantom.spacing, phantom.origin)
     fast = (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination())
@@ -71,7 +70,6 @@ def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
 
 
 PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit_found", "fit_true")}
-"""What each function writes, from left to right."""
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -91,5 +89,6 @@ def add_demo(commands: Any) -> None:
     parser = add_command(commands, "demo", text, _demo)
     add_output(parser, "jaxvol-demo", "folder to write")
     add_size(parser)
-    text = "voxels per axis of the head (default: %(default)s)"
-    parser.add_argument("--resolution", type=int, default=320, metavar="N", help=text)
+    parser.add_argument(
+        "--resolution", type=int, default=320, metavar="N", help="voxels per axis of the head"
+    )
