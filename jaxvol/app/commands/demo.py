@@ -89,6 +89,4 @@ def add_demo(commands: Any) -> None:
     parser = add_command(commands, "demo", text, _demo)
     add_output(parser, "jaxvol-demo", "folder to write")
     add_size(parser)
-    parser.add_argument(
-        "--resolution", type=int, default=320, metavar="N", help="voxels per axis of the head"
-    )
+    parser.add_argument("--resolution", type=int, default=320, metavar="N", help="voxels along the head")
