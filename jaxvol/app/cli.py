@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
-        ThreadPoolExecutor(1).submit(options.run, options).result()
+        ThreadPoolExecutor(1).submit(options.execute, options).result()
         sys.stdout.flush()
     except BrokenPipeError:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end

@@ -23,10 +23,10 @@ def memory_size(text: str) -> int:
     return count
 
 
-def add_command(commands: Any, name: str, help: str, run: Callable[[argparse.Namespace], None]) -> Parser:
-    """A subcommand, which `run` executes."""
+def add_command(commands: Any, name: str, help: str, execute: Callable[[argparse.Namespace], None]) -> Parser:
+    """A subcommand, with its function."""
     parser = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.")
-    parser.set_defaults(run=run, parser=parser)
+    parser.set_defaults(execute=execute, parser=parser)
     return parser
 
 

@@ -51,7 +51,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
-    """The options of a command, from all sources, their `defaults`, and its `run`.
+    """The options of a command, from all sources, their `defaults`, and the function that is to `execute` it.
 
     **Raises:** `ValueError` for a file that cannot be read, and for an option that the command does not have,
     or whose value is of another kind, naming the file if it is from one."""
@@ -75,7 +75,7 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     needed = ("file", "images", "cameras")
     if missing := [name for name in needed if options.get(name, "") is None]:
         command.error(f"the following arguments are required: {', '.join(missing)}")
-    return argparse.Namespace(run=found.run, defaults=defaults, **options)
+    return argparse.Namespace(execute=found.execute, defaults=defaults, **options)
 
 
 def _of_toml(command: Parser, path: Path) -> dict[str, Any]:

@@ -50,6 +50,7 @@ def recorded_in(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read as a PNG: {shortened(str(fault))}") from fault
     if not isinstance(text, str):
         raise ValueError(f"{path} holds no settings of jaxvol; another program may have saved it again.")
+    content: Any = None
     try:
         content = json.loads(text)
         known = isinstance(content["settings"], dict) and isinstance(content["file"]["name"], str)

@@ -334,10 +334,10 @@ def test_without_a_march_the_defaults_are_on_and_all_others_are_offered():
     scene, state = begun(transfer=None, march=None, lit=True)
     assert state.enabled == {"AlphaCorrection", "SpaceLeaping", "EarlyTermination"}
     assert state.lit
-    assert {"Jitter", "EmptySpaceJitter", "AdaptiveSampling"} <= set(scene.transform_names)
+    assert {jv.Jitter, jv.EmptySpaceJitter, jv.AdaptiveSampling} <= set(map(type, scene.transforms))
     clip = jv.Clip(box=(0, 5, 0, 5, 0, 5))
     scene, state = begun(march=jv.March(0.2, (clip,)))
-    assert scene.transform_names[0] == "Clip"
+    assert isinstance(scene.transforms[0], jv.Clip)
     assert state.enabled == {"Clip"}
     assert scene.voxel == pytest.approx(0.8)
     assert state.step == pytest.approx(0.25)
