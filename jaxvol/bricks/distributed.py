@@ -1,14 +1,12 @@
 """Bricks distributed over devices: each device reads and renders its own, of all rays, and the partial images
 are combined front to back.
 
-Devices get consecutive bricks of the order front to back. Where rays are straight, each ray meets them in
-this order, and so passes from the bricks of the first device to those of the second, and never back. Where it
-does follows from its geometry alone. So each device marches its cells as if nothing lay in front, and the
-operator "over", which is associative, joins them. All devices take a brick each at a time, in one program.
+Devices get consecutive bricks of the order front to back, which straight rays meet in this order. Each device
+marches its cells as if nothing lay in front, and the operator "over", which is associative, joins them. All
+devices take a brick each at a time, in one program.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import Future
 from itertools import pairwise, zip_longest
 from typing import Any, TypeAlias
 
@@ -31,17 +29,17 @@ from ..scene.volume import part_of, with_voxels
 from ..xla.compiling import compiled
 from ..xla.trees import PyTree
 from .cells import first_behind, straight_cells
-from .grid import BrickGrid, Node
-from .traversal import Traversal
+from .grid import BrickGrid
+from .traversal import Load, Traversal
 
 
-Reading: TypeAlias = dict[int, tuple[Node, "Future[np.ndarray]"]]
-"""By device, the first node and the voxels of the brick that this process reads for it."""
+Loads: TypeAlias = dict[int, Load]
+"""By device, the brick that this process reads for it."""
 
 
 class Share(eqx.Module):
-    """What a device marches of an image: all rays, and which of their cells lie in its bricks. Arrays of many
-    shares have one more axis in front, which is sharded."""
+    """What a device marches: all rays, and which of their cells are its own. Arrays of many shares have one
+    more axis in front, which is sharded."""
 
     underway: RayStates
     own: CellRange
@@ -87,36 +85,30 @@ def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[in
 
 def _next_load(
     traversal: Traversal, mesh: Mesh, share: Share, remaining: Iterator[tuple[int, ...]]
-) -> tuple[np.ndarray, Reading] | None:
-    """The next brick of each device, -1 where none of its rays needs one, and the voxels as they are read.
-    `remaining`: bricks of the devices that are still to come, one of each at a time."""
+) -> tuple[np.ndarray, Loads] | None:
+    """The next brick of each device, -1 where none of its rays needs one. `remaining`: those still to come."""
     here = jax.process_index()
     for each in remaining:
         bricks = np.asarray(each, np.int32)
-        met = _met(mesh, traversal.grid, traversal.scene, share, jnp.asarray(bricks)[:, None])
-        needed = np.asarray(met)[:, 0]
+        needed = np.asarray(_met(mesh, traversal.grid, traversal.scene, share, jnp.asarray(bricks)[:, None]))[
+            :, 0
+        ]
         local = [d for d, device in enumerate(mesh.devices) if device.process_index == here and needed[d]]
         if needed.any():
-            reading = {d: traversal.read(each[d], *traversal.around(each[d])) for d in local}
-            return np.where(needed, bricks, -1), reading
+            loads = {d: traversal.load(each[d], None, *traversal.around(each[d])) for d in local}
+            return np.where(needed, bricks, -1), loads
     return None
 
 
-def _placed(
-    traversal: Traversal, mesh: Mesh, bricks: np.ndarray, reading: Reading
-) -> tuple[Array, Array, Array]:
+def _placed(traversal: Traversal, mesh: Mesh, bricks: np.ndarray, loads: Loads) -> tuple[Array, Array, Array]:
     """The bricks, their first nodes and their voxels, each on its device."""
     shape = permuted(traversal.stored, traversal.source.order)
-    nothing, first = np.zeros(shape, traversal.source.dtype), np.zeros((mesh.size, 3), np.int32)
-    voxels = []
+    nothing, first, voxels = np.zeros(shape, traversal.source.dtype), np.zeros((mesh.size, 3), np.int32), []
     for d, device in enumerate(mesh.devices):
-        if device.process_index != jax.process_index():
-            continue
-        part = nothing
-        if d in reading:
-            first[d], coming = reading[d]
-            part = coming.result()
-        voxels.append(jax.device_put(part[None], device))
+        if device.process_index == jax.process_index():
+            first[d] = loads[d].first if d in loads else 0
+            part = loads[d].voxels.result() if d in loads else nothing
+            voxels.append(jax.device_put(part[None], device))
     sharding = NamedSharding(mesh, SHARDED)
     return (
         jnp.asarray(bricks),

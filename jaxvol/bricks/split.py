@@ -1,5 +1,4 @@
-"""How large may bricks be, and how much is read around them? Where rays are straight, any split shows the same
-image."""
+"""How large may bricks be, and how much is read around them?"""
 
 import math
 from dataclasses import dataclass, replace

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.memory import give_back
 from ..engine import devices
-from ..engine.tiling import RenderOptions
+from ..engine.tiling import RenderOptions, Tiling
 from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..ray import Progress, Scene
@@ -30,7 +30,7 @@ from .conversion import range_of
 from .grid import BrickGrid, Node
 from .sources import READERS, VoxelSource
 from .split import Margin, bytes_of, check_stored, divided, fits, split, stored_of, stored_shape
-from .summary import Summary, summary_of
+from .summary import summary_of
 
 
 State = TypeVar("State")
@@ -45,6 +45,9 @@ BEAMS = 32
 """Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
 rays."""
 
+BATCH = 72
+"""`Tiling.batch` on a CPU. Few rays meet a brick, and the last batch takes as long as its longest ray."""
+
 KEPT = 64 * 2**20
 """Bytes that are read before freed memory is given back to the system, which takes some 8 ms."""
 
@@ -58,11 +61,13 @@ class Load(NamedTuple):
     voxels: "Future[np.ndarray]"
 
 
-class Request(NamedTuple):
-    """How bricks are chosen, as `render_bricks` was asked to.
+@dataclass(frozen=True)
+class Request:
+    """What `render_bricks` was asked for.
 
-    - `counts`: along x, y and z, in place of those chosen to fit into `memory`.
-    - `devices`: how many take a brick each at a time.
+    - `counts`: bricks along x, y and z, in place of those chosen to fit into `memory`.
+    - `mesh`: devices over which rays are dealt out, or bricks, if `deals_bricks`.
+    - `traversals`: filled while the scene is rendered. A gradient has a second one.
     """
 
     source: VoxelSource
@@ -70,7 +75,10 @@ class Request(NamedTuple):
     counts: Node | None = None
     method: Method = "overlap"
     progress: Callable[[int, int], Any] | None = None
-    devices: int = 1
+    outputs: Any = "all"
+    mesh: Mesh | None = None
+    deals_bricks: bool = False
+    traversals: "list[Traversal]" = field(default_factory=list)
 
 
 class Traversal:
@@ -87,27 +95,27 @@ class Traversal:
     rays: Ray
     at: Progress
 
-    def __init__(
-        self,
-        request: Request,
-        marched: Scene,
-        shown: Scene,
-        options: RenderOptions,
-        summary: Summary | None = None,
-    ):
-        """Of a scene as its rays are marched, and as it is `shown`. `summary`: of the source, if known."""
+    def __init__(self, request: Request, marched: Scene, shown: Scene, outputs: Any):
+        """Of a scene as its rays are marched, and as it is `shown`."""
         assert isinstance(marched.source, Camera)
-        source, memory, counts, method, _, least = request
-        self.request, self.source, self.scene, self.options = request, source, marched, options
+        self.request, self.source, self.scene = request, request.source, marched
+        source, memory, counts = request.source, request.memory, request.counts
+        tiling = Tiling.of_backend(request.mesh)
+        if not tiling.turns:  # on a CPU
+            tiling = tiling._replace(batch=BATCH)
+        self.options = RenderOptions(
+            outputs, tiling._replace(devices=None) if request.deals_bricks else tiling
+        )
         self.done, self.bytes_read = 0, 0
         self.loads: list[int] = []
         self.space, shape = marched.march.locate(marched.volume), source.shape
-        margin = Margin.of(marched.march, self.space, shape, options.tiling.cells, shown)
+        margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
+        least = devices.number_of(request.mesh) if request.deals_bricks else 1
         self.grid = divided(shape, counts) if counts else split(shape, source.dtype, memory, margin, least)
-        self.margin = margin if method == "overlap" else replace(margin, probe=None)
+        self.margin = margin if request.method == "overlap" else replace(margin, probe=None)
         self.stored = self.min_stored = stored_of(self.grid, self.margin)
         check_stored(self.stored)
-        if not self.margin.straight and not callable(method):
+        if not self.margin.straight and not callable(request.method):
             # what is read follows from the rays: begin with less
             middle = (np.asarray(shape) - 1) / 2
             cells = self.margin.of_box(self.space, shape, middle, middle)
@@ -115,7 +123,9 @@ class Traversal:
         self.memory = max(memory, bytes_of(self.min_stored, source.dtype, self.margin))
         self.order = self.grid.order(self.space, marched.source)
         # last, since it may read the whole source
-        self.summary = summary_of(source, memory=memory) if summary is None else summary
+        known = request.traversals
+        self.summary = known[0].summary if known else summary_of(source, memory=memory)
+        known.append(self)
         occupied = self.summary.where(eqx.Partial(marched.compositing.occupied, marched.transfer))
         self.visible = self.summary.bricks_with(occupied, self.grid)
 

@@ -1,8 +1,7 @@
 """Marches an image through one brick of a volume after the other, and pulls it back in a second march.
 
-A volume that does not fit into memory is marched brick by brick. Of each ray, it is kept where it has come
-to; in each brick it marches those of its cells that lie there (`CellRange`), from where the brick before left
-off. What is computed from voxels, the packed copy, ranges of blocks and windows, is computed for each brick.
+Of each ray, it is kept where it has come to; in each brick it marches those of its cells that lie there
+(`CellRange`), from where the brick before left off.
 """
 
 from dataclasses import replace
@@ -61,10 +60,8 @@ def march_brick(
     exact: bool = False,
 ) -> RayStates:
     """Marches each ray through `ranges`. `scene`: with a brick of the volume, which holds what rays meet
-    there, and in a segment more.
-
-    `restart`: ignore where rays have come to, unless they are opaque. `exact`: rays take no cell behind their
-    range."""
+    there, and in a segment more. `restart`: from where their ranges begin, unless they are opaque. `exact`:
+    rays take no cell behind their range."""
     tiles = RayTiles.of(scene.source, options.tiling)
     index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
     prepared = acceleration.prepared(scene)
