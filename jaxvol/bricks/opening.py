@@ -24,7 +24,6 @@ Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 """A source, a volume, the path of a file or folder, or an array."""
 
 OF_RAW, OF_ARRAY, OF_ZARR = ("shape", "dtype"), ("axes", "index"), ("axes", "index", "missing")
-OPTIONS = *OF_RAW, *OF_ZARR
 
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:

@@ -153,15 +153,12 @@ class VoxelSource:
         return voxels
 
     def subsampled(self, stride: int) -> Volume:
-        """Every `stride`-th voxel, read in slabs across the axis where these are thinnest."""
-        axis = int(np.argmax([n / c for n, c in zip(self.shape, self.chunks, strict=True)]))
-        thick = -(-max(self.chunks[axis], stride) // stride) * stride
-        slabs = []
-        for begin in range(0, self.shape[axis], thick):
-            low, high = [0, 0, 0], list(self.shape)
-            low[axis], high[axis] = begin, min(begin + thick, self.shape[axis])
-            slabs.append(self.read(low, high)[::stride, ::stride, ::stride].copy())
-        return Volume(np.concatenate(slabs, axis), [stride * s for s in self.spacing], self.origin)
+        """Every `stride`-th voxel."""
+        found = np.empty([-(-n // stride) for n in self.shape], self.dtype)
+        for low, high in self.parts(((0, 0, 0), self.shape), AT_ONCE):
+            place = tuple(slice(-(-a // stride), -(-b // stride)) for a, b in zip(low, high, strict=True))
+            found[place] = self.read(low, high)[tuple(slice(-a % stride, None, stride) for a in low)]
+        return Volume(found, [stride * s for s in self.spacing], self.origin)
 
     def _stored(self, box: Box, axes: Axes) -> np.ndarray:
         """The voxels of a box as they are stored, with their axes in the order `axes`."""

@@ -1,7 +1,6 @@
 """Which values occur where in a source? Ranges of its blocks, found in one pass over all voxels. They tell
 which bricks are empty without reading them, as `occupancy.Blocks` does of a volume in memory."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -31,9 +30,6 @@ COPIES = 8
 MOST = 2**25
 """Bytes of voxels that are read at a time, if a chunk has no more: larger parts leave the caches."""
 
-Progress = Callable[[int, int], Any]
-"""Called with the number of voxels done and the number of all."""
-
 
 @dataclass(frozen=True)
 class Summary:
@@ -52,7 +48,8 @@ class Summary:
     def range_of(self, low: Corner, high: Corner) -> tuple[float, float]:
         """Range of the blocks that hold the voxels with `low` <= (x, y, z) < `high`. Interpolation between
         these stays within it up to rounding (`occupancy.ROUNDING`)."""
-        touched = tuple(self._blocks_of(a, b - 1, n) for a, b, n in zip(low, high, self.shape, strict=True))
+        ends = zip(low, high, self.shape, strict=True)
+        touched = tuple(self._blocks_of(int(a), int(b) - 1, n) for a, b, n in ends)
         return float(self.low[touched].min()), float(self.high[touched].max())
 
     def where(self, holds: Callable[[Blocks], Any]) -> Bool[np.ndarray, "bx by bz"]:
@@ -80,7 +77,7 @@ class Summary:
         return slice(begin, min(max(begin, (last - 1) // self.cell), final) + 1)
 
 
-def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress | None = None) -> Summary:
+def summary_of(source: VoxelSource, *, memory: int = 2**28) -> Summary:
     """The summary of a source, from one pass over its voxels. The source keeps it if it `is_constant`; open
     it again after writing to it.
 
@@ -88,7 +85,6 @@ def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress |
 
     - `source`: the voxels.
     - `memory`: bytes for the pass, beside the summary. It is exceeded where one chunk takes more.
-    - `progress`: called after each part; what it raises ends the pass.
 
     **Returns:** the summary. It takes 2 / 16³ of the voxels' memory.
 
@@ -98,20 +94,20 @@ def summary_of(source: VoxelSource, *, memory: int = 2**28, progress: Progress |
         source.check_unchanged()
         return source._summary
     cell = CELL if min(source.shape) > CELL else BLOCK
-    found = scan(source, cell, memory=memory, progress=progress)
+    found = scan(source, cell, memory=memory)
     if source.is_constant:
         source._summary = found
     return found
 
 
-def scan(source: VoxelSource, cell: int, *, memory: int = 2**28, progress: Progress | None = None) -> Summary:
+def scan(source: VoxelSource, cell: int, *, memory: int = 2**28) -> Summary:
     """As `summary_of`, by reading all voxels in slabs, each while the one before is looked at. `cell`: cells
     along the side of a block."""
     order, shape = source.order, tuple(-(-(n - 1) // cell) for n in source.shape)
     limits = (jnp.iinfo if source.dtype.kind in "iu" else jnp.finfo)(source.dtype)
     low, high = np.full(shape, limits.max, source.dtype), np.full(shape, limits.min, source.dtype)
     boxes = list(source.parts(((0, 0, 0), source.shape), min(memory // COPIES, MOST)))
-    done, coming = 0, READERS.submit(source.read, *boxes[0], order)
+    coming = READERS.submit(source.read, *boxes[0], order)
     for (begin, end), following in zip(boxes, [*boxes[1:], None], strict=True):
         voxels = comparable(coming.result())
         if following is not None:
@@ -125,9 +121,6 @@ def scan(source: VoxelSource, cell: int, *, memory: int = 2**28, progress: Progr
             found = _over_blocks(voxels, permuted(begin, order), permuted(blocks, order), cell, combine)
             found = found.transpose(inverse(order)).astype(source.dtype)
             ranges[blocks] = combine(ranges[blocks], found)
-        done += voxels.size
-        if progress is not None:
-            progress(done, math.prod(source.shape))
     give_back()
     return Summary(source.shape, cell, low, high)
 
