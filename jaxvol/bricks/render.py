@@ -90,8 +90,8 @@ def render_bricks(
     but `SpaceLeaping("min_distance")`.
 
     - `source`, and `options` for it (`shape`, `dtype`, `axes`, `index`, `missing`): see `bricks.levels_of`.
-      One pass over all voxels finds their ranges before the first image. A `bricks.VoxelSource` of a file keeps
-      them for the next: open it once, by `bricks.source_of`.
+      One pass over all voxels finds their ranges before the first image. A `bricks.VoxelSource` of a file
+      keeps them for the next: open it once, by `bricks.source_of`.
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
       default a quarter of the device's. Beside them an image takes some 550 bytes for each pixel, compiled

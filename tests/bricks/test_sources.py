@@ -274,7 +274,7 @@ def test_what_is_no_box_is_refused():
             source.read(low, high)
     for low in ((0, 0), 0, (0.5, 0, 0), None):
         with pytest.raises(
-            ValueError, match="low and high must be the corners of a box .* three integers each"
+            ValueError, match=r"low and high must be the corners of a box .* three integers each"
         ):
             source.read(low, (1, 1, 1))
 
