@@ -52,7 +52,7 @@ class VoxelSource:
 
     - `shape`: number of voxels. `spacing`, `origin`, `direction`: as given.
     - `dtype`: of the voxels that `read` returns. `stored_type`: of those of the array.
-    - `chunks`: voxels of the chunks in which it is stored, or of a plane if it is not `chunked`.
+    - `chunks`: voxels of the chunks in which it is stored, or of a row if it has none.
     - `order`: axes in the order of storage, the slowest first, 0 for x.
     - `is_constant`: whether its `Summary` is kept: unlike an array of NumPy or a memory map that is open for
       writing, nobody is expected to write to it.
@@ -94,9 +94,8 @@ class VoxelSource:
         chunks, order = _layout_of(array, shape)
         slow, middle, fast = (place.index(axis) for axis in order if axis in place)
         self.order: Axes = slow, middle, fast
-        self.chunked = chunks is not None
         if chunks is None:
-            chunks = [1 if axis == place[slow] else n for axis, n in enumerate(shape)]
+            chunks = [n if axis == place[fast] else 1 for axis, n in enumerate(shape)]
         x, y, z = (min(chunks[axis], n) for axis, n in zip(place, self.shape, strict=True))
         self.chunks: tuple[int, int, int] = x, y, z
         self._place, self._index = place, _index(name, names, shape, index or {})
@@ -185,12 +184,9 @@ class VoxelSource:
         return moved
 
     def parts(self, box: Box, most: int) -> Iterator[Box]:
-        """A box, cut between chunks into parts that are stored in at most so many bytes, or in one chunk. Of
-        what is not stored in chunks, planes with more are cut into rows. In the order of storage."""
+        """A box, cut between chunks into parts that are stored in at most so many bytes, or in one chunk, in
+        the order of storage."""
         extent, item = list(self.chunks), max(self.stored_type.itemsize, self.dtype.itemsize)
-        middle = self.order[1]
-        while not self.chunked and extent[middle] > 1 and math.prod(extent) * item > most:
-            extent[middle] = -(-extent[middle] // 2)
         for axis in reversed(self.order):  # rows first
             while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= most:
                 extent[axis] = min(2 * extent[axis], self.shape[axis])

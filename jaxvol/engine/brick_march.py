@@ -68,17 +68,16 @@ def march_brick(
 
     def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
         number, states, range_ = each
-        rays, at = states.rays, states.at
+        rays, start = states.rays, states.at
         beams = Beams.of(tiles, scene.source, rays, number, range_)
-        start = at
         if restart:
-            over = opaque(prepared, at) | (range_.until <= range_.first)
-            start = with_fields(at, index=range_.first, finished=over)
+            over = opaque(prepared, start) | (range_.until <= range_.first)
+            start = with_fields(start, index=range_.first, finished=over)
         after, _ = march_rays(
             prepared, index, beams, options.tiling, options.outputs, resumed=start, exact=restart or exact
         )
         # where it was restarted, a ray may go back
-        over = opaque(prepared, after) if restart else at.finished | ended(prepared, rays, after)
+        over = opaque(prepared, after) if restart else start.finished | ended(prepared, rays, after)
         return RayStates(rays, with_fields(after, finished=over))
 
     return tiles.map(one, states, ranges)
@@ -109,14 +108,11 @@ def resolve_brick(
     sample than the one chosen `before`. `march`: of the rays."""
     tiles = RayTiles.of(scene.source, options.tiling)
     rendering = _assembled(scene._replace(march=march), tiles, after)
-    changed = jnp.zeros(after.rays.length.shape, bool)
-    for old, new in zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True):
-        changed |= old != new
-    changed = tiles.assemble(changed)
-    rgba = rendering.rgba * changed[..., None].astype(rendering.rgba.dtype)
-    found = rgba, rendering.depth, rendering.details.selected
+    states = zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True)
+    changed = tiles.assemble(jnp.any(jnp.stack([old != new for old, new in states]), axis=0))[..., None]
+    found = rendering.rgba * changed, rendering.depth, rendering.details.selected
     resolved = resolve_pixels(scene, options, acceleration, found)
-    return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)
+    return resolved if pixels is None else jnp.where(changed, resolved, pixels)
 
 
 def _assembled(scene: Scene, tiles: RayTiles, states: RayStates) -> Rendering:
@@ -131,16 +127,17 @@ def join_segments(scene: Scene, parts: RayStates) -> RayStates:
     prepared = scene._replace(lighting=None).prepared()
 
     def join(front: Progress, back: Progress) -> Progress:
+        stats = None
+        if front.stats is not None and back.stats is not None:
+            samples = front.stats.samples + back.stats.samples
+            stats = replace(front.stats, samples=samples, aligned=front.stats.aligned | back.stats.aligned)
         both = replace(
             front,
             index=jnp.maximum(front.index, back.index),
             composite=scene.compositing.joined(front.composite, back.composite),
             finished=front.finished & back.finished,
+            stats=stats,
         )
-        if front.stats is not None and back.stats is not None:
-            samples = front.stats.samples + back.stats.samples
-            aligned = front.stats.aligned | back.stats.aligned
-            both = replace(both, stats=replace(front.stats, samples=samples, aligned=aligned))
         stops = stopped(prepared, front.composite)
         return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
 
@@ -165,11 +162,8 @@ def _passed(march: March, at: Progress) -> Progress:
 
 
 class ReplayState(eqx.Module):
-    """The second march of an image, underway, of (tiles, groups, rays in a group).
-
-    - `given`: cotangents of the rays.
-    - `carry`: what the samples so far are worth. `of_rays`: what they gave the rays.
-    """
+    """The second march of an image: cotangents `given` to the rays, what the samples so far are worth
+    (`carry`), and what they gave the rays; (tiles, groups, rays in a group)."""
 
     states: RayStates
     given: Cotangents
