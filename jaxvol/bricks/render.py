@@ -16,8 +16,6 @@ from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.brick_march import (
     NO_ACCELERATION,
-    RayStates,
-    ReplayState,
     begin_rays,
     begin_vjp,
     finish_image,
@@ -27,11 +25,10 @@ from ..engine.brick_march import (
     vjp_of_brick,
 )
 from ..engine.devices import Devices, check_not_sharded, mesh_of, on_all
-from ..engine.gradients import Sums, of_all_outputs, of_perturbed
+from ..engine.gradients import of_all_outputs, of_perturbed
 from ..engine.image import RenderOutputs
 from ..engine.resolve import resolve_image
 from ..engine.tiling import RenderOptions
-from ..engine.wavefront import CellRange
 from ..lighting.shading import Lighting
 from ..march.march import March
 from ..march.strides import stride_control
@@ -45,7 +42,7 @@ from ..scene.volume import Volume, part_of
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
-from ..xla.trees import PyTree, strong
+from ..xla.trees import strong
 from .distributed import render_distributed
 from .grid import Node, is_straight
 from .opening import level_for, levels_of
@@ -232,20 +229,15 @@ def _image(scene: Scene, request: Request) -> Rendering:
     if request.deals_bricks:
         assert request.mesh is not None
         return render_distributed(traversal, request.mesh)
-    exact = callable(request.method)
-
-    def march_brick(
-        brick: Volume, cells: CellRange, state: tuple[RayStates, PyTree]
-    ) -> tuple[RayStates, PyTree]:
-        underway, pixels = state
-        after = _march_part(*_on(brick, marched, options), underway, cells, exact)
+    underway, pixels = _set_out(marched, options), None
+    for brick, cells in traversal.bricks(underway.rays, underway.at):
+        before, restart = underway.at, callable(request.method)
+        underway = _march_part(*_on(brick, marched, options), underway, cells, restart)
         if selects:
-            pixels = _resolve_part(*_on(brick, scene, options), marched.march, underway.at, after, pixels)
-        return after, pixels
-
-    underway = _set_out(marched, options)
-    state = traversal.through(underway.rays, (underway, None), lambda state: state[0].at, march_brick)
-    underway, pixels = state
+            pixels = _resolve_part(*_on(brick, scene, options), marched.march, before, underway, pixels)
+            jax.block_until_ready(pixels)
+        traversal.at = underway.at
+        del brick
     rendering = _arrive(marched, options, underway)
     if not mode.resolves:
         return rendering
@@ -296,16 +288,12 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, reques
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
 
-    def pull_brick(
-        brick: Volume, cells: CellRange, state: tuple[Sums, ReplayState]
-    ) -> tuple[Sums, ReplayState]:
-        here, options_, acceleration = _on(brick, scene, options)
-        return _pull_part(here, perturbed, options_, acceleration, *state, cells)
-
-    state = _start_pull(scene, perturbed, options, rendering, whole)
-    rays = state[1].states.rays
-    state = traversal.through(rays, state, lambda state: state[1].states.at, pull_brick)
-    found = _end_pull(scene, perturbed, options, *state, rendering, whole)
+    sums, replay = _start_pull(scene, perturbed, options, rendering, whole)
+    for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
+        sums, replay = _pull_part(*_on(brick, scene, options), perturbed, sums, replay, cells)
+        traversal.at = replay.states.at
+        del brick
+    found = _end_pull(scene, perturbed, options, sums, replay, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -32,8 +32,6 @@ from .sources import READERS, VoxelSource
 from .split import Margin, bytes_of, check_stored, divided, fits, split, stored_of, stored_shape
 from .summary import summary_of
 
-
-State = TypeVar("State")
 
 Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 """Which brick is read next, and for which cells of each ray. Bricks are planned one ahead of the march:
@@ -129,35 +127,27 @@ class Traversal:
         occupied = self.summary.where(eqx.Partial(marched.compositing.occupied, marched.transfer))
         self.visible = self.summary.bricks_with(occupied, self.grid)
 
-    def through(
-        self,
-        rays: Ray,
-        state: State,
-        where: Callable[[State], Progress],
-        march: Callable[[Volume, CellRange, State], State],
-    ) -> State:
-        """The state after `march(brick, cells, state)` of all bricks; `where`: how far its rays have come."""
-        self.rays, self.at, given_back = rays, where(state), self.bytes_read
+    def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
+        """Each brick that rays need, and their cells there, while the next one is read. Before this one is
+        asked for, `at` is set to where rays have come, and the brick dropped."""
+        self.rays, self.at, given_back = rays, at, self.bytes_read
         method = self.request.method
         if not callable(method):
             method = in_order if self.margin.straight else METHODS[method]
         schedule = method(self)
         load = next(schedule, None)
         while load is not None:
-            jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
+            jax.block_until_ready(self.at)  # or two bricks, and what is made of both, would be in memory
             if self.bytes_read - given_back >= KEPT:
                 give_back()
                 given_back = self.bytes_read
             brick, cells = self._brick(load), load.cells
             assert cells is not None
-            load = None  # and with it the voxels as they were read
-            following = next(schedule, None)
-            state = march(brick, cells, state)
+            del load  # and with it the voxels as they were read
+            load = next(schedule, None)
+            yield brick, cells
             del brick, cells
-            self.at = where(state)
             self.finish(1, int(self.visible.sum()))
-            load = following
-        return state
 
     def finish(self, bricks: int, of: int) -> None:
         """Reports that so many more bricks are rendered, `of` all that hold anything visible."""

@@ -194,9 +194,9 @@ def begin_vjp(
 @on_devices("both", sharded=("replayed", "ranges"))
 def vjp_of_brick(
     scene: Scene,
-    perturbed: Any,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
+    perturbed: Any,
     sums: Sums,
     replayed: ReplayState,
     ranges: CellRange,
