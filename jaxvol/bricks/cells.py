@@ -31,14 +31,8 @@ CHUNK = 8
 
 
 class Visit(eqx.Module):
-    """One brick, and where rays may go while it is in memory.
-
-    - `brick`: its number.
-    - `passable`: bricks through which rays go on from it, itself included.
-    - `empty`: bricks of which no voxel is needed, through which rays move to it.
-
-    The last two have one more entry, for what lies outside of the volume.
-    """
+    """A brick; through which bricks rays go on from it, itself included, while it is in memory; and which are
+    `empty`, so that rays move through them to it. Of all bricks, and of what lies outside of the volume."""
 
     brick: Int[Array, ""]
     passable: Bool[Array, " bricks"]
@@ -46,13 +40,8 @@ class Visit(eqx.Module):
 
 
 class BrickCells(NamedTuple):
-    """Cells of rays that are marched while a brick is in memory.
-
-    - `cells`: from the first to the last one, which lie in bricks that are passable.
-    - `reached`: index to which each ray has then come.
-    - `low`, `high`: a box of grid coordinates that holds all points of these cells.
-    - `any`: whether there are any cells.
-    """
+    """Cells of rays that are marched while a brick is in memory; the index that each ray has then `reached`;
+    a box of grid coordinates that holds all points of these cells; and whether there are any."""
 
     cells: CellRange
     reached: Int[Array, "*rays"]
@@ -71,8 +60,7 @@ def padded(cells: CellRange) -> CellRange:
 def straight_cells(
     grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], brick: Int[Array, ""]
 ) -> CellRange:
-    """The cells of straight rays in a brick, and those whose samples may be shifted into it; none of rays
-    that miss it, or are not alive."""
+    """The cells of `alive` straight rays in a brick, and those whose samples may be shifted into it."""
     near, far, hit = _within(grid, march, rays, brick)
     first, until = jnp.ceil(near).astype(jnp.int32) - SLACK, jnp.floor(far).astype(jnp.int32) + 1 + SLACK
     hit &= alive

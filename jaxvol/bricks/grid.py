@@ -19,8 +19,7 @@ Node = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class BrickGrid:
-    """Bricks of equally many cells; the last ones along an axis may have fewer. Bricks are numbered in
-    row-major order.
+    """Bricks of equally many cells, numbered in row-major order; the last ones along an axis may have fewer.
 
     - `shape`: nodes of the volume. `size`: cells of a brick.
     """

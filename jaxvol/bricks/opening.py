@@ -97,9 +97,7 @@ def _of_volume(volume: Volume) -> VoxelSource:
     check_is_array(volume)
     for part in ("labels", "field"):
         if getattr(volume, part) is not None:
-            raise ValueError(
-                f"source must be a volume of voxels alone; got a Volume with {part}. Use jv.render for it."
-            )
+            raise ValueError(f"source must hold voxels alone; got a Volume with {part}. Use jv.render.")
     return VoxelSource(volume.data, volume.spacing, volume.origin, direction=volume.direction, name="volume")
 
 

@@ -47,7 +47,7 @@ from .distributed import render_distributed
 from .grid import Node, is_straight
 from .opening import level_for, levels_of
 from .sources import VoxelSource
-from .traversal import Method, Request, Traversal
+from .traversal import METHODS, Method, Request, Traversal
 
 
 Own = Literal["rays", "bricks"]
@@ -157,8 +157,7 @@ def render_bricks(
         _check_distributed(scene, method)
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
         raise ValueError(
-            "render_bricks has gradients in reverse mode (jax.grad, jax.vjp), of first order, and none in "
-            'forward mode (jax.jvp, jax.jacfwd): use jv.render(..., adjoint="forward" or "direct").'
+            "render_bricks has gradients in reverse mode, but none in forward mode (jax.jvp) or of 2nd order."
         )
     rendering = _differentiable(scene, request) if is_traced(scene) else _image(scene, request)
     report = request.traversals[0].report()
@@ -223,8 +222,8 @@ _start_pull, _pull_part, _end_pull = map(compiled, (begin_vjp, vjp_of_brick, fin
 def _image(scene: Scene, request: Request) -> Rendering:
     mode, outputs = scene.compositing, request.outputs
     marched, selects = _marched(scene), isinstance(mode, Selection)
-    outputs_of_march = "depth" if mode.resolves and outputs == "rgba" else outputs
-    traversal = Traversal(request, marched, scene, outputs_of_march)
+    found = "depth" if mode.resolves and outputs == "rgba" else outputs
+    traversal = Traversal(request, marched, scene, found)
     options = traversal.options
     if request.deals_bricks:
         assert request.mesh is not None
@@ -256,8 +255,7 @@ def _image(scene: Scene, request: Request) -> Rendering:
 def _differentiable(scene: Scene, request: Request) -> Rendering:
     if is_traced(scene):
         raise ValueError(
-            "render_bricks reads its source while it runs, and so not inside jax.jit, jax.vmap or forward "
-            "mode: call it outside of them, or jv.render on a volume in memory."
+            "render_bricks reads its source while it runs, so not inside jax.jit, jax.vmap or forward mode."
         )
     return _image(scene, request)
 
@@ -266,10 +264,7 @@ def _differentiable(scene: Scene, request: Request) -> Rendering:
 def _(perturbed: Any, scene: Scene, request: Request) -> tuple[Rendering, Rendering]:
     mode = scene.compositing
     if mode.resolves:
-        raise ValueError(
-            f"compositing by {type(mode).__name__} has no gradient through bricks; use jv.render on a volume "
-            "in memory."
-        )
+        raise ValueError(f"compositing by {type(mode).__name__} has no gradient through bricks.")
     if callable(request.method):
         raise ValueError('method: a schedule of your own has no gradient; use "overlap".')
     rendering = _differentiable(scene, request)
@@ -287,7 +282,6 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, reques
     options, whole = traversal.options, of_all_outputs(rendering, cotangent)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
-
     sums, replay = _start_pull(scene, perturbed, options, rendering, whole)
     for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
         sums, replay = _pull_part(*_on(brick, scene, options), perturbed, sums, replay, cells)
@@ -314,10 +308,7 @@ def _level(
         otherwise = ', or "auto" under a ToroidalMap' if mapped else ', or "auto"'
         return levels[integer("level", level, 0, most, otherwise=otherwise)]
     if most and is_traced(camera):
-        raise ValueError(
-            f"level must be one of 0 to {most} where gradients are taken; got 'auto', which depends on what "
-            "is differentiated."
-        )
+        raise ValueError(f"level must be one of 0 to {most} where gradients are taken; got 'auto'.")
     return levels[level_for(levels, camera) if most else 0]
 
 
@@ -329,8 +320,7 @@ def _counts(bricks: Any) -> Node | None:
         return integer("x", x, 1), integer("y", y, 1), integer("z", z, 1)
     except (TypeError, ValueError) as fault:
         raise ValueError(
-            "bricks must be three numbers of bricks, along x, y and z, each an integer of at least 1; got "
-            f"{shortened(bricks)}."
+            f"bricks must be three numbers of bricks, each an integer of at least 1; got {shortened(bricks)}."
         ) from fault
 
 

@@ -178,8 +178,7 @@ class VoxelSource:
         size = permuted([b - a for a, b in zip(*box, strict=True)], axes)
         if moved.shape != size:
             raise ValueError(
-                f"{self.name}: the box from {box[0]} to {box[1]} must have the shape {size}, along the axes "
-                f"{''.join(SPACE[axis] for axis in axes)}; its array returns {moved.shape}."
+                f"{self.name}: a box at {box[0]} must have the shape {size}; its array returns {moved.shape}."
             )
         return moved
 
@@ -247,8 +246,7 @@ def _axis_names(name: str, axes: Any, rank: int) -> list[str]:
     names = list(axes) if isinstance(axes, Sequence) else []
     if len(names) != rank or len({*names}) != rank or not {*SPACE} <= {*names}:
         raise ValueError(
-            f"axes must name each of the {rank} axes of {name} once, x, y and z among them, such as "
-            f'"zyx"; got {axes!r}.'
+            f'axes must name each of the {rank} axes of {name} once, such as "zyx"; got {axes!r}.'
         )
     return names
 
@@ -256,9 +254,7 @@ def _axis_names(name: str, axes: Any, rank: int) -> list[str]:
 def _index(name: str, names: list[str], shape: tuple[int, ...], index: Mapping[str, int]) -> list[int]:
     """The entry to take along each axis; those of x, y and z are replaced by slices."""
     if unknown := {*index} - ({*names} - {*SPACE}):
-        raise ValueError(
-            f"index must name axes of {name} other than x, y, z; got {sorted(unknown)} of {names}."
-        )
+        raise ValueError(f"index must name axes other than x, y, z of {names}; got {sorted(unknown)}.")
     fixed = []
     for axis, count in zip(names, shape, strict=True):
         only = 0 if count == 1 or axis in SPACE else None
@@ -298,6 +294,5 @@ def check_is_array(thing: Any) -> None:
         ) from fault
     if isinstance(thing, type) or not (isinstance(thing, Volume) or has_boxes):
         raise ValueError(
-            "source must be an array, a Volume, a VoxelSource, or the path of a file or folder; got "
-            f"{described(thing)}."
+            f"source must be an array, a Volume, a VoxelSource, or the path of one; got {described(thing)}."
         )

@@ -44,10 +44,8 @@ class Margin:
     - `cells`: along each axis, on both sides, around any brick.
     - `steps`, `length`: how far cells that begin in the brick may reach along a ray, and in the world.
     - `light`: world length around a sample within which light is looked for.
-    - `around`: nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`.
-    - `slopes`: whether the gradient is read.
-    - `straight`: whether rays are straight in the grid.
-    - `probe`: whose bricks overlap. None if bricks do not.
+    - `around`: nodes more, for interpolation, `slopes`, and the windows of `AdaptiveSampling`.
+    - `straight`: whether rays are straight in the grid. `probe`: whose bricks overlap, if they do.
     """
 
     cells: Node
@@ -148,8 +146,8 @@ def check_stored(stored: Node) -> None:
     """**Raises** `ValueError` if a brick of this shape has more voxels than a volume may have."""
     if math.prod(stored) > MOST_VOXELS:
         raise ValueError(
-            "bricks must be so many, and steps so short, that a brick and what is read around it have fewer "
-            f"than 2**31 voxels; got {' x '.join(map(str, stored))} along x, y and z."
+            "bricks must be so many that fewer than 2**31 voxels are read for each; got "
+            f"{' x '.join(map(str, stored))}."
         )
 
 

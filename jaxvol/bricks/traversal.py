@@ -233,9 +233,8 @@ class Traversal:
         (least, most), (lowest, highest) = self.summary.range_of(low, high), range_of(voxels)
         if lowest < least or highest > most:
             raise ValueError(
-                f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
-                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now {lowest} to "
-                f"{highest}. Open it again."
+                f"{self.source.name} changed since the ranges of its values were found: {least} to {most} "
+                f"then, and {lowest} to {highest} now, in the box from {tuple(low.tolist())}. Open it again."
             )
         return voxels
 

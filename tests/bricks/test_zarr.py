@@ -106,7 +106,7 @@ def test_an_index_chooses_along_other_axes(tmp_path):
         (None, r"index\['t'\] must be an integer from 0 to 1; got None"),
         ({"t": 0}, r"index\['c'\] must be an integer from 0 to 2; got None"),
         ({"t": 2, "c": 0}, r"index\['t'\] must be an integer from 0 to 1; got 2"),
-        ({"t": 0, "c": 0, "z": 1}, "index must name axes .* other than x, y, z"),
+        ({"t": 0, "c": 0, "z": 1}, "index must name axes other than x, y, z"),
         ({"t": 0, "c": 0, "q": 1}, "index must name axes"),
     ):
         with pytest.raises(ValueError, match=message):
