@@ -113,11 +113,13 @@ class VoxelSource:
 
     def _file_state(self) -> tuple[int, int] | None:
         """Size and time of the file under a memory map; None if there is none, or only the map has it."""
-        try:
-            found = os.stat(self._map.filename)  # pyright: ignore
-        except (AttributeError, OSError, TypeError):
+        if self._map is None or self._map.filename is None:
             return None
-        return found.st_size, found.st_mtime_ns if self._map.mode == "r" else 0  # pyright: ignore
+        try:
+            found = os.stat(self._map.filename)
+        except OSError:
+            return None
+        return found.st_size, found.st_mtime_ns if self._map.mode == "r" else 0
 
     def check_unchanged(self) -> None:
         """**Raises:** `ValueError` if the file under a memory map was written to since the source was made.

@@ -141,7 +141,10 @@ class Traversal:
             if self.bytes_read - given_back >= KEPT:
                 give_back()
                 given_back = self.bytes_read
-            brick, cells = self._brick(load), load.cells
+            # on a CPU, voxels are not copied if aligned (`empty_array`)
+            brick = with_voxels(self.scene.volume, jax.device_put(load.voxels.result()))
+            brick = part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
+            cells = load.cells
             assert cells is not None
             del load  # and with it the voxels as they were read
             load = next(schedule, None)
@@ -166,12 +169,6 @@ class Traversal:
             self.stored,
             bytes_of(self.stored, self.source.dtype, self.margin),
         )
-
-    def _brick(self, load: Load) -> Volume:
-        """A brick of the volume, once it is read."""
-        voxels = jax.device_put(load.voxels.result())  # on a CPU, not copied if aligned (`empty_array`)
-        brick = with_voxels(self.scene.volume, voxels)
-        return part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
 
     def cells_of(
         self, brick: int, passable: set[int], reached: Array, *, over_empty: bool = True
