@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.ticker import NullFormatter
 
 import jaxvol as jv
-from jaxvol.bricks import VoxelSource, overlap_of, share, source_of
+from jaxvol.bricks import VoxelSource, overlap_of, source_of
 
 from . import bricks_paper, charts, record, timing
 from .bricks_paper import BEST, TABLE, Split
@@ -222,7 +222,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
             rows[name] = {
                 "paper": TABLE[split]._asdict(),
                 "formula": round(bricks_paper.overlap(split), 3),
-                "formula, of these voxels": round(100 * share(overlap, scan.source.shape[2]), 3),
+                "formula, of these voxels": round(bricks_paper.share(overlap, scan.source.shape[2]), 3),
                 **measure(split, VIEW),
             }
         views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits.values()}

@@ -2,6 +2,7 @@
 Kwon and Shin 2008, with its scan."""
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jaxvol as jv
@@ -81,4 +82,10 @@ def overlap(split: Split) -> float:
         return 0.0
     scan = jv.ToroidalMap(0.0, near, beta, sigma, (0.0, DEEP))
     voxel = DEEP / (SHAPE[2] - 1)
-    return 100 * sum(math.ceil(k * voxel) for k in overlap_of(scan, grid(SHAPE, split))) / SHAPE[2]
+    return share([k * voxel for k in overlap_of(scan, grid(SHAPE, split))], SHAPE[2])
+
+
+def share(overlaps: Iterable[float], nodes: int) -> float:
+    """The part of a volume of so many voxels along γ that is read twice, in percent: whole layers at each
+    face."""
+    return 100 * sum(map(math.ceil, overlaps)) / nodes
