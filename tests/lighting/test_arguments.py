@@ -25,7 +25,7 @@ from jaxvol.lighting import (
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import materials_of
 from jaxvol.lighting.template_lighting import with_baked_light
-from jaxvol.lighting.template_simulation import PacketTree
+from jaxvol.lighting.template import PacketTree
 
 from .samples import shaded
 
@@ -48,7 +48,6 @@ BAD = {
     "packets": (grown(packets=0), "packets must be an integer of at least 1"),
     "threshold 0": (grown(threshold=0.0), "threshold must be"),
     "threshold 1": (grown(threshold=1.0), "threshold must be"),
-    "threshold on": (grown(threshold_on="tree"), "threshold_on must be one of photon, level; got 'tree'"),
     "opacity too low": (
         grown(FAINT),
         "opacity 0.031 leaves no photon above threshold=0.01.*packets=4.*a threshold of at most 0.00775",
@@ -65,7 +64,7 @@ BAD = {
     ),
     "a tree too large": (
         grown(threshold=1e-9, levels=40),
-        "templates.*levels=40.*threshold.*asks for .* GiB of memory, and the device has",
+        "templates.*levels=40.*asks for .* GiB of memory, and the device has",
     ),
     "too many templates": (lambda: scatterer_templates(HALF, 0, count=10**9), "1000000000 templates.*asks"),
     "count": (lambda: scatterer_templates(HALF, 0, count=0), "count must be an integer of at least 1"),
