@@ -8,7 +8,7 @@ from .lights import (
     Light as Light,
     PointLight as PointLight,
 )
-from .materials import Material as Material, material as material
+from .materials import Material as Material
 from .phong import Phong as Phong
 from .shading import Lighting as Lighting, Shading as Shading
 from .template import (

@@ -17,12 +17,8 @@ from .._util.vec3 import Scalar, Vec3, apart
 
 
 class Arriving(NamedTuple):
-    """Light that arrives at a point from one direction.
-
-    - `toward`: unit direction to the light. `distance`: to the light, world length; infinite for parallel
-      light.
-    - `irradiance`: (r, g, b) on a plane that faces the light, without occlusion.
-    """
+    """Light at a point from one direction: toward the light, its distance (infinite for parallel light), and
+    the irradiance on a plane that faces it, without occlusion."""
 
     toward: Vec3
     distance: Scalar
@@ -102,7 +98,6 @@ class PointLight(LocatedLight):
 
 class HeadLight(Light):
     """A light at the camera: each ray brings its own parallel light, which travels along it. For `Phong`.
-    (VTK's fixed-point ray caster lets the light of all rays travel along the camera's axis.)
 
     **Arguments:**
 
@@ -137,19 +132,16 @@ def lights_of(
     lights: Light | tuple[Light, ...] | Any,
     kinds: tuple[type[Light], ...] = (LocatedLight, ConstantLight),
 ) -> tuple[Light, ...]:
-    """One or several lights of some kinds, as a tuple. **Raises** `ValueError` for no lights and for other
-    objects."""
+    """One or several lights of some kinds, as a tuple; `ValueError` for anything else."""
     several = (lights,) if isinstance(lights, Light) else lights
     if not isinstance(several, tuple | list) or not several:
         raise ValueError(f"lights must be a light or a tuple of lights; got {lights!r}.")
     for light in several:
         if not isinstance(light, kinds):
-            known = ", ".join(each.__name__ for each in CLASSES if issubclass(each, kinds))
+            classes = (DirectionalLight, PointLight, HeadLight, ConstantLight)
+            known = ", ".join(each.__name__ for each in classes if issubclass(each, kinds))
             raise ValueError(f"lights must hold jaxvol lights, here {known}; got {light!r}.")
     return tuple(several)
-
-
-CLASSES = (DirectionalLight, PointLight, HeadLight, ConstantLight)
 
 
 def _power(name: str, value: Arrayable) -> Float[Array, "3"]:

@@ -249,7 +249,7 @@ class PacketTree:
         if alpha <= self.faintest * self.packets:
             raise ValueError(
                 f"opacity {alpha:g} leaves no photon above threshold={self.threshold:g} with "
-                f"packets={self.packets}: use a threshold of at most {alpha / self.packets:.3g}, or fewer packets."
+                f"packets={self.packets}: use a threshold of at most {alpha / self.packets:.3g}, or fewer."
             )
 
     def require_room(self, levels: int, merge: float, templates: int) -> None:

@@ -150,7 +150,7 @@ class ScattererTemplates(Lighting):
             shape = given.intensity.shape
             if len(shape) != 3 or shape[0] != len(self.materials):
                 raise ValueError(
-                    f"given must hold templates of {len(self.materials)} materials, with intensities of shape "
+                    f"given must hold templates of {len(self.materials)} materials, intensities of shape "
                     f"(materials, templates, n); got {shape}."
                 )
             self.templates, self.levels, available = shape[1], 0, shape[-1]
@@ -209,8 +209,8 @@ class ScattererTemplates(Lighting):
 
 
 def _checked_reach(reach: Any) -> tuple[float, ...]:
-    multiples = np.asarray(reach)
-    if multiples.ndim != 1 or not np.all(np.diff(multiples.astype(float), prepend=1.0, append=np.inf) > 0):
+    multiples = np.asarray(reach, float)
+    if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
         raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
     return tuple(multiples.tolist())
 

@@ -18,14 +18,13 @@ from jaxvol.lighting import (
     PointLight,
     ScattererTemplate,
     ScattererTemplates,
-    material,
     scatterer_template,
     scatterer_templates,
 )
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import materials_of
-from jaxvol.lighting.template_lighting import with_baked_light
 from jaxvol.lighting.template import PacketTree
+from jaxvol.lighting.template_lighting import with_baked_light
 
 from .samples import shaded
 
@@ -78,8 +77,6 @@ BAD = {
     "values": (lambda: Material(0.5, 1.0, values=(2, 2)), "values must be .* low < high"),
     "label": (lambda: Material(0.5, 1.0, label=-1), "label must be an integer of at least 0"),
     "both": (lambda: Material(0.5, 1.0, values=(0, 1), label=1), "values and label must not both be given"),
-    "preset": (lambda: material("fat"), "name must be one of skin, muscle, bone; got 'fat'"),
-    "millimetre": (lambda: material("skin", millimetre=0.0), "millimetre must be greater than 0"),
     "no materials": (lambda: materials_of([]), "materials must hold at least one Material"),
     "no material": (lambda: materials_of([HALF, "skin"]), "materials must hold jaxvol materials; got 'skin'"),
     # lights
@@ -134,7 +131,7 @@ BAD = {
     "ambient": (lambda: Phong(ambient=-0.1), "ambient must not be negative"),
     "diffuse": (lambda: Phong(diffuse=np.nan), "diffuse must be finite"),
     "specular": (lambda: Phong(specular=(1, 2)), "specular must have shape"),
-    "specular power": (lambda: Phong(specular_power=0), "specular_power must be positive"),
+    "specular power": (lambda: Phong(specular_power=0), "specular_power must be greater than 0"),
 }
 
 
