@@ -108,9 +108,9 @@ def optics_of(materials: Sequence[Material]) -> Optics:
 def shares(
     materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
 ) -> tuple[Scalar, ...]:
-    """Share of each material at a grid coordinate with this value: 1 for the first that is present and 0 for
-    all others. With an `edge` above 0, the fraction of its value range over which a material fades in and out,
-    shares are continuous and sum to at most 1; labels are then looked up trilinearly."""
+    """Share of each material at a grid coordinate with this value: 1 for the first that is present, 0 for all
+    others. With an `edge` above 0, the fraction of its value range over which a material fades, shares are
+    continuous and sum to at most 1; labels are then looked up trilinearly."""
     remaining, each = jnp.ones_like(value), []
     for one in materials:
         if one.label is not None:

@@ -1,7 +1,7 @@
 """How is a classified sample shaded? The interface of lightings.
 
-`render` takes a `Lighting`, which makes a `Shading` for each image; engines call the `Shader`, which adds up a
-sample's terms.
+`render` takes a `Lighting`, which makes a `Shading` for each image; engines call the `Shader`, which adds up
+a sample's terms.
 """
 
 import math
@@ -203,7 +203,7 @@ class Shader(NamedTuple):
         return Shader(shading, Surroundings(whole, transfer, space))
 
     def __call__(self, sample: Sample) -> Vec3:
-        """The shaded colour of a sample, or those of many along one axis: terms that none needs are left out."""
+        """The shaded colour of a sample, or those of many, without terms that none needs."""
         shading, around = self
         if self.inline:
             sample = sample._replace(transmittance=jnp.ones_like(sample.transmittance))

@@ -1,8 +1,4 @@
-"""Path tracing of light that is scattered many times: the reference for cheaper lighting.
-
-It is unbiased: an image is the exact answer plus noise, whose size is reported, and which falls with the
-square root of the number of paths. It refuses to be differentiated.
-"""
+"""Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
 from typing import Any
 
@@ -11,7 +7,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.checks import Arrayable, all_finite, described, flag, integer, number
 from .._util.memory import require_room
@@ -30,7 +26,6 @@ from ..xla.compiling import compiled
 from ..xla.platform import is_traced
 from .lanes import walk_all
 from .medium import Medium
-from .result import PathTraced
 from .walks import Walk, WalkResult, WalkScene, Words, step
 
 
@@ -41,23 +36,76 @@ WALKS_PER_LANE = 128
 """Walks that each lane of a batch runs, one after the other."""
 
 MAX_SCATTERINGS = 2**20
-"""Scatterings that a walk may have by default. A path of albedo 1 leaves a medium of optical thickness τ
-after about τ² scatterings, so this limits only paths in media a thousand mean free paths thick."""
+"""Scatterings that a walk may have by default: enough for media a thousand mean free paths thick."""
 
 BYTES_PER_WALK, BYTES_PER_RESULT = 2**10, 2**6
 """Memory of a walk in its lane, and of its result until its batch is over."""
 
 NOT_DIFFERENTIABLE = (
-    "path_trace has no derivative, but volume, transfer, camera, lights, materials or anisotropy carries a "
-    "tangent here (jax.grad, jax.jvp, jax.linearize). Differentiate scatterer templates instead: "
-    "render(..., lighting=lighting.ScattererTemplates(...)). To treat the path-traced image as a constant, "
-    "apply jax.lax.stop_gradient to its inputs."
+    "path_trace has no derivative, but an input carries a tangent here (jax.grad, jax.jvp). Differentiate "
+    "lighting.ScattererTemplates instead, or apply jax.lax.stop_gradient to the inputs."
 )
-"""Error message. Differentiating the walks would not give the image's derivative in any case: how often and
-where a path collides jumps with the extinction."""
+"""Error message: how often and where a path collides jumps with the extinction."""
 
 BEFORE_FIRST_STEP = np.uint32(2**32 - 1)
 """Used in place of a walk's step number for what is drawn before its first step."""
+
+
+class PathTraced(eqx.Module):
+    """A path-traced image, from the paths traced so far.
+
+    - `radiance`: linear RGB of the light that the volume scatters into the camera, mean over all paths,
+      without the background.
+    - `opacity`: the fraction of camera rays that met anything.
+    - `deviations`: sums of the squared deviations of each path's radiance from the mean.
+    - `exhausted`: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
+      contributed.
+    - `paths`: per pixel. `seed`: of all random numbers.
+    """
+
+    radiance: Float[Array, "height width 3"]
+    opacity: Float[Array, "height width"]
+    deviations: Float[Array, "height width 3"]
+    exhausted: Bool[Array, "height width"]
+    seed: UInt32[Array, ""]
+    paths: int = eqx.field(static=True)
+
+    @property
+    def standard_error(self) -> Float[Array, "height width 3"]:
+        """Standard error of `radiance`, from the variance of the pixel's paths; infinite for a single path.
+
+        If a pixel's few paths miss a rare bright one, the pixel is too dark and its error too small.
+        """
+        if self.paths < 2:
+            return jnp.full_like(self.deviations, jnp.inf)
+        return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
+
+    def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
+        """Linear RGB over a background: one colour (3,), or an image of the same shape."""
+        background = jnp.asarray(background, self.radiance.dtype)
+        if background.shape not in ((3,), self.radiance.shape):
+            raise ValueError(
+                f"background must be one colour (3,) or an image {self.radiance.shape}; "
+                f"got shape {background.shape}."
+            )
+        return self.radiance + (1 - self.opacity[..., None]) * background
+
+    def joined(self, other: "PathTraced") -> "PathTraced":
+        """The result of this one's and another one's paths, of the same scene.
+
+        Source: Chan, Golub and LeVeque 1983.
+        """
+        paths = self.paths + other.paths
+        share = other.paths / paths
+        between = jnp.square(other.radiance - self.radiance) * (self.paths * share)
+        return PathTraced(
+            radiance=self.radiance + (other.radiance - self.radiance) * share,
+            opacity=self.opacity + (other.opacity - self.opacity) * share,
+            deviations=self.deviations + other.deviations + between,
+            exhausted=self.exhausted | other.exhausted,
+            seed=self.seed,
+            paths=paths,
+        )
 
 
 def path_trace(
@@ -79,7 +127,7 @@ def path_trace(
 
     The extinction is the transfer function's, at the trilinear value, and the single-scattering albedo is its
     colour, clipped to [0, 1]: an image corresponds to one by Mitsuba's `volpath` with a heterogeneous medium.
-    (`render` treats the colour as light that the medium emits. With albedo 0 the two agree on opacity.)
+    (`render` treats the colour as light that the medium emits.)
 
     The image is radiance, in the unit of `lights`: in a white furnace (albedo 1 under a `ConstantLight` of
     radiance L) it is L times the opacity. Under light of radiance L from all sides, a half-space of albedo ω
@@ -104,11 +152,10 @@ def path_trace(
     - `max_scatterings`: after which a path ends, ≥ 1. By default 2²⁰, so that only Russian roulette ends a
       path, with a probability that depends on its throughput. A smaller number gives an image of light
       scattered at most that many times, and `exhausted` marks the pixels that lack some.
-    - `onto`: an earlier result of the same scene, camera and key, to which these paths are added. The result
-      is that of all paths at once, up to rounding.
+    - `onto`: an earlier result of the same scene, camera and key, to which these paths are added.
     - `lanes`: paths that are traced side by side. Memory grows with it; the result does not change.
 
-    **Returns:** a `PathTraced` of leading shape (height, width), with the standard error of each pixel.
+    **Returns:** a `PathTraced`, with the standard error of each pixel.
 
     **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function without
     a majorant, labels where the volume has none, `onto` of another size or key, and lanes or paths that do
@@ -169,7 +216,7 @@ class _TraceOptions(eqx.Module):
         require_room(
             walks * BYTES_PER_RESULT + min(self.lanes, walks) * BYTES_PER_WALK,
             f"lanes={self.lanes} and paths={self.paths}, {self.pixels(camera)} pixels at once; use fewer "
-            "lanes, which does not change the result, or fewer paths, and add more with `onto`",
+            "lanes, or fewer paths, and add more with `onto`",
         )
 
 
@@ -280,5 +327,4 @@ def _statistics(results: WalkResult) -> tuple[Array, ...]:
     radiance = jnp.stack(results.radiance, axis=-1)
     mean = radiance.mean(axis=1)
     deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
-    met, scatterings = (leaf.astype(mean.dtype).mean(axis=1) for leaf in (results.met, results.scatterings))
-    return mean, met, deviations, scatterings, results.exhausted.any(axis=1)
+    return mean, results.met.astype(mean.dtype).mean(axis=1), deviations, results.exhausted.any(axis=1)

@@ -1,8 +1,7 @@
 """Random walks of light, traced backwards from the camera: flights, scatterings and next-event estimation.
 
-A walk is one path. It is always on one flight: its own, or one from its last scattering towards a light,
-which estimates how much of that light arrives. Both query the volume in the same way, so that walks at
-different stages run side by side, a step at a time, without waiting for each other.
+A walk is always on one flight: its own, or one from its last scattering towards a light. Both query the
+volume in the same way, so that walks at different stages run side by side, a step at a time.
 """
 
 from typing import NamedTuple, TypeAlias, TypeVar
@@ -25,8 +24,7 @@ from .tracking import Candidate, Flight, fly
 T = TypeVar("T")
 
 ROULETTE = 0.25
-"""Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light. A value
-below it survives with a probability in proportion, and is then raised to the threshold."""
+"""Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light."""
 
 MAX_STEPS = 2**24
 """Steps after which a walk counts as exhausted, against walks that never end."""
@@ -34,13 +32,9 @@ MAX_STEPS = 2**24
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
 """Key of all random numbers along a path: pixel, path, seed."""
 
-Uniforms: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
-"""Uniform random numbers in [0, 1)."""
-
 
 class WalkResult(NamedTuple):
-    """Of a path so far: the radiance that it gathered, whether the camera's ray met anything, the number of
-    scatterings, and whether the path was cut off."""
+    """Of a path: its radiance, whether the camera's ray met anything, its scatterings, whether it was cut."""
 
     radiance: Vec3
     met: Bool[Array, "..."]
@@ -85,10 +79,7 @@ class Walk(NamedTuple):
 
 
 class WalkScene(NamedTuple):
-    """The scene that walks travel through.
-
-    - `max_scatterings`: scatterings that a walk may have.
-    """
+    """The scene that walks travel through."""
 
     volume: Volume
     medium: Medium
@@ -115,8 +106,7 @@ class WalkScene(NamedTuple):
         return Flight.to(self.medium.majorants, start, self.space.own(direction), self.space.spacing, end)
 
     def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
-        """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
-        weighted to give that of all of them on average."""
+        """Light at a grid coordinate from one located light, chosen at random, weighted by their number."""
         x, y, z = self.space.point(coordinate)
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -127,10 +117,8 @@ class WalkScene(NamedTuple):
 
 
 class Scattering(NamedTuple):
-    """The outcome of a scattering: new values for fields of `Walk`, and the next flight.
-
-    - `toward`, `end`: world direction and length of the next flight.
-    """
+    """The outcome of a scattering: new values for fields of `Walk`, and the next flight `toward` (world) a
+    direction up to its `end`."""
 
     direction: Vec3
     throughput: Vec3
@@ -141,11 +129,8 @@ class Scattering(NamedTuple):
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
-    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome.
-
-    XLA recomputes a shared intermediate for each of its uses, unless a branch has put it in memory. So every
-    expensive computation is behind a branch.
-    """
+    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome. Whatever is
+    expensive is put in memory, since XLA would recompute it for each of its uses."""
     live = jnp.any(walks.alive)
     first, second = (in_memory(live, jax.vmap(lambda w, i=i: _uniforms(w, i)), walks) for i in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
@@ -161,12 +146,7 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
     scattering = in_memory(
         live,
         jax.vmap(lambda *of_one: _scatter(scene, *of_one)),
-        walks,
-        candidate.coordinate,
-        albedo,
-        turn,
-        choose,
-        survive,
+        *(walks, candidate.coordinate, albedo, turn, choose, survive),
     )
     candidate = candidate._replace(found=candidate.found & walks.alive, over=candidate.over & walks.alive)
     walks = walks._replace(flight=flight, steps=walks.steps + 1)
@@ -266,7 +246,7 @@ def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:
     return scaled(throughput, jnp.where(small, jnp.where(survives, weight, 0), 1))
 
 
-def _uniforms(walk: Walk, stage: int) -> Uniforms:
+def _uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Four uniform random numbers for stage 0 or 1 of a walk's next step."""
     pixel, path, seed = walk.words
     return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
