@@ -35,12 +35,9 @@ light around it: half of the photons of a sample on its face are inside, so that
 
 
 class _Shared(NamedTuple):
-    """What is common to all photons of a sample.
-
-    - `shares`: of the materials. `mixture`: the same, normalized to sum to 1 if any is above 0.
-    - `optics`: of the sample's material. `template`: which of its templates; None if there is only one.
-    - `lights`: for each, the direction to it, its distance and irradiance. Direction None: from all sides.
-    """
+    """What is common to all photons of a sample: the materials' shares, and the same normalized to sum to 1;
+    its optics; which template it uses, if there are several; and of each light the direction to it (None:
+    from all sides), its distance and irradiance."""
 
     shares: tuple[Scalar, ...]
     mixture: tuple[Scalar, ...]
@@ -50,8 +47,8 @@ class _Shared(NamedTuple):
 
 
 class _Photon(NamedTuple):
-    """A photon of a sample. `inner`: the factor by which the colour at its place counts; `mean_free_path`:
-    there. None if they follow from what is read at its place."""
+    """A photon of a sample; where there are several materials, also the factor by which the colour at its
+    place counts, and the mean free path there."""
 
     offset: Vec3
     intensity: Scalar
@@ -62,9 +59,8 @@ class _Photon(NamedTuple):
 class PhotonShading(Shading):
     """Templates prepared for one image.
 
-    - `templates`: (materials, templates, photons). Where there are several for a material, each pixel uses
-      one, drawn by `seed`. `blended`: how many were blended into each; their photons are skipped as they
-      would be in their own templates.
+    - `templates`: (materials, templates, photons). `blended`: how many were blended into each; their photons
+      are skipped as they would be in their own templates.
     - `cutoff`: None: no photon is skipped.
     """
 
@@ -152,8 +148,7 @@ class PhotonShading(Shading):
         return red, green, blue
 
     def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
-        """A photon of the sample's material, or of several blended by their shares; of intensity 0 if it is
-        skipped."""
+        """A photon of the sample's materials, blended by their shares; of intensity 0 if it is skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
@@ -247,7 +242,6 @@ def _displaced(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
 
 
 def _matter(shares: tuple[Scalar, ...]) -> Scalar:
-    """How far a sample is in any material."""
     return jnp.minimum(2 * sum(shares), 1)
 
 

@@ -105,31 +105,30 @@ class Lighting(eqx.Module):
 
     @property
     def reads_gradient(self) -> bool:
-        """Whether samples read the volume's gradient, so that it is worth storing slopes. By default not."""
+        """Whether samples read the volume's gradient. By default not."""
         return False
 
     @property
     def farthest_read(self) -> float | None:
-        """Distance from a sample, world length, up to which its shading reads the volume: more than 0 must be
-        read around a brick. By default None: unknown, or unbounded."""
+        """Distance from a sample, world length, up to which its shading reads the volume. By default None:
+        unknown, or unbounded."""
         return None
 
     @abstractmethod
     def for_image(self, around: "Surroundings") -> "Shading":
-        """What shades the samples of one image. What does not depend on the sample is computed here, once."""
+        """What shades the samples of one image; here is computed what does not depend on the sample."""
 
 
 class Shading(Lighting):
     """A lighting that shades samples, by three methods, each of which sees one sample: `begin`, `term` and
     `color`, of which only the last one is required.
 
-    The light at a sample is a sum of `terms`, such as one for each light source, or for each place from which
-    light comes. Only `term` may read voxels: under replay, those that are read elsewhere get no gradient.
+    The light at a sample is a sum of `terms`, such as one for each light source. Only `term` may read voxels:
+    under replay, those that are read elsewhere get no gradient.
 
     If there is one term and all it reads is the gradient at the sample (`reads_gradient` is true and
-    `farthest_read` is 0), all samples are shaded where they are, since gathering the visible ones would cost
-    more. Of a sample, `begin` and `term` are then told where it is, and `color` also its colour; its
-    transmittance is 1, and all else NaN.
+    `farthest_read` is 0), all samples are shaded, also invisible ones. Of a sample, `begin` and `term` are
+    then told where it is, and `color` also its colour; its transmittance is 1, and all else NaN.
     """
 
     @property
@@ -144,8 +143,7 @@ class Shading(Lighting):
 
     @property
     def skips_hidden(self) -> bool:
-        """Whether, by its `thresholds`, a sample behind little transmittance may need no term at all: its
-        colour is then computed without gathering it. By default not."""
+        """Whether, by its `thresholds`, a sample behind little transmittance may need no term at all."""
         return False
 
     def for_image(self, around: "Surroundings") -> "Shading":
@@ -236,7 +234,7 @@ def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: P
 @eqx.filter_custom_jvp
 def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
     """The sums of the terms that any of these samples needs; None where there are none. Their derivative is
-    that of all terms: a term of 0 may have one, and JAX cannot differentiate this loop in reverse."""
+    that of all terms, since JAX cannot differentiate this loop in reverse."""
     if shading.terms == 0:
         return None
 

@@ -1,5 +1,6 @@
 """Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -180,44 +181,28 @@ def path_trace(
         raise ValueError("materials use labels, but this volume has none; give Volume(..., labels=...).")
     paths = integer("paths", paths, 1)
     anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
-    limit = MAX_SCATTERINGS
-    if max_scatterings is not None:
-        limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
+    if max_scatterings is None:
+        max_scatterings = MAX_SCATTERINGS
+    limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
-    options = _TraceOptions(paths, integer("lanes", lanes, 1), flag("antialias", antialias))
-    options.require_room(camera)
-    seed = _seed(key)
-    first = 0
+    lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
+    pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
+    require_room(
+        pixels * paths * BYTES_PER_RESULT + min(lanes, pixels * paths) * BYTES_PER_WALK,
+        f"lanes={lanes} and paths={paths}, {pixels} pixels at once; use fewer lanes, or fewer paths, and add "
+        "more with `onto`",
+    )
     if onto is not None:
-        first = _checked(onto, camera, seed).paths
+        _check_earlier(onto, camera, seed)
+    first = 0 if onto is None else onto.paths
     blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
     traced = _trace(
         *(volume, words_of(volume), blocks, transfer, materials, lights, anisotropy),
-        *(jnp.asarray(limit, jnp.int32), camera, seed, jnp.asarray(first, jnp.uint32), options),
+        *(jnp.asarray(limit, jnp.int32), camera, seed, jnp.asarray(first, jnp.uint32)),
+        *(paths, lanes, pixels, antialias),
     )
     return traced if onto is None else onto.joined(traced)
-
-
-class _TraceOptions(eqx.Module):
-    """Static settings of the compiled program."""
-
-    paths: int = eqx.field(static=True)
-    lanes: int = eqx.field(static=True)
-    antialias: bool = eqx.field(static=True)
-
-    def pixels(self, camera: Camera) -> int:
-        """Number of pixels in one batch."""
-        return min(max(WALKS_PER_LANE * self.lanes // self.paths, 1), camera.size[0] * camera.size[1])
-
-    def require_room(self, camera: Camera) -> None:
-        """**Raises** `ValueError` if a batch would not fit into memory."""
-        walks = self.pixels(camera) * self.paths
-        require_room(
-            walks * BYTES_PER_RESULT + min(self.lanes, walks) * BYTES_PER_WALK,
-            f"lanes={self.lanes} and paths={self.paths}, {self.pixels(camera)} pixels at once; use fewer "
-            "lanes, or fewer paths, and add more with `onto`",
-        )
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -231,17 +216,14 @@ def _seed(key: Any) -> UInt32[Array, ""]:
     return jax.random.bits(key, (), jnp.uint32)
 
 
-def _checked(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
+def _check_earlier(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> None:
     if not isinstance(onto, PathTraced):
         raise ValueError(f"onto must be an earlier result of path_trace; got {onto!r}.")
-    width, height = camera.size
-    if onto.opacity.shape != (height, width):
-        raise ValueError(
-            f"onto must have the camera's size {(height, width)}; got size {onto.opacity.shape}."
-        )
+    size = camera.size[::-1]
+    if onto.opacity.shape != size:
+        raise ValueError(f"onto must have the camera's size {size}; got size {onto.opacity.shape}.")
     if not is_traced(onto.seed, seed) and onto.seed != seed:
         raise ValueError("onto must be of the same key, since otherwise other paths would be drawn again.")
-    return onto
 
 
 @compiled
@@ -257,10 +239,13 @@ def _trace(
     camera: Camera,
     seed: UInt32[Array, ""],
     first: UInt32[Array, ""],
-    options: _TraceOptions,
+    paths: int,
+    lanes: int,
+    pixels: int,
+    antialias: bool,
 ) -> PathTraced:
-    """Trace the pixels row by row, in batches that bound the memory. `words`: the volume's packed voxels.
-    `first`: number of each pixel's first path."""
+    """Trace the image row by row, in batches of `pixels`, which bounds the memory. `words`: the volume's packed
+    voxels. `first`: number of each pixel's first path."""
     volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
         _single, (volume, blocks, transfer, materials, lights, anisotropy, camera)
     )
@@ -272,23 +257,21 @@ def _trace(
     ranges = blocks if volume.field is None else None
     valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
     valid &= all_finite((materials, lights, anisotropy, camera))
-    pixels = options.pixels(camera)
-    batches = -(-width * height // pixels)
-    count = pixels * options.paths
+    batches, count = -(-width * height // pixels), pixels * paths
 
     def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
         def begin(index: Int[Array, " lanes"]) -> Walk:
-            pixel, path = number * pixels + index // options.paths, index % options.paths
+            pixel, path = number * pixels + index // paths, index % paths
             alive = valid & (index < count) & (pixel < width * height)
             words = (
                 pixel.astype(jnp.uint32),
                 first + path.astype(jnp.uint32),
                 jnp.broadcast_to(seed, index.shape),
             )
-            return jax.vmap(lambda *of_one: _begin(scene, camera, options, *of_one))(words, alive)
+            return jax.vmap(partial(_begin, scene, camera, antialias))(words, alive)
 
-        results = walk_all(begin, lambda walks: step(scene, walks), count, options.lanes)
-        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, options.paths), results))
+        results = walk_all(begin, partial(step, scene), count, lanes)
+        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results))
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
@@ -297,7 +280,7 @@ def _trace(
     images = jax.tree.map(
         lambda leaf: jnp.where(valid, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, images
     )
-    return PathTraced(*images, seed=seed, paths=options.paths)
+    return PathTraced(*images, seed=seed, paths=paths)
 
 
 def _single(leaf: Array) -> Array:
@@ -305,13 +288,11 @@ def _single(leaf: Array) -> Array:
     return leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf
 
 
-def _begin(
-    scene: WalkScene, camera: Camera, options: _TraceOptions, words: Words, alive: Bool[Array, ""]
-) -> Walk:
+def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
     """Start a walk where the camera's ray enters the volume."""
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
-    if options.antialias:
+    if antialias:
         x, y, *_ = hashed_uniforms_4(pixel, path, jnp.full_like(pixel, BEFORE_FIRST_STEP), seed)
         origin, direction = camera.ray(column.astype(x.dtype) + x - 0.5, row.astype(y.dtype) + y - 0.5)
     else:

@@ -4,6 +4,7 @@ A walk is always on one flight: its own, or one from its last scattering towards
 volume in the same way, so that walks at different stages run side by side, a step at a time.
 """
 
+from functools import partial
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -132,25 +133,23 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
     """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome. Whatever is
     expensive is put in memory, since XLA would recompute it for each of its uses."""
     live = jnp.any(walks.alive)
-    first, second = (in_memory(live, jax.vmap(lambda w, i=i: _uniforms(w, i)), walks) for i in (0, 1))
+    first, second = (in_memory(live, jax.vmap(partial(_uniforms, stage=i)), walks) for i in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
     turn = in_memory(
         live, jax.vmap(sample_phase, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
     )
-    flight, candidate = in_memory(
-        live, jax.vmap(lambda flight, draw: fly(scene.medium.majorants, flight, draw)), walks.flight, draw
-    )
+    flight, candidate = in_memory(live, jax.vmap(partial(fly, scene.medium.majorants)), walks.flight, draw)
     measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.coordinate)
     extinction, albedo = in_memory(live, jax.vmap(scene.medium.classify), measured)
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
     scattering = in_memory(
         live,
-        jax.vmap(lambda *of_one: _scatter(scene, *of_one)),
+        jax.vmap(partial(_scatter, scene)),
         *(walks, candidate.coordinate, albedo, turn, choose, survive),
     )
     candidate = candidate._replace(found=candidate.found & walks.alive, over=candidate.over & walks.alive)
     walks = walks._replace(flight=flight, steps=walks.steps + 1)
-    return jax.vmap(lambda *of_one: _advance(scene, *of_one))(walks, candidate, share, scattering, decide)
+    return jax.vmap(partial(_advance, scene))(walks, candidate, share, scattering, decide)
 
 
 def _advance(
