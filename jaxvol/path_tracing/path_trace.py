@@ -244,8 +244,8 @@ def _trace(
     pixels: int,
     antialias: bool,
 ) -> PathTraced:
-    """Trace the image row by row, in batches of `pixels`, which bounds the memory. `words`: the volume's packed
-    voxels. `first`: number of each pixel's first path."""
+    """Trace the image in batches of `pixels`. `words`: the volume's packed voxels. `first`: number
+    of each pixel's first path."""
     volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
         _single, (volume, blocks, transfer, materials, lights, anisotropy, camera)
     )

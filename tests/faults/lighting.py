@@ -41,13 +41,10 @@ FAULTS: list[Fault] = [
         (f"{SHADING}test_samples_shaded_together_are_shaded_as_each_alone[hard]",),
     ),
     Fault(
-        "light: photons appear at once",
+        "light: photons below the threshold are kept",
         "lighting.template:PacketTree.faded",
         lambda f: lambda self, opacity, light: light,
-        (
-            "lighting/test_template.py::"
-            "test_gradients_match_central_differences_and_photons_do_not_appear_at_once",
-        ),
+        ("lighting/test_template.py::test_a_conserving_template_holds_what_the_threshold_leaves",),
     ),
     Fault(
         "light: baked while something is traced, it is kept as tracers",
