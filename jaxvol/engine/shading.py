@@ -110,11 +110,6 @@ def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
     return Weights(*(list(values) for values in zip(*each, strict=True)))
 
 
-def visible(weights: Weights, chunk: int) -> Chosen:
-    """The samples of positive weight."""
-    return Chosen.of([weight > 0 for weight in weights.weight], chunk)
-
-
 def samples_of(
     chosen: Chosen,
     indices: Int[Array, " chunk"],

@@ -14,10 +14,11 @@ from ..ray import Scene
 from ..scene.space import Ray
 from ..scene.volume import read_as
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from ..xla.compaction import Chosen
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added
 from .segment import Samples
-from .shading import Weights, samples_of, visible
+from .shading import Weights, samples_of
 
 
 class ShadingTotal(NamedTuple):
@@ -49,7 +50,7 @@ def shading_vjp(
     total: ShadingTotal,
 ) -> tuple[list[ShadingVjp], ShadingTotal]:
     """Pulls back the `cotangents` of the shaded colours of a segment's samples, and adds to the total."""
-    chosen = visible(weights, chunk)
+    chosen = Chosen.of([weight > 0 for weight in weights.weight], chunk)
     size = sum(weight.size for weight in weights.weight)
 
     def one(

@@ -1,8 +1,5 @@
-"""Light sources, and how much of their light arrives at a point. Names and units are Mitsuba's.
-
-Irradiance is power per area, radiance power per area and solid angle, each in linear RGB. Images by
-`path_trace`, and by `ScattererTemplates` wherever there is a material, are radiance in the same unit.
-"""
+"""Light sources, and how much of their light arrives at a point. Names and units are Mitsuba's: irradiance is
+power per area, radiance power per area and solid angle, each in linear RGB."""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple
@@ -60,7 +57,7 @@ class DirectionalLight(LocatedLight):
         self.irradiance = _power("irradiance", irradiance)
 
     def at(self, point: Vec3) -> Arriving:
-        # its largest component first, so that no square overflows or underflows
+        # scaled first, so that no square overflows or underflows
         direction = self.direction / jax.lax.stop_gradient(jnp.max(jnp.abs(self.direction)))
         x, y, z = apart(-direction / jnp.linalg.norm(direction))
         zero = jnp.zeros_like(point[0])

@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._util.checks import integer, number
-from .._util.memory import require_room
 from .._util.vec3 import Scalar, golden_spiral, turned
 from ..xla.platform import is_traced
 from .materials import Material, Optics, materials_of, optics_of, smoothstep
@@ -31,9 +30,6 @@ FADES = 0.8
 
 MERGE = 0.01
 """Photons closer than this fraction of the mean free path are merged into one."""
-
-BYTES_PER_PHOTON, BYTES_PER_PAIR = 256, 16
-"""Memory per photon of a tree, and per pair of photons, for the distances by which they are merged."""
 
 
 class ScattererTemplate(eqx.Module):
@@ -127,13 +123,11 @@ def scatterer_template(
 
     Where it fails: `experiments/stability.py`, "lopsided templates", "energy of templates as printed".
 
-    **Raises:** `ValueError` for numbers out of range, if `levels` are required but missing, for a tree that
-    does not fit into memory, and if all photons are below the threshold. If the opacity is traced, the
-    intensities are NaN in the last case.
+    **Raises:** `ValueError` for numbers out of range, if `levels` are required but missing, and if all
+    photons are below the threshold; if the opacity is traced, the intensities are NaN in the last case.
     """
     tree = PacketTree.checked(packets, threshold)
     levels = tree.levels_of((material,), levels)
-    tree.require_room(levels, merge, 1)
     return tree.template(material.optics, _key(key), levels, merge)
 
 
@@ -155,12 +149,11 @@ def scatterer_templates(
     **Returns:** a `ScattererTemplate` with leading axes (materials, count). The draws are keyed by the index
     of the material and that of the template.
 
-    **Raises:** as `scatterer_template` does; the memory checked is that of all templates.
+    **Raises:** as `scatterer_template` does.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
     tree = PacketTree.checked(packets, threshold)
     levels = tree.levels_of(materials, levels)
-    tree.require_room(levels, merge, count * len(materials))
 
     def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
@@ -251,15 +244,6 @@ class PacketTree:
                 f"opacity {alpha:g} leaves no photon above threshold={self.threshold:g} with "
                 f"packets={self.packets}: use a threshold of at most {alpha / self.packets:.3g}, or fewer."
             )
-
-    def require_room(self, levels: int, merge: float, templates: int) -> None:
-        """**Raises** `ValueError` if this many templates would not fit into memory."""
-        size = self.size(levels)
-        require_room(
-            templates * size * (BYTES_PER_PHOTON + (BYTES_PER_PAIR * size if merge > 0 else 0)),
-            f"{templates} templates of {size} photons each (packets={self.packets}, levels={levels}); use "
-            "fewer templates or levels, or a higher threshold",
-        )
 
     def template(
         self, optics: Optics, key: PRNGKeyArray, levels: int, merge: float = MERGE

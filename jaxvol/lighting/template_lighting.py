@@ -92,8 +92,8 @@ class ScattererTemplates(Lighting):
     paths", "short mean free paths".
 
     **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
-    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for templates or
-    a grid that do not fit into memory.
+    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for a grid that
+    does not fit into memory.
     """
 
     materials: tuple[Material, ...]

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.checks import Arrayable, all_finite, described, flag, integer, number
-from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
 from ..engine.acceleration import with_words, words_of
@@ -38,9 +37,6 @@ WALKS_PER_LANE = 128
 
 MAX_SCATTERINGS = 2**20
 """Scatterings that a walk may have by default: enough for media a thousand mean free paths thick."""
-
-BYTES_PER_WALK, BYTES_PER_RESULT = 2**10, 2**6
-"""Memory of a walk in its lane, and of its result until its batch is over."""
 
 NOT_DIFFERENTIABLE = (
     "path_trace has no derivative, but an input carries a tangent here (jax.grad, jax.jvp). Differentiate "
@@ -144,7 +140,7 @@ def path_trace(
     - `lights`: those with a position or a direction are sampled at every scattering, one of them at random;
       a `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
       unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-    - `paths`: per pixel, ≥ 1.
+    - `paths`: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once: for very many, use `onto`.
     - `key`: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
       and on the path's number.
     - `materials`: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
@@ -159,9 +155,9 @@ def path_trace(
     **Returns:** a `PathTraced`, with the standard error of each pixel.
 
     **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function without
-    a majorant, labels where the volume has none, `onto` of another size or key, and lanes or paths that do
-    not fit into memory; `RuntimeError` if it is differentiated (grad or jvp) with respect to any of its
-    inputs. It may be called in a function that is differentiated with respect to something else.
+    a majorant, labels where the volume has none, and `onto` of another size or key; `RuntimeError` if it is
+    differentiated with respect to any of its inputs. It may be called in a function that is differentiated
+    with respect to something else.
 
     NaN or infinity in any input makes the whole image NaN, since any path may reach it.
 
@@ -188,11 +184,6 @@ def path_trace(
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
-    require_room(
-        pixels * paths * BYTES_PER_RESULT + min(lanes, pixels * paths) * BYTES_PER_WALK,
-        f"lanes={lanes} and paths={paths}, {pixels} pixels at once; use fewer lanes, or fewer paths, and add "
-        "more with `onto`",
-    )
     if onto is not None:
         _check_earlier(onto, camera, seed)
     first = 0 if onto is None else onto.paths

@@ -27,9 +27,6 @@ T = TypeVar("T")
 ROULETTE = 0.25
 """Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light."""
 
-MAX_STEPS = 2**24
-"""Steps after which a walk counts as exhausted, against walks that never end."""
-
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
 """Key of all random numbers along a path: pixel, path, seed."""
 
@@ -157,12 +154,9 @@ def _advance(
 ) -> Walk:
     """The walk after a candidate, where `share` is extinction / majorant; or after the end of its flight."""
     advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
-    if scene.located:
-        to_light = _ratio_tracking(scene, walk, candidate, share, decide)
-        advanced = _where(walk.to_light, to_light, advanced)
-    cut_off, result = advanced.alive & (advanced.steps >= MAX_STEPS), advanced.result
-    result = result._replace(exhausted=result.exhausted | cut_off)
-    return advanced._replace(alive=advanced.alive & ~cut_off, result=result)
+    if not scene.located:
+        return advanced
+    return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, share, decide), advanced)
 
 
 def _scatter(
