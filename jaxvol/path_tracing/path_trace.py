@@ -78,13 +78,12 @@ class PathTraced(eqx.Module):
         return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
-        """Linear RGB over a background: one colour (3,), or an image of the same shape."""
+        """Linear RGB over a background: one colour (3,), or an image of the same shape. **Raises:** `ValueError`
+        for another shape."""
         background = jnp.asarray(background, self.radiance.dtype)
         if background.shape not in ((3,), self.radiance.shape):
-            raise ValueError(
-                f"background must be one colour (3,) or an image {self.radiance.shape}; "
-                f"got shape {background.shape}."
-            )
+            shapes = f"(3,) or {self.radiance.shape}"
+            raise ValueError(f"background must have shape {shapes}; got {background.shape}.")
         return self.radiance + (1 - self.opacity[..., None]) * background
 
     def joined(self, other: "PathTraced") -> "PathTraced":
