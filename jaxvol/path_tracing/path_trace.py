@@ -78,8 +78,8 @@ class PathTraced(eqx.Module):
         return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
-        """Linear RGB over a background: one colour (3,), or an image of the same shape. **Raises:** `ValueError`
-        for another shape."""
+        """Linear RGB over a background: one colour (3,), or an image of the same shape. **Raises:**
+        `ValueError` for another shape."""
         background = jnp.asarray(background, self.radiance.dtype)
         if background.shape not in ((3,), self.radiance.shape):
             shapes = f"(3,) or {self.radiance.shape}"
