@@ -150,7 +150,8 @@ class VoxelSource:
             place = [slice(a - x, b - x) for a, b, x in zip(*part, box[0], strict=True)]
             voxels[permuted(place, axes)] = converted(self._stored(part, axes), part, axes, self.name)
         if self._map is not None and self._map.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
-            self._map.base.madvise(mmap.MADV_DONTNEED)  # or what was read would count as the process's memory
+            mapped: Any = self._map.base
+            mapped.madvise(mmap.MADV_DONTNEED)  # or what was read would count as the process's memory
         return voxels
 
     def subsampled(self, stride: int) -> Volume:
