@@ -84,7 +84,9 @@ class PathTraced(eqx.Module):
         if background.shape not in ((3,), self.radiance.shape):
             shapes = f"(3,) or {self.radiance.shape}"
             raise ValueError(f"background must have shape {shapes}; got {background.shape}.")
-        return self.radiance + (1 - self.opacity[..., None]) * background
+        return self.radiance + (1 - self.opacity[..., None]) * jnp.broadcast_to(
+            background, self.radiance.shape
+        )
 
     def joined(self, other: "PathTraced") -> "PathTraced":
         """The result of this one's and another one's paths, of the same scene.
