@@ -6,7 +6,7 @@ memory is allocated for it.
 """
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -171,28 +171,16 @@ def files_of(path: Path) -> list[Path]:
     return series_files(path) if is_dicom(path) else [path]
 
 
-def says_where_it_lies(path: Path) -> bool:
-    """Whether a file says where in the world its volume lies, and how its axes are turned."""
-    return "origin" in _place_told(path)
-
-
 def says_its_spacing(path: Path) -> bool:
-    """Whether a file of voxels, or the header beside it, says how far they lie apart."""
-    return "spacing" in _place_told(path)
-
-
-def _place_told(path: Path) -> Collection[str]:
-    """Which of spacing and origin a file tells, without reading its voxels."""
+    """Whether a file of voxels, or the header beside it, says how far apart they lie; they are not read."""
     name = path.name.lower()
-    if name.endswith(RAW):  # an origin there says nothing of the axes
-        return raw_json_header(path).keys() - {"origin"}
+    if name.endswith(RAW):
+        return "spacing" in raw_json_header(path)
     if name.endswith(".npz"):
-        return npz_names(path)
+        return "spacing" in npz_names(path)
     if name.endswith(TIFF):
-        return tiff_spacing(path)
-    if name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)):
-        return ()
-    return ("spacing", "origin")
+        return "spacing" in tiff_spacing(path)
+    return not (name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)))
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
