@@ -129,10 +129,12 @@ FINAL: dict[type, str] = {
 def check_arguments(call: str, **arguments: Any) -> None:
     """Check that arguments are of the types that their names say.
 
-    **Arguments:** `call`: how the function is called, such as `render(volume, transfer, camera, march)`,
-    quoted when arguments are swapped.
+    Args:
+        call: how the function is called, such as `render(volume, transfer, camera, march)`, quoted when
+            arguments are swapped.
 
-    **Raises:** `ValueError` naming the first such argument, what came, and what to pass.
+    Raises:
+        ValueError: naming the first wrong argument, what came, and what to pass.
     """
     for name, value in arguments.items():
         kind, expected, remedy = EXPECTED[name]

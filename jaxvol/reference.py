@@ -56,18 +56,22 @@ def render_ray_reference(
     Computes in the float type of `origin` and `direction`. Differentiable in forward and reverse mode, any
     number of times; the memory of reverse mode grows with the number of samples.
 
-    **Arguments:**
+    Args:
+        volume: the values, on a grid.
+        transfer: their colours and extinctions.
+        origin: world point where the ray begins.
+        direction: unit vector.
+        march: step and transforms: where samples are.
+        pixel: (column, row), which keys random numbers.
+        compositing: how cells become a pixel.
+        lighting: how samples are shaded.
 
-    - `volume`, `transfer`, `march`: what is there, how it looks, and where it is sampled.
-    - `origin`, `direction`: world point and unit direction of the ray.
-    - `pixel`: (column, row), which keys random numbers.
-    - `compositing`: how cells become a pixel.
-    - `lighting`: how samples are shaded.
+    Returns:
+        A `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
-    **Returns:** a `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
-
-    **Raises:** `ValueError` where the step, the spacing or a transform that bends space is traced, and
-    `march.max_samples` is not given: the length of the scan cannot be known.
+    Raises:
+        ValueError: where the step, the spacing or a transform that bends space is traced, and
+            `march.max_samples` is not given: the length of the scan cannot be known.
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)

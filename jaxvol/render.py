@@ -43,53 +43,54 @@ def render(
 ) -> Rendering:
     """Renders an image of a volume.
 
-    **Arguments:**
+    Args:
+        volume: the values, on a grid.
+        transfer: their colours and extinctions.
+        camera: makes one ray for each pixel.
+        march: step and transforms; or `"auto"`: those of `plan`, which is called for each image, without
+            transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
+            `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render by
+            `found.march`.
+        tolerance: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
+        compositing: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or
+            `"average"`, the projections of VTK (`Maximum` and its siblings take a `thickness`); an
+            `Isosurface(value)`; or another `Weighting` or `Selection`. Where a `Selection` chooses a depth,
+            no adjoint marches again: JAX differentiates what is computed there.
+        lighting: how samples are shaded: `lighting.Phong(lights)` or
+            `lighting.ScattererTemplates(materials, lights)`; by default not at all.
+        outputs: `"all"`, or `"rgba"` for the image and `exhausted` only, in some 5 % less time.
+        adjoint: how the image is differentiated; the image itself is the same. `"replay"`, for reverse mode
+            (`jax.grad`): a second march computes the samples again, so that memory does not grow with their
+            number (one array like each leaf, and the rays of one tile). `"forward"`, for forward mode
+            (`jax.jvp`, `jax.jacfwd`). `"direct"`, for both and higher derivatives: JAX differentiates
+            `render_ray_reference`, and memory grows with the number of samples.
+        devices: a sequence of JAX's devices, or a `jax.sharding.Mesh` of one axis, over which
+            `jax.shard_map` shards the rays. Image and gradient are the same, and lie on all of these
+            devices; so does the scene (a volume is copied to each once in its lifetime). By default JAX
+            chooses one device. In a program of several processes (`jax.distributed.initialize()`) pass
+            `jax.devices()` and make the same calls in all of them; each gets the whole image
+            (`examples/several_processes.py`).
 
-    - `volume`, `transfer`: what is there, and how it looks.
-    - `camera`: makes one ray for each pixel.
-    - `march`: step and transforms; or `"auto"`: those of `plan`, which is called for each image,
-      without transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
-      `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render by `found.march`.
-    - `tolerance`: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
-    - `compositing`: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or `"average"`,
-      the projections of VTK (`Maximum` and its siblings take a `thickness`); an `Isosurface(value)`; or
-      another `Weighting` or `Selection`. Where a `Selection` chooses a depth, no adjoint marches again: JAX
-      differentiates what is computed there.
-    - `lighting`: how samples are shaded: `lighting.Phong(lights)`, or `lighting.ScattererTemplates(materials,
-      lights)`. Without, colours are those of the transfer function.
-    - `outputs`: `"rgba"` computes the image and `exhausted` only, in some 5 % less time; `"all"` everything
-      that a `Rendering` holds.
-    - `adjoint`: how the image is differentiated. The image itself is the same.
-        - `"replay"`: reverse mode (`jax.grad`). A second march computes the samples again, so that memory
-          does not grow with their number: it takes one array like each leaf, and the rays of one tile.
-        - `"forward"`: forward mode (`jax.jvp`, `jax.jacfwd`).
-        - `"direct"`: both, and higher derivatives; JAX differentiates `render_ray_reference`. Memory grows
-          with the number of samples.
-    - `devices`: a sequence of JAX's devices, or a `jax.sharding.Mesh` of one axis, to which the rays are
-      dealt out by `jax.shard_map`: beams of 8 x 8 pixels in turn. The image and its gradient are the same,
-      jitter included, and lie on all of these devices. So does the scene: a volume is copied to each once in
-      its lifetime. By default JAX decides where the image is computed, on one device. In a program of several
-      processes (`jax.distributed.initialize()`) pass `jax.devices()`, and make the same calls in all of them;
-      each has the whole image then (`examples/several_processes.py`).
+    Returns:
+        A `Rendering` of shape (height, width), in JAX's default float type. If a number on which all pixels
+        depend is NaN or infinite (a transfer function whose fit diverged, say), all of the image and of its
+        gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays meet it, or leave the volume
+        next to it.
 
-    **Returns:** a `Rendering` with leading shape (height, width), in JAX's default float type. If a number on
-    which all pixels depend is NaN or infinite (an entry of a transfer function whose fit diverged, say), all
-    of the image is NaN, and so is its gradient. A voxel that is NaN makes those pixels NaN whose rays meet
-    it, or leave the volume next to it.
+    Raises:
+        ValueError: for an argument of another kind (an array for a `Volume`, a camera in the march's place);
+            for unknown outputs or adjoint; for `"direct"` where march or spacing is traced and
+            `march.max_samples` is not given; for `"auto"` where arrays are traced, and for a tolerance
+            without it; for wrong `devices`, and for any inside a `jax.shard_map`; and under a mode of
+            differentiation that is not the adjoint's. (`jax.jvp` of a `jax.jit` under `"replay"` is JAX's
+            own `TypeError`.)
 
-    `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so for
-    gradients, as a loop would. `"direct"` renders them side by side, and so does `"forward"` where the image
-    is also differentiated, or compiled inside the `jax.vmap`.
+    `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so do
+    gradients. `"direct"` renders them side by side, and so does `"forward"` where the image is also
+    differentiated or compiled within the `jax.vmap`: slower, with more memory.
 
     In float32, the gradient by the extinction drowns in rounding along rays of optical depth above 14
     (`experiments/stability.py`, "gradients of opaque rays").
-
-    **Raises:** `ValueError`, naming the argument, for an argument of another kind (an array for a `Volume`, a
-    camera in the march's place), for unknown outputs or an unknown adjoint, and for `"direct"` where the
-    march or the spacing is traced and `march.max_samples` is not given. For `"auto"` where arrays are
-    traced, and for a tolerance without it. For `devices` that are none, and for any inside a `jax.shard_map`.
-    Under the wrong mode of differentiation, naming the adjoint to pass (except `jax.jvp` of a `jax.jit` under
-    `"replay"`, which is JAX's `TypeError`).
 
     Without `AlphaCorrection` an image jumps when a sample crosses the exit. The gradient with respect to the
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
@@ -126,22 +127,22 @@ def render_rays(
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
-    """Renders arbitrary rays.
+    """Renders arbitrary rays. Other arguments are those of `render`.
 
-    **Arguments:** as for `render`, except:
+    Args:
+        origins: (*rays, 3) world points where rays begin.
+        directions: (*rays, 3), of any length but 0. Distances are measured in world length.
+        pixels: (*rays, 2) integers, (column, row), which key the random numbers of each ray. By default
+            (index in the flattened array, 0). Within a `jax.shard_map` over the first axis that is the index
+            in the whole array; but under `check_vma=False`, where JAX does not tell a shard that it is one,
+            give pixels, or each shard draws the same numbers.
 
-    - `origins`, `directions`: (*rays, 3) world points, and directions of any length but 0. Distances
-      are measured in world length whatever the length of a direction.
-    - `pixels`: (*rays, 2) integers, (column, row), which key the random numbers of each ray. By default
-      (index, 0), with the ray's index in the flattened array. Inside `jax.shard_map` over the first axis of
-      the rays that is the index in the whole array. Under `check_vma=False`, JAX does not tell a shard that
-      it is one: give pixels there, or each shard draws the same numbers. There is no need for any of this
-      with `devices`.
+    Returns:
+        A `Rendering` of shape `*rays`.
 
-    **Returns:** as `render`, with leading shape `*rays`.
-
-    **Raises:** as `render`, and `ValueError` for shapes that differ or do not end in 3, NaN or
-    infinity, and directions of length 0.
+    Raises:
+        ValueError: as `render`; and for shapes that differ or do not end in 3, NaN or infinity, and
+            directions of length 0.
     """
     order = "render_rays(volume, transfer, origins, directions, march)"
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)

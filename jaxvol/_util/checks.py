@@ -61,8 +61,9 @@ def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> 
     `holds` gets NumPy arrays if the values are concrete, else traced ones. `{got}` in `message` becomes the
     value.
 
-    **Raises:** `ValueError` at once for a concrete value, an Equinox runtime error for a traced one. Inside
-    `jax.shard_map`, where Equinox's errors do not work, a traced value becomes NaN instead.
+    Raises:
+        ValueError: at once for a concrete value, an Equinox runtime error for a traced one. Inside
+            `jax.shard_map`, where Equinox's errors do not work, a traced value becomes NaN instead.
     """
     if is_traced(value, *others):
         if any(map(varies_over, jax.tree.leaves((value, others)))):

@@ -43,8 +43,10 @@ LARGE = 2**16
 def mesh_of(devices: Any) -> Mesh | None:
     """The devices as a mesh of one axis; None for None: JAX decides where the image is computed.
 
-    **Raises:** `ValueError` for what is neither a sequence of JAX's devices nor a mesh of them of one axis,
-    for none, for one that is there twice, and for devices of several kinds."""
+    Raises:
+        ValueError: For what is neither a sequence of JAX's devices nor a mesh of them of one axis, for none,
+            for one that is there twice, and for devices of several kinds.
+    """
     if devices is None:
         return None
     expected = "a sequence of JAX devices, such as jax.devices(), or a jax.sharding.Mesh of one axis"

@@ -48,9 +48,11 @@ def render_scene(
 ) -> Rendering:
     """The image of a scene whose parts are what they should be.
 
-    **Raises:** `ValueError` for unknown outputs or an unknown adjoint; for `"direct"` where the march or the
-    spacing is traced and `march.max_samples` is not given; and as `mesh_of` and `check_not_sharded` do for
-    devices."""
+    Raises:
+        ValueError: For unknown outputs or an unknown adjoint; for `"direct"` where the march or the spacing
+            is traced and `march.max_samples` is not given; and as `mesh_of` and `check_not_sharded` do for
+            devices.
+    """
     for name, given, known in (("outputs", outputs, RenderOutputs), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")

@@ -103,12 +103,13 @@ class Total(NamedTuple):
 class Replay(SampleVisitor):
     """Pulls the cotangents of rays (groups, rays in a group) back to what their samples depend on.
 
-    **Arguments:**
-
-    - `scene`: what the gradient is taken by. `prepared`: the same, without lighting.
-    - `shader`: what shades the samples, `chunk` at a time.
-    - `rays`: those that are marched. `given`: their cotangents.
-    - `total`: the gradients so far, to which those of these rays are added.
+    Args:
+        scene: what the gradient is taken by.
+        prepared: the same, without lighting.
+        shader: what shades the samples, `chunk` at a time.
+        rays: those that are marched.
+        given: their cotangents.
+        total: the gradients so far, to which those of these rays are added.
     """
 
     given: Cotangents

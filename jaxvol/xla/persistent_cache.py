@@ -27,12 +27,15 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     JAX has a folder already. The programs are those of this machine, this version of jaxvol and of JAX;
     others are added. To be rid of them, delete the folder.
 
-    **Arguments:** `folder`: made if it does not exist. By default the folder that
-    `JAX_COMPILATION_CACHE_DIR` names, or else `jaxvol/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
+    Args:
+        folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
+            else `jaxvol/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
 
-    **Returns:** the folder.
+    Returns:
+        The folder.
 
-    **Raises:** `OSError` for a folder that cannot be made.
+    Raises:
+        OSError: for a folder that cannot be made.
     """
     path = default_programs() if folder is None else Path(folder)
     path.mkdir(parents=True, exist_ok=True)
